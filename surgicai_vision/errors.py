@@ -1,0 +1,64 @@
+"""Errors: one base class, and every message says what was given, what is allowed and what to do next.
+
+The command line maps them to exit codes: `InputError` (wrong input) ends with 2, every other
+`SurgicaiError` (the work failed) with 1; both print one line and no traceback.
+"""
+
+import difflib
+from collections.abc import Iterable
+
+
+class SurgicaiError(Exception):
+    """Base of all errors this package raises on purpose. One line, no traceback, exit code 1."""
+
+    exit_code = 1
+
+
+class InputError(SurgicaiError):
+    """The caller gave something that cannot be used. Exit code 2."""
+
+    exit_code = 2
+
+
+class UnknownName(InputError):
+    """A name outside a closed list; the message lists what exists and suggests the nearest.
+
+    Args:
+        kind: what the name stands for, in one word ("camera", "encoder").
+        given: the name as given.
+        allowed: every name that exists.
+    """
+
+    def __init__(self, kind: str, given: object, allowed: Iterable[str]):
+        names = sorted(allowed)
+        near = difflib.get_close_matches(str(given), names, n=1, cutoff=0.5)
+        hint = f" Did you mean '{near[0]}'?" if near else ""
+        super().__init__(f"Unknown {kind} '{given}'.{hint} Allowed: {', '.join(names)}.")
+
+
+class BadFile(InputError):
+    """A file or folder that is missing, unreadable, damaged or of another kind than asked."""
+
+
+class OutputExists(InputError):
+    """An output path that already holds something this command did not make."""
+
+
+class MissingWeights(InputError):
+    """Pretrained weights that are neither at hand nor downloadable; names the file and the alternatives."""
+
+
+class UnreachablePose(SurgicaiError):
+    """A tool pose outside the arm's joint limits or workspace."""
+
+
+class PhysicsError(SurgicaiError):
+    """The simulation diverged or was started from an impossible state."""
+
+
+def check_name(kind: str, given: str, allowed: Iterable[str]) -> str:
+    """Return `given` if it is one of `allowed`, else raise `UnknownName`."""
+    names = tuple(allowed)
+    if given not in names:
+        raise UnknownName(kind, given, names)
+    return given

@@ -1,0 +1,80 @@
+"""Every name that crosses a module border, once: tasks, arms, cameras, modalities, dataset keys.
+
+Other modules import these and never spell them. Names are the field's: gymnasium, LeRobot, dVRK.
+"""
+
+from types import MappingProxyType
+
+SUBTASKS = ("grasp", "place", "insert", "handoff", "pullout")
+"""The five subtasks in the order of the procedure; a subtask's index is its `phase` and its class."""
+
+SUTURE = "suture"
+TASKS = (*SUBTASKS, SUTURE)
+
+ENV_IDS = MappingProxyType({task: f"surgicai_vision/{task.capitalize()}-v0" for task in TASKS})
+"""Task name → gymnasium id."""
+
+TASK_TEXTS = MappingProxyType(
+    {
+        "grasp": "Grasp the needle with the right-hand instrument.",
+        "place": "Place the needle tip at the entry point, perpendicular to the tissue.",
+        "insert": "Drive the needle through the tissue until its tip leaves the exit.",
+        "handoff": "Grasp the needle's tip side with the left-hand instrument.",
+        "pullout": "Pull the needle wholly out of the tissue to the end point.",
+        "suture": "Throw one stitch: grasp, place, insert, hand off and pull out the needle.",
+    }
+)
+"""Task name → the sentence stored as LeRobot's `task`."""
+
+PSM1, PSM2 = "psm1", "psm2"
+ARMS = (PSM1, PSM2)
+ACTIVE_ARM = MappingProxyType({"grasp": PSM2, "place": PSM2, "insert": PSM2, "handoff": PSM1, "pullout": PSM1})
+"""Subtask → the arm its action moves."""
+
+CAMERAS = ("front", "front_right", "back", "wrist_psm1", "wrist_psm2")
+RGB, DEPTH, SEGMENTATION = "rgb", "depth", "segmentation"
+MODALITIES = (RGB, DEPTH, SEGMENTATION)
+PARTS = ("background", "phantom", "needle", "thread", "psm1", "psm2")
+"""Named parts; a part's index is its value in a segmentation picture."""
+
+OBS_TYPES = ("state", "goal", "pixels", "pixels_agent_pos")
+GRASPS = ("friction", "attach")
+LAYOUTS = ("simple", "3dmed", "3dmed_straight")
+
+ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "jaw")
+STATE_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "jaw")
+
+# LeRobot keys.
+STATE = "observation.state"
+ACTION = "action"
+REWARD = "next.reward"
+DONE = "next.done"
+SUCCESS = "next.success"
+SEED = "seed"
+PHASE = "phase"
+CONTACT = "contact"
+NEEDLE_POSE = "needle_pose"
+
+META_FILE = "meta/surgicai.json"
+"""Our own sidecar inside a LeRobot dataset: cameras, units, renderer, hashes, versions."""
+
+FPS = 50
+"""Control steps and frames per second of simulated time."""
+
+TRAIN_SEED, VALIDATION_SEED, TEST_SEED = 0, 500_000, 900_000
+"""First seed of each bank of start states; the banks never meet (fewer than 400,000 seeds each)."""
+
+
+def image_key(view: str) -> str:
+    """LeRobot feature key of a view's RGB picture."""
+    return f"observation.images.{view}"
+
+
+def depth_key(view: str) -> str:
+    """LeRobot feature key of a view's depth picture [m]."""
+    return f"observation.images.{view}_depth"
+
+
+def segmentation_key(view: str) -> str:
+    """LeRobot feature key of a view's segmentation picture (part index)."""
+    return f"observation.images.{view}_segmentation"
