@@ -1,0 +1,36 @@
+# make setup        make .venv (and install what this machine lacks)
+# make quickstart   set up, then run the main job: outputs/quickstart/report.html
+# make test         set up, then pass the tests
+# make check        lint, format, types, import rule, tests
+# make format       rewrite the sources in the house's format
+# make lock         rewrite requirements.lock (UPGRADE=1: newest versions allowed)
+
+BIN := .venv/bin
+PYTEST_ARGS ?= -n 2 --dist loadfile
+
+.PHONY: setup quickstart test lint check format lock
+.NOTPARALLEL:
+
+setup:
+	@sh scripts/setup.sh
+
+quickstart: setup
+	$(BIN)/surgicai-vision quickstart
+
+test: setup
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/mypy
+
+check: lint test
+
+format: setup
+	$(BIN)/ruff check --fix-only --exit-zero .
+	$(BIN)/ruff format .
+
+lock: setup
+	sh scripts/lock.sh

@@ -1,0 +1,141 @@
+#!/bin/sh
+# Set up this checkout: GL packages if no GL renders, a Python >= 3.12, uv, and .venv from requirements.lock.
+# Asks nothing. A second call only verifies. POSIX sh; needs git, make and any python3 beforehand.
+set -eu
+
+root=$(cd "$(dirname "$0")/.." && pwd)
+cd "$root"
+venv=$root/.venv
+tools=$root/.venv-tools
+stamp=$venv/.surgicai-vision-setup
+minimum_gb=8
+
+say() { printf 'setup: %s\n' "$*"; }
+stop() { printf 'setup: %s\n' "$*" >&2; exit 1; }
+
+# The prefix that makes a command run as root: empty for root, "sudo -n" where sudo asks nothing.
+if [ "$(id -u)" = 0 ]; then
+    as_root=env
+elif sudo -n true 2>/dev/null; then
+    as_root="sudo -n"
+else
+    as_root=
+fi
+
+# apt_install REASON PACKAGE...: install Debian packages, or stop with the one line that does it.
+apt_install() {
+    reason=$1
+    shift
+    line="apt-get install --yes --no-install-recommends $*"
+    command -v apt-get >/dev/null 2>&1 || stop "$reason. This is not Debian or Ubuntu: install the equivalent of: $*"
+    [ -n "$as_root" ] || stop "$reason. Run: sudo $line"
+    say "$reason: $line"
+    log=$(mktemp)
+    {
+        $as_root apt-get -o DPkg::Lock::Timeout=300 update &&
+            $as_root env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=300 \
+                install --yes --no-install-recommends "$@"
+    } >"$log" 2>&1 </dev/null || { tail -n 20 "$log" >&2; stop "failed: sudo $line"; }
+    rm -f "$log"
+}
+
+# Candidates are run, never trusted by name: a pyenv shim exists and fails, and a Python built without lzma
+# or ssl cannot read a dataset.
+python_works() {
+    "$1" -c 'import sys
+assert (3, 12) <= sys.version_info[:2] <= (3, 13) and sys.implementation.name == "cpython"
+import bz2, ctypes, lzma, sqlite3, ssl' >/dev/null 2>&1
+}
+
+find_python() {
+    for candidate in ${PYTHON:+"$PYTHON"} python3.12 python3.13 python3 python \
+        "${PYENV_ROOT:-$HOME/.pyenv}"/versions/3.1[23]*/bin/python /usr/local/bin/python3.1[23] \
+        /opt/*/bin/python3.1[23] "$HOME"/.local/share/uv/python/cpython-3.1[23]*/bin/python; do
+        if python_works "$candidate"; then
+            "$candidate" -c 'import sys; print(sys.executable)'
+            return 0
+        fi
+    done
+    return 1
+}
+
+find_uv() {
+    for candidate in ${UV:+"$UV"} uv "$tools/bin/uv" "$HOME/.local/bin/uv" "$HOME/.cargo/bin/uv"; do
+        if "$candidate" --version 2>/dev/null | grep -q '^uv '; then
+            command -v "$candidate"
+            return 0
+        fi
+    done
+    return 1
+}
+
+# `pip --target` leaves the system's Python alone (PEP 668 permits it); `venv` serves where pip is missing.
+uv_from() {
+    rm -rf "$tools"
+    if PIP_REQUIRE_VIRTUALENV=0 "$1" -m pip install --quiet --disable-pip-version-check --no-deps \
+        --require-hashes --target "$tools" -r scripts/uv.txt >/dev/null 2>&1 && "$tools/bin/uv" --version; then
+        return 0
+    fi
+    rm -rf "$tools"
+    "$1" -m venv "$tools" && "$tools/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps \
+        --require-hashes -r scripts/uv.txt && "$tools/bin/uv" --version
+}
+
+install_uv() {
+    say "uv is missing: installing $(sed -n 's/^\(uv==[^ ;]*\).*/\1/p' scripts/uv.txt) in .venv-tools"
+    for candidate in python3 /usr/bin/python3 ${python:+"$python"}; do
+        if uv_from "$candidate" >/dev/null 2>&1; then return 0; fi
+    done
+    apt_install "python3 has neither pip nor venv" python3-venv
+    for candidate in /usr/bin/python3 python3; do
+        if uv_from "$candidate" >/dev/null; then return 0; fi
+    done
+    stop "uv could not be installed (see above). Install uv by any means and run this again."
+}
+
+check_gl() {
+    python3 scripts/gl_probe.py >/dev/null 2>&1 && return 0
+    apt_install "no OpenGL renders here ($(python3 scripts/gl_probe.py 2>&1 | tail -n 1))" libegl1 libgl1
+    python3 scripts/gl_probe.py >/dev/null || stop "libegl1 and libgl1 are installed and GL still does not render."
+}
+
+check_space() {
+    free_kb=$(df -Pk "$root" | awk 'NR == 2 { print $4 }')
+    [ "$free_kb" -ge $((minimum_gb * 1024 * 1024)) ] ||
+        say "warning: $((free_kb / 1024 / 1024)) GB free in $root; the environment takes about 6 GB"
+}
+
+make_venv() {
+    python_works "$venv/bin/python" && return 0
+    check_space
+    if [ -n "$python" ]; then
+        say "Python: $python"
+        "$uv" venv --quiet --clear --python "$python" "$venv"
+    else
+        say "no Python 3.12 or 3.13 runs here: uv fetches one"
+        "$uv" venv --quiet --clear --python 3.12 --python-preference only-managed "$venv" ||
+            stop "uv could not fetch Python 3.12. Install Python 3.12 or 3.13 and run: PYTHON=/path/to/python make setup"
+    fi
+}
+
+install_packages() {
+    say "installing $(grep -c '==' requirements.lock) locked packages in .venv (about 6 GB on disk, once)"
+    "$uv" pip install --quiet --python "$venv/bin/python" --require-hashes -r requirements.lock
+    "$uv" pip install --quiet --python "$venv/bin/python" --no-deps --no-build-isolation --editable .
+}
+
+command -v python3 >/dev/null 2>&1 || stop "python3 is missing; any version does. Run: sudo apt-get install --yes python3"
+check_gl
+
+wanted=$({ cat requirements.lock pyproject.toml scripts/setup.sh; printf '%s\n' "$root"; } | sha256sum | cut -d' ' -f1)
+if [ "$(cat "$stamp" 2>/dev/null)" = "$wanted" ] && python_works "$venv/bin/python"; then
+    exit 0
+fi
+
+python=$(find_python) || python=
+uv=$(find_uv) || { install_uv; uv=$tools/bin/uv; }
+make_venv
+rm -f "$stamp"
+install_packages
+printf '%s\n' "$wanted" >"$stamp"
+say "done: the commands stand in .venv/bin; 'make quickstart' runs the main job, '.venv/bin/surgicai-vision doctor' looks at this machine"
