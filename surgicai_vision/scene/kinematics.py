@@ -1,0 +1,239 @@
+"""Kinematics of the da Vinci patient-side manipulator (PSM): joints ⇄ pose of the tool tip in the arm's base.
+
+Modified DH table (α, a, θ, d), as the surgical robotics challenge publishes it:
+1 (π/2, 0, q1 + π/2, 0); 2 (-π/2, 0, q2 - π/2, 0); 3 (π/2, 0, 0, q3 - L_rcc); 4 (0, 0, q4, L_tool);
+5 (-π/2, 0, q5 - π/2, 0); 6 (-π/2, L_p2y, q6 - π/2, 0); 7 (-π/2, 0, π/2, 0).
+
+The base origin is the remote centre of motion: the shaft passes through it, so both directions are closed
+forms. Multiplied out, with L = L_tool - L_rcc and s, c for sine and cosine:
+
+    shaft  z3 = (s1 c2, -s2, -c1 c2),  x3 = (-s1 s2, -c2, c1 s2),  y3 = (-c1, 0, -s1)
+    wrist  w  = (q3 + L) z3                       where the pitch axis meets the shaft
+    pitch axis  e = s4 x3 - c4 y3
+    pitch link  u = s5 (c4 x3 + s4 y3) + c5 z3
+    tip    p  = w + L_p2y u                       on the yaw axis
+    columns of R: x = -c5 (c4 x3 + s4 y3) + s5 z3,  y = c6 e - s6 u,  z = c6 u + s6 e
+
+`…_flat` functions work on plain floats for the control step: a pose is a tuple of twelve floats, the position
+and then the rotation row by row.
+"""
+
+from dataclasses import dataclass
+from math import atan2, cos, pi, radians, sin, sqrt
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from surgicai_vision.errors import InputError, UnreachablePose, check_name
+from surgicai_vision.names import PSM1, PSM2
+from surgicai_vision.scene.rotations import rpy_to_matrix
+
+Joints = tuple[float, float, float, float, float, float]
+"""outer_yaw, outer_pitch [rad], outer_insertion [m], outer_roll, outer_wrist_pitch, outer_wrist_yaw [rad]."""
+Pose = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+"""Position [m], then the rotation matrix row by row."""
+
+JOINT_NAMES = ("outer_yaw", "outer_pitch", "outer_insertion", "outer_roll", "outer_wrist_pitch", "outer_wrist_yaw")
+"""The dVRK's names; a joint in the model is f"{arm}_{name}"."""
+INSERTION = JOINT_NAMES.index("outer_insertion")
+
+TOLERANCE = 1e-9
+"""How far past a joint limit a solution may lie [rad or m]: rounding, not motion."""
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """Lengths [m] and joint limits of a PSM with one instrument.
+
+    Attributes:
+        name: Intuitive's number of the instrument.
+        rcc: L_rcc, from the remote centre to the tool carriage at zero insertion.
+        tool: L_tool, from the carriage to the wrist's pitch axis.
+        pitch_to_yaw: L_p2y, from the wrist's pitch axis to its yaw axis, where the tip frame lies.
+        lower, upper: limits of the six joints in the order of `JOINT_NAMES` [rad, m].
+        jaw: limits of a finger's angle [rad].
+    """
+
+    name: str
+    rcc: float
+    tool: float
+    pitch_to_yaw: float
+    lower: Joints
+    upper: Joints
+    jaw: tuple[float, float]
+
+
+def _instrument(name: str, rcc: float, tool: float, degrees: tuple[float, ...], jaw: tuple[float, float]) -> Instrument:
+    """Build an instrument with symmetric limits `degrees` of the five turning joints and 0..0.24 m insertion."""
+    yaw, pitch, roll, wrist_pitch, wrist_yaw = (radians(angle) for angle in degrees)
+    lower = (-yaw, -pitch, 0.0, -roll, -wrist_pitch, -wrist_yaw)
+    upper = (yaw, pitch, 0.24, roll, wrist_pitch, wrist_yaw)
+    return Instrument(name, rcc, tool, 0.009, lower, upper, jaw)
+
+
+INSTRUMENTS = MappingProxyType(
+    {
+        "400006": _instrument("400006", 0.4389, 0.416, (92.0, 60.0, 175.0, 90.0, 85.0), (0.0, 1.57)),
+        "420006": _instrument("420006", 0.4318, 0.4826, (91.0, 53.0, 175.0, 80.0, 80.0), (radians(-20), radians(80))),
+    }
+)
+"""Large needle drivers of the surgical robotics challenge; SurgicAI uses 400006."""
+DEFAULT = "400006"
+
+BASES = MappingProxyType(
+    {
+        PSM1: ((0.1, 0.13461, 0.13499), (0.6981, -0.5236, -3.1416)),
+        PSM2: ((-0.1, 0.13461, 0.13499), (0.6981, 0.5236, -3.1416)),
+    }
+)
+"""Arm → position [m] and roll, pitch, yaw [rad] of its base in world (SurgicAI's scene)."""
+
+PSM1_START = (0.04629208, 0.00752399, -0.08173992, -3.598019, -0.05762508, 1.2738742, 0.8)
+PSM2_START = (-0.03721037, 0.01213105, -0.08036895, -2.7039163, 0.07693613, 2.0361109, 0.8)
+"""Tip at the start of an episode in the arm's own base: x y z [m], roll pitch yaw, jaw [rad] (released code)."""
+STARTS = MappingProxyType({PSM1: PSM1_START, PSM2: PSM2_START})
+
+
+def limits(instrument: str = DEFAULT) -> NDArray[np.float64]:
+    """Return the lower and upper limit of each joint, (6, 2) [rad, m]."""
+    chosen = INSTRUMENTS[check_name("instrument", instrument, INSTRUMENTS)]
+    return np.array([chosen.lower, chosen.upper]).T
+
+
+def base_in_world(arm: str) -> NDArray[np.float64]:
+    """Return T_world_base (4, 4) of "psm1" or "psm2"."""
+    position, rpy = BASES[check_name("arm", arm, BASES)]
+    return _matrix(position, rpy_to_matrix(*rpy))
+
+
+def start_in_base(arm: str) -> NDArray[np.float64]:
+    """Return T_base_tip (4, 4) at the start of an episode."""
+    start = STARTS[check_name("arm", arm, STARTS)]
+    return _matrix(start[:3], rpy_to_matrix(*start[3:6]))
+
+
+def forward(q6: ArrayLike, instrument: str = DEFAULT) -> NDArray[np.float64]:
+    """Return T_base_tip (4, 4) of the joints (6,) [rad, m]; limits are not checked."""
+    check_name("instrument", instrument, INSTRUMENTS)
+    pose = forward_flat(np.asarray(q6, dtype=np.float64).tolist(), instrument)
+    return _matrix(pose[:3], np.array(pose[3:]).reshape(3, 3))
+
+
+def inverse(T_base_tip: ArrayLike, instrument: str = DEFAULT, near: ArrayLike | None = None) -> NDArray[np.float64]:
+    """Return the joints (6,) [rad, m] that put the tip at `T_base_tip` (4, 4).
+
+    Args:
+        near: joints (6,) the arm comes from. The roll is then unwrapped towards them: a pose that is only
+            reached by turning the roll back through its whole range is refused. Without it, any solution will do.
+
+    Raises:
+        UnreachablePose: outside a joint limit; names joint, value and limit.
+        InputError: not a (4, 4) matrix of finite numbers.
+    """
+    check_name("instrument", instrument, INSTRUMENTS)
+    matrix = np.asarray(T_base_tip, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"T_base_tip must be a finite 4 × 4 matrix; its shape is {matrix.shape}.")
+    pose = (*matrix[:3, 3].tolist(), *matrix[:3, :3].ravel().tolist())
+    joints = None if near is None else tuple(np.asarray(near, dtype=np.float64).tolist())
+    return np.array(inverse_flat(pose, instrument, joints))
+
+
+def forward_flat(q: Joints, instrument: str = DEFAULT) -> Pose:
+    """Return the tip's pose in the base as twelve floats."""
+    q1, q2, q3, q4, q5, q6 = q
+    length = INSTRUMENTS[instrument]
+    s1, c1, s2, c2, s4, c4 = sin(q1), cos(q1), sin(q2), cos(q2), sin(q4), cos(q4)
+    s5, c5, s6, c6 = sin(q5), cos(q5), sin(q6), cos(q6)
+    zx, zy, zz = s1 * c2, -s2, -c1 * c2
+    xx, xy, xz = -s1 * s2, -c2, c1 * s2
+    ex, ey, ez = s4 * xx + c4 * c1, s4 * xy, s4 * xz + c4 * s1
+    fx, fy, fz = c4 * xx - s4 * c1, c4 * xy, c4 * xz - s4 * s1
+    ux, uy, uz = s5 * fx + c5 * zx, s5 * fy + c5 * zy, s5 * fz + c5 * zz
+    depth, p2y = q3 + length.tool - length.rcc, length.pitch_to_yaw
+    return (
+        depth * zx + p2y * ux, depth * zy + p2y * uy, depth * zz + p2y * uz,
+        s5 * zx - c5 * fx, c6 * ex - s6 * ux, c6 * ux + s6 * ex,
+        s5 * zy - c5 * fy, c6 * ey - s6 * uy, c6 * uy + s6 * ey,
+        s5 * zz - c5 * fz, c6 * ez - s6 * uz, c6 * uz + s6 * ez,
+    )  # fmt: skip
+
+
+def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = None) -> Joints:
+    """Return the joints of a tip pose given as twelve floats; see `inverse`."""
+    px, py, pz, ax, yx, bx, ay, yy, by, az, yz, bz = pose
+    length = INSTRUMENTS[instrument]
+    # The pitch axis e stands on the plane of the shaft and the yaw axis a, which holds the base origin and the tip.
+    ex, ey, ez = py * az - pz * ay, pz * ax - px * az, px * ay - py * ax
+    norm = sqrt(ex * ex + ey * ey + ez * ez)
+    if norm < 1e-12:  # the yaw axis passes through the remote centre: every wrist yaw serves, take none
+        ex, ey, ez, norm = yx, yy, yz, 1.0
+    ex, ey, ez = ex / norm, ey / norm, ez / norm
+    ux, uy, uz = ay * ez - az * ey, az * ex - ax * ez, ax * ey - ay * ex
+    c6 = bx * ux + by * uy + bz * uz
+    if c6 < 0.0:  # e and -e give wrist yaws half a turn apart; only one is within ±90°
+        ex, ey, ez, ux, uy, uz, c6 = -ex, -ey, -ez, -ux, -uy, -uz, -c6
+    q6 = atan2(bx * ex + by * ey + bz * ez, c6)
+    p2y = length.pitch_to_yaw
+    wx, wy, wz = px - p2y * ux, py - p2y * uy, pz - p2y * uz
+    depth = sqrt(wx * wx + wy * wy + wz * wz)
+    offset = length.rcc - length.tool
+    geometry = (ux, uy, uz, ex, ey, ez, ax, ay, az)
+    if depth < 1e-12:  # the wrist lies in the remote centre: any shaft will do, take the pitch link's own
+        return _checked((*_shaft(ux, uy, uz, offset, geometry, near), q6), length)
+    joints = (*_shaft(wx / depth, wy / depth, wz / depth, depth + offset, geometry, near), q6)
+    if depth <= offset:  # the wrist may be behind the remote centre: 400006 at less than 23 mm of insertion
+        behind = (*_shaft(-wx / depth, -wy / depth, -wz / depth, offset - depth, geometry, near), q6)
+        return _checked(_better(joints, behind, length, near), length)
+    return _checked(joints, length)
+
+
+def _shaft(
+    zx: float, zy: float, zz: float, q3: float, geometry: tuple[float, ...], near: Joints | None
+) -> tuple[float, float, float, float, float]:
+    """Return the first five joints for a shaft along z = (zx, zy, zz) and insertion `q3`."""
+    ux, uy, uz, ex, ey, ez, ax, ay, az = geometry
+    c2 = sqrt(zx * zx + zz * zz)
+    s1, c1 = (zx / c2, -zz / c2) if c2 > 0.0 else (0.0, 1.0)
+    # s4 = e · x3 and c4 = -e · y3, s5 = a · z3 and c5 = u · z3.
+    q4 = atan2(s1 * zy * ex - c2 * ey - c1 * zy * ez, c1 * ex + s1 * ez)
+    if near is not None:
+        q4 += 2.0 * pi * round((near[3] - q4) / (2.0 * pi))
+    return atan2(s1, c1), atan2(-zy, c2), q3, q4, atan2(ax * zx + ay * zy + az * zz, ux * zx + uy * zy + uz * zz)
+
+
+def _better(first: Joints, second: Joints, instrument: Instrument, near: Joints | None) -> Joints:
+    """Return the solution within limits, and of two the one nearer to `near` (or to zero)."""
+    if _violation(first, instrument) >= 0 or _violation(second, instrument) >= 0:
+        return second if _violation(second, instrument) < 0 else first
+    goal = near or (0.0,) * 6
+    return min((first, second), key=lambda joints: sum((a - b) ** 2 for a, b in zip(joints, goal, strict=True)))
+
+
+def _violation(joints: Joints, instrument: Instrument) -> int:
+    """Return the index of the first joint outside its limits, -1 for none."""
+    for index, (low, value, high) in enumerate(zip(instrument.lower, joints, instrument.upper, strict=True)):
+        if not low - TOLERANCE <= value <= high + TOLERANCE:
+            return index
+    return -1
+
+
+def _checked(joints: Joints, instrument: Instrument) -> Joints:
+    """Return `joints`, or raise `UnreachablePose` for the first one outside its limits."""
+    index = _violation(joints, instrument)
+    if index < 0:
+        return joints
+    low, high, value = instrument.lower[index], instrument.upper[index], joints[index]
+    scale, unit = (1000.0, "mm") if index == INSERTION else (180.0 / pi, "°")
+    raise UnreachablePose(
+        f"Pose out of reach: {JOINT_NAMES[index]} would be {value * scale:.2f} {unit}; "
+        f"instrument {instrument.name} allows {low * scale:.2f} to {high * scale:.2f} {unit}."
+    )
+
+
+def _matrix(position: ArrayLike, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (4, 4) transform of a position (3,) and a rotation (3, 3)."""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, position
+    return transform
