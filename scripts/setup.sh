@@ -72,25 +72,27 @@ find_uv() {
 # `pip --target` leaves the system's Python alone (PEP 668 permits it); `venv` serves where pip is missing.
 uv_from() {
     rm -rf "$tools"
-    if PIP_REQUIRE_VIRTUALENV=0 "$1" -m pip install --quiet --disable-pip-version-check --no-deps \
-        --require-hashes --target "$tools" -r scripts/uv.txt >/dev/null 2>&1 && "$tools/bin/uv" --version; then
-        return 0
-    fi
-    rm -rf "$tools"
-    "$1" -m venv "$tools" && "$tools/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps \
-        --require-hashes -r scripts/uv.txt && "$tools/bin/uv" --version
+    maker=$1
+    set -- install --quiet --disable-pip-version-check --no-deps --require-hashes -r scripts/uv.txt
+    if "$maker" -m pip --version >/dev/null 2>&1; then
+        PIP_REQUIRE_VIRTUALENV=0 "$maker" -m pip "$@" --target "$tools"
+    else
+        "$maker" -m venv "$tools" && "$tools/bin/python" -m pip "$@"
+    fi && "$tools/bin/uv" --version >/dev/null || stop "uv could not be installed (see above); install it by any means and run this again"
 }
 
 install_uv() {
     say "uv is missing: installing $(sed -n 's/^\(uv==[^ ;]*\).*/\1/p' scripts/uv.txt) in .venv-tools"
-    for candidate in python3 /usr/bin/python3 ${python:+"$python"}; do
-        if uv_from "$candidate" >/dev/null 2>&1; then return 0; fi
+    for attempt in first second; do
+        for maker in ${python:+"$python"} python3 /usr/bin/python3; do
+            if "$maker" -c 'import pip' 2>/dev/null || "$maker" -c 'import ensurepip, venv' 2>/dev/null; then
+                uv_from "$maker"
+                return 0
+            fi
+        done
+        [ "$attempt" = first ] && apt_install "python3 has neither pip nor venv" python3-venv
     done
-    apt_install "python3 has neither pip nor venv" python3-venv
-    for candidate in /usr/bin/python3 python3; do
-        if uv_from "$candidate" >/dev/null; then return 0; fi
-    done
-    stop "uv could not be installed (see above). Install uv by any means and run this again."
+    stop "python3 has neither pip nor venv; install uv by any means and run this again"
 }
 
 check_gl() {

@@ -4,6 +4,7 @@ Every stage writes through this module, so a process killed at any moment leaves
 new one, or a temporary name that the next run removes.
 """
 
+import functools
 import hashlib
 import json
 import os
@@ -14,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from surgicai_vision import __version__
 from surgicai_vision.errors import BadFile, InputError, OutputExists
 
 TEMPORARY = ".partial-"
@@ -109,3 +111,26 @@ def sha256_file(path: Path) -> str:
     """sha256 (hex) of a file's bytes."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@functools.cache
+def code_version(*stages: str) -> str:
+    """Return "<version>+<12 hex digits>": the sha256 over the sources of this package.
+
+    Args:
+        stages: only these stages ("envs", "demos", …) and the shared modules; none means all of them.
+    """
+    package = Path(__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        stage = path.relative_to(package).parts[0].removesuffix(".py")
+        if not stages or stage in (*stages, "names", "config"):
+            digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes() + b"\0")
+    return f"{__version__}+{digest.hexdigest()[:12]}"
+
+
+def configs_folder() -> Path:
+    """Return the folder of the configurations that ship with the package (in a checkout: `configs/`)."""
+    package = Path(__file__).parent
+    shipped = package / "configs"
+    return shipped if shipped.is_dir() else package.parent / "configs"
