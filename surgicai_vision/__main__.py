@@ -1,0 +1,8 @@
+"""`python -m surgicai_vision` is the command line."""
+
+import sys
+
+from surgicai_vision.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

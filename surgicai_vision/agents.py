@@ -1,0 +1,145 @@
+"""Agents: what acts in an evaluation. The expert, two baselines, and a policy with its frozen encoder."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.errors import UnreachablePose
+
+CHUNK = 8
+"""Frames an encoder sees at once. Fixed (the last chunk is padded), because a library may choose another
+algorithm, with other rounding, for another batch size, and a policy's episode must not depend on it."""
+
+
+@final
+class ExpertAgent:
+    """The scripted expert: reads the env's state, needs no pictures."""
+
+    name = "expert"
+    cameras: tuple[str, ...] = ()
+    image_size = 224
+
+    def __init__(self) -> None:
+        self._experts: dict[int, Any] = {}
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Make an expert for the slot's episode."""
+        from surgicai_vision.demos.expert import Expert
+
+        expert = Expert(env)
+        expert.reset()
+        self._experts[slot] = expert
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the experts' actions (n, 7); not a number where the expert knows no way on."""
+        actions = np.full((len(slots), 7), np.nan, np.float32)
+        for row, slot in enumerate(slots):
+            try:
+                actions[row] = self._experts[slot].action()
+            except UnreachablePose:
+                continue
+        return actions
+
+
+@final
+class RandomAgent:
+    """Uniform actions, drawn from the episode's own seed."""
+
+    name = "random"
+    cameras: tuple[str, ...] = ()
+    image_size = 224
+
+    def __init__(self) -> None:
+        self._generators: dict[int, np.random.Generator] = {}
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Seed the slot's generator."""
+        self._generators[slot] = np.random.default_rng(seed)
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return actions (n, 7) in [-1, 1]."""
+        return np.stack([self._generators[slot].uniform(-1, 1, 7).astype(np.float32) for slot in slots])
+
+
+@final
+class ZeroAgent:
+    """Zero actions."""
+
+    name = "zero"
+    cameras: tuple[str, ...] = ()
+    image_size = 224
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return zeros (n, 7)."""
+        return np.zeros((len(slots), 7), np.float32)
+
+
+BASELINES = {agent.name: agent for agent in (ExpertAgent, RandomAgent, ZeroAgent)}
+"""Name → agent that needs no checkpoint."""
+
+
+@final
+class PolicyAgent:
+    """A trained policy; sees the pictures of its views and the measured pose of its tip, nothing else.
+
+    Args:
+        name: how tables call it.
+        policy: has `act(features (B, F) or None, agent_pos (B, 7)) -> (B, 7)`.
+        encoder: frames (B, H, W, 3) → features (B, dim), or None for a policy without pictures.
+        cameras: the policy's views, in the order of its features.
+        image_size: height and width the policy was trained on [px].
+    """
+
+    def __init__(self, name: str, policy: Any, encoder: Any, cameras: tuple[str, ...], image_size: int):
+        self.name, self.cameras, self.image_size = name, cameras, image_size
+        self._policy, self._encoder = policy, encoder
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Nothing to forget: the policy has no memory."""
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the policy's actions (n, 7)."""
+        with one_thread():
+            poses = np.stack([_agent_pos(o, env) for o, env in zip(observations, envs, strict=True)])
+            if self.cameras:
+                views = [np.stack([o["pixels"][view] for o in observations]) for view in self.cameras]
+                features = np.concatenate([in_chunks(self._encoder, frames) for frames in views], axis=1)
+                return in_chunks(self._policy.act, features, poses)
+            return in_chunks(lambda chunk: self._policy.act(None, chunk), poses)
+
+
+def _agent_pos(observation: Any, env: Any) -> NDArray[np.float32]:
+    """The measured tip pose and jaw (7,): from the observation, or asked of an env that renders nothing."""
+    pose = observation["agent_pos"] if isinstance(observation, dict) else env.agent_pos()
+    return np.asarray(pose, np.float32)
+
+
+def in_chunks(function: Callable[..., Any], *arrays: NDArray[Any]) -> NDArray[np.float32]:
+    """Apply `function` to rows in chunks of exactly `CHUNK`, the last one padded by repeating its last row."""
+    count, parts = len(arrays[0]), []
+    for start in range(0, count, CHUNK):
+        chunks = [array[start : start + CHUNK] for array in arrays]
+        missing = CHUNK - len(chunks[0])
+        padded = [np.concatenate([chunk, np.repeat(chunk[-1:], missing, axis=0)]) for chunk in chunks]
+        parts.append(np.asarray(function(*padded), np.float32)[: CHUNK - missing])
+    return np.concatenate(parts)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute with one thread: processes share the cores, and sums keep their order."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+

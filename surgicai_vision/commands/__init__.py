@@ -1,0 +1,29 @@
+"""The verbs, one file each, in the order of the flow.
+
+A verb's module holds `EXAMPLE` (one command line), `Options` (a frozen dataclass: the schema of its
+options and of its `--config` file) and `run(options, console) -> dict` (the result `--json` prints).
+"""
+
+from types import MappingProxyType
+
+VERBS = MappingProxyType(
+    {
+        "quickstart": "run the whole flow once, small, and write its report",
+        "doctor": "check this machine and say what to do",
+        "scene": "show what every camera sees",
+        "record-demos": "record demonstrations by the scripted expert",
+        "import-demos": "read demonstrations of the original SurgicAI",
+        "render-demos": "render demonstrations into a LeRobot dataset",
+        "encode": "compute a dataset's frozen features",
+        "train": "train a policy on a dataset's features",
+        "evaluate": "run a policy from held-out starts and count successes",
+        "sweep": "encode, train and evaluate every cell of a grid",
+        "report": "write the report of stored results",
+    }
+)
+"""Verb → what it does, in one line."""
+
+
+def module_name(verb: str) -> str:
+    """Name of the module that holds `verb`."""
+    return f"{__name__}.{verb.replace('-', '_')}"

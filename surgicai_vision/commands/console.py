@@ -1,0 +1,62 @@
+"""The console: results on stdout, progress on stderr."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import final
+
+Progress = Callable[..., None]
+"""Called as progress(done, total) or progress(done, total, unit), both counted from the start."""
+
+
+@final
+class Console:
+    """Where a verb prints. `rich` is imported on the first bar, so that short verbs stay quick."""
+
+    def say(self, text: str = "") -> None:
+        """Print a line of the result."""
+        print(text, flush=True)
+
+    def note(self, text: str) -> None:
+        """Print a line that is not part of the result."""
+        from rich.console import Console as Rich
+
+        Rich(stderr=True, highlight=False).print(text, markup=False, soft_wrap=True)
+
+    @contextmanager
+    def stage(self, title: str, unit: str = "") -> Iterator[Progress]:
+        """Show a progress bar for one stage; yields the function that moves it."""
+        from rich.console import Console as Rich
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+        from rich.progress import TimeRemainingColumn
+
+        columns = (
+            TextColumn("{task.description:<46}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[unit]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(compact=True),
+        )
+        with Progress(*columns, console=Rich(stderr=True), refresh_per_second=4) as bars:
+            bar = bars.add_task(title, total=None, unit=unit)
+
+            def move(done: int, total: int, unit: str = unit) -> None:
+                bars.update(bar, completed=done, total=total, unit=unit)
+
+            yield move
+
+
+@final
+class QuietConsole:
+    """A console that shows nothing (tests and calls from Python)."""
+
+    def say(self, text: str = "") -> None:
+        """Drop the line."""
+
+    def note(self, text: str) -> None:
+        """Drop the line."""
+
+    @contextmanager
+    def stage(self, title: str, unit: str = "") -> Iterator[Progress]:
+        """Yield a function that does nothing."""
+        yield lambda done, total, unit="": None

@@ -1,0 +1,206 @@
+"""Options: a frozen dataclass per verb becomes its command line and the schema of its `--config` file.
+
+Values are taken in this order: the command line, the file, the dataclass's default.
+"""
+
+import argparse
+import dataclasses
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from surgicai_vision.config import SceneConfig, TaskConfig, from_mapping
+from surgicai_vision.errors import BadFile, InputError, UnknownName, check_name
+
+T = TypeVar("T")
+Check = Callable[[str, Any], None]
+
+
+def option(default: Any, text: str, *, check: Check | None = None, metavar: str = "", default_text: str = "") -> Any:
+    """Declare an option.
+
+    Args:
+        default: its default; `dataclasses.MISSING` makes it a required positional argument.
+        text: what it is, for `--help`.
+        check: called with the option's name and value; raises `InputError`.
+        metavar: how `--help` names its value.
+        default_text: what `--help` says of a default that depends on other options.
+    """
+    metadata = {"text": text, "check": check, "metavar": metavar, "default_text": default_text}
+    if default is dataclasses.MISSING:
+        return dataclasses.field(metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclasses.dataclass(frozen=True)
+class Env:
+    """The table `env` of a `--config` file: how episodes differ from the defaults of `TaskConfig`."""
+
+    scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+    step: str = TaskConfig.step
+    tolerance: str = TaskConfig.tolerance
+    max_steps: int = TaskConfig.max_steps
+
+    def task_config(self, task: str) -> TaskConfig:
+        """Return the configuration of `task`."""
+        return TaskConfig(task, self.scene, self.step, self.tolerance, max_steps=self.max_steps)
+
+
+def config_only() -> Any:
+    """Declare a table that only the `--config` file can give."""
+    return dataclasses.field(default=None, metadata={"config_only": True})
+
+
+def positive(name: str, value: float | None) -> None:
+    """Refuse a number below 1."""
+    if value is not None and value < 1:
+        raise InputError(f"{name} is {value}; it must be at least 1.")
+
+
+def not_negative(name: str, value: float | None) -> None:
+    """Refuse a number below 0."""
+    if value is not None and value < 0:
+        raise InputError(f"{name} is {value}; it must be at least 0.")
+
+
+def one_of(kind: str, allowed: Iterable[str]) -> Check:
+    """Return a check that admits one of `allowed`."""
+    known = tuple(allowed)
+
+    def check(_: str, value: str | None) -> None:
+        if value is not None:
+            check_name(kind, value, known)
+
+    return check
+
+
+def many_of(kind: str, allowed: Iterable[str]) -> Check:
+    """Return a check that admits a list without repetition of names among `allowed`."""
+    known = tuple(allowed)
+
+    def check(name: str, values: tuple[str, ...]) -> None:
+        for value in values:
+            check_name(kind, value, known)
+            if values.count(value) > 1:
+                raise InputError(f"{name} names '{value}' twice; give each {kind} once.")
+
+    return check
+
+
+def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
+    """Add the options of the dataclass `cls` to `parser`; what is not given stays out of the result."""
+    hints = typing.get_type_hints(cls)
+    for field in dataclasses.fields(cls):
+        meta = field.metadata
+        if meta.get("config_only"):
+            continue
+        hint = _plain(hints[field.name])
+        keywords: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(field)}
+        if hint is bool:
+            keywords["action"] = argparse.BooleanOptionalAction
+        else:
+            keywords["type"] = _READERS.get(hint, _names)
+            keywords["metavar"] = meta["metavar"] or field.name.upper()
+        if field.default is dataclasses.MISSING:
+            parser.add_argument(field.name, **keywords)
+        else:
+            parser.add_argument(flag(field.name), dest=field.name, **keywords)
+
+
+def flag(name: str) -> str:
+    """The command-line spelling of a field's name."""
+    return f"--{name.replace('_', '-')}"
+
+
+def build(cls: type[T], given: Mapping[str, Any], config: Path | None) -> T:
+    """Build the options from the command line's values and a YAML file, and check every value.
+
+    Raises:
+        BadFile: a file that is missing or no YAML table.
+        UnknownName: a key of the file that the verb does not have.
+        InputError: a value out of its range.
+    """
+    values = _read(cls, config) if config else {}
+    options = from_mapping(cls, {**values, **given}, where=str(config) if config else "options")
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        check = field.metadata.get("check")
+        if check is not None:
+            check(flag(field.name), getattr(options, field.name))
+    return options
+
+
+def _read(cls: type, path: Path) -> dict[str, Any]:
+    """Read a YAML table; a comma list is taken where a list is wanted."""
+    table = read_yaml(path)
+    hints = typing.get_type_hints(cls)
+    for key, value in table.items():
+        if key in hints and typing.get_origin(hints[key]) is tuple and isinstance(value, str):
+            table[key] = list(_names(value))
+    return table
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML file that holds a table; `BadFile` where it is missing or something else."""
+    import yaml
+
+    try:
+        table = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BadFile(f"{path} is not valid YAML ({' '.join(str(error).split())}).") from None
+    if not isinstance(table, dict) or not all(isinstance(key, str) for key in table):
+        raise BadFile(f"{path} holds no table of keys; write one `key: value` a line.")
+    return table
+
+
+def nearest_option(given: str, parser: argparse.ArgumentParser) -> UnknownName:
+    """Return the error for an option that `parser` does not have."""
+    return UnknownName("option", given.split("=")[0], parser._option_string_actions)
+
+
+def _help(field: "dataclasses.Field[Any]") -> str:
+    """An option's help with its default."""
+    text = field.metadata["text"]
+    shown = field.metadata["default_text"]
+    if not shown and field.default is not dataclasses.MISSING and field.default is not None:
+        default = field.default
+        shown = ",".join(default) if isinstance(default, tuple) else str(default)
+        shown = {"True": "on", "False": "off"}.get(shown, shown)
+    return (f"{text} (default: {shown})" if shown else text).replace("%", "%%")
+
+
+def _plain(hint: Any) -> Any:
+    """The type behind `X | None`."""
+    if isinstance(hint, types.UnionType):
+        return next(part for part in typing.get_args(hint) if part is not type(None))
+    return hint
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a whole number, got '{text}'") from None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a number, got '{text}'") from None
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Read a comma list; the empty text is the empty list."""
+    parts = tuple(part.strip() for part in text.split(","))
+    if parts == ("",):
+        return ()
+    if "" in parts:
+        raise argparse.ArgumentTypeError(f"expected names between commas, got '{text}'")
+    return parts
+
+
+_READERS: Mapping[Any, Callable[[str], Any]] = types.MappingProxyType({int: _whole, float: _number, str: str})
