@@ -1,10 +1,6 @@
 """Kinematics of the da Vinci patient-side manipulator (PSM): joints ⇄ pose of the tool tip in the arm's base.
 
-Modified DH table (α, a, θ, d), as the surgical robotics challenge publishes it:
-1 (π/2, 0, q1 + π/2, 0); 2 (-π/2, 0, q2 - π/2, 0); 3 (π/2, 0, 0, q3 - L_rcc); 4 (0, 0, q4, L_tool);
-5 (-π/2, 0, q5 - π/2, 0); 6 (-π/2, L_p2y, q6 - π/2, 0); 7 (-π/2, 0, π/2, 0).
-
-The base origin is the remote centre of motion: the shaft passes through it, so both directions are closed
+`Instrument.dh` is the modified DH table that the surgical robotics challenge publishes. The base origin is the remote centre of motion: the shaft passes through it, so both directions are closed
 forms. Multiplied out, with L = L_tool - L_rcc and s, c for sine and cosine:
 
     shaft  z3 = (s1 c2, -s2, -c1 c2),  x3 = (-s1 s2, -c2, c1 s2),  y3 = (-c1, 0, -s1)
@@ -18,9 +14,11 @@ forms. Multiplied out, with L = L_tool - L_rcc and s, c for sine and cosine:
 and then the rotation row by row.
 """
 
+import math
 from dataclasses import dataclass
 from math import atan2, cos, pi, radians, sin, sqrt
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,12 +32,22 @@ Joints = tuple[float, float, float, float, float, float]
 Pose = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """Position [m], then the rotation matrix row by row."""
 
-JOINT_NAMES = ("outer_yaw", "outer_pitch", "outer_insertion", "outer_roll", "outer_wrist_pitch", "outer_wrist_yaw")
+DVRK_JOINTS = ("outer_yaw", "outer_pitch", "outer_insertion", "outer_roll", "outer_wrist_pitch", "outer_wrist_yaw")
 """The dVRK's names; a joint in the model is f"{arm}_{name}"."""
-INSERTION = JOINT_NAMES.index("outer_insertion")
+INSERTION = DVRK_JOINTS.index("outer_insertion")
 
 TOLERANCE = 1e-9
 """How far past a joint limit a solution may lie [rad or m]: rounding, not motion."""
+
+
+class Row(NamedTuple):
+    """One row: RotX(alpha) TransX(a) RotZ(q + offset) TransZ(d) [rad, m]; where `prismatic`, q adds to d."""
+
+    alpha: float
+    a: float
+    d: float
+    offset: float
+    prismatic: bool = False
 
 
 @dataclass(frozen=True)
@@ -50,32 +58,40 @@ class Instrument:
         name: Intuitive's number of the instrument.
         rcc: L_rcc, from the remote centre to the tool carriage at zero insertion.
         tool: L_tool, from the carriage to the wrist's pitch axis.
+        limits: lower and upper limit of the six joints in the order of `DVRK_JOINTS` [rad, m].
+        jaw: lower and upper limit of a finger's angle [rad].
         pitch_to_yaw: L_p2y, from the wrist's pitch axis to its yaw axis, where the tip frame lies.
-        lower, upper: limits of the six joints in the order of `JOINT_NAMES` [rad, m].
-        jaw: limits of a finger's angle [rad].
     """
 
     name: str
     rcc: float
     tool: float
-    pitch_to_yaw: float
-    lower: Joints
-    upper: Joints
+    limits: tuple[tuple[float, float], ...]
     jaw: tuple[float, float]
+    pitch_to_yaw: float = 0.009
+
+    @property
+    def dh(self) -> tuple[Row, ...]:
+        """Return the table: six joints and the fixed tip."""
+        right = pi / 2
+        first, second = Row(right, 0.0, 0.0, right), Row(-right, 0.0, 0.0, -right)
+        insertion, roll = Row(right, 0.0, -self.rcc, 0.0, prismatic=True), Row(0.0, 0.0, self.tool, 0.0)
+        wrist_yaw, tip = Row(-right, self.pitch_to_yaw, 0.0, -right), Row(-right, 0.0, 0.0, right)
+        return first, second, insertion, roll, second, wrist_yaw, tip
 
 
-def _instrument(name: str, rcc: float, tool: float, degrees: tuple[float, ...], jaw: tuple[float, float]) -> Instrument:
-    """Build an instrument with symmetric limits `degrees` of the five turning joints and 0..0.24 m insertion."""
-    yaw, pitch, roll, wrist_pitch, wrist_yaw = (radians(angle) for angle in degrees)
-    lower = (-yaw, -pitch, 0.0, -roll, -wrist_pitch, -wrist_yaw)
-    upper = (yaw, pitch, 0.24, roll, wrist_pitch, wrist_yaw)
-    return Instrument(name, rcc, tool, 0.009, lower, upper, jaw)
+def _limits(*degrees: float) -> tuple[tuple[float, float], ...]:
+    """Return symmetric limits of the five turning joints, with 0..0.24 m of insertion between them."""
+    turning = [(-radians(angle), radians(angle)) for angle in degrees]
+    return (*turning[:INSERTION], (0.0, 0.24), *turning[INSERTION:])
 
 
 INSTRUMENTS = MappingProxyType(
     {
-        "400006": _instrument("400006", 0.4389, 0.416, (92.0, 60.0, 175.0, 90.0, 85.0), (0.0, 1.57)),
-        "420006": _instrument("420006", 0.4318, 0.4826, (91.0, 53.0, 175.0, 80.0, 80.0), (radians(-20), radians(80))),
+        "400006": Instrument("400006", 0.4389, 0.416, _limits(92.0, 60.0, 175.0, 90.0, 85.0), (0.0, 1.57)),
+        "420006": Instrument(
+            "420006", 0.4318, 0.4826, _limits(91.0, 53.0, 175.0, 80.0, 80.0), (radians(-20.0), radians(80.0))
+        ),
     }
 )
 """Large needle drivers of the surgical robotics challenge; SurgicAI uses 400006."""
@@ -97,8 +113,7 @@ STARTS = MappingProxyType({PSM1: PSM1_START, PSM2: PSM2_START})
 
 def limits(instrument: str = DEFAULT) -> NDArray[np.float64]:
     """Return the lower and upper limit of each joint, (6, 2) [rad, m]."""
-    chosen = INSTRUMENTS[check_name("instrument", instrument, INSTRUMENTS)]
-    return np.array([chosen.lower, chosen.upper]).T
+    return np.array(INSTRUMENTS[check_name("instrument", instrument, INSTRUMENTS)].limits)
 
 
 def base_in_world(arm: str) -> NDArray[np.float64]:
@@ -183,7 +198,7 @@ def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = No
     if depth < 1e-12:  # the wrist lies in the remote centre: any shaft will do, take the pitch link's own
         return _checked((*_shaft(ux, uy, uz, offset, geometry, near), q6), length)
     joints = (*_shaft(wx / depth, wy / depth, wz / depth, depth + offset, geometry, near), q6)
-    if depth <= offset:  # the wrist may be behind the remote centre: 400006 at less than 23 mm of insertion
+    if depth <= offset + TOLERANCE:  # the wrist may be behind the remote centre: 400006 at less than 23 mm of insertion
         behind = (*_shaft(-wx / depth, -wy / depth, -wz / depth, offset - depth, geometry, near), q6)
         return _checked(_better(joints, behind, length, near), length)
     return _checked(joints, length)
@@ -193,7 +208,7 @@ def _shaft(
     zx: float, zy: float, zz: float, q3: float, geometry: tuple[float, ...], near: Joints | None
 ) -> tuple[float, float, float, float, float]:
     """Return the first five joints for a shaft along z = (zx, zy, zz) and insertion `q3`."""
-    ux, uy, uz, ex, ey, ez, ax, ay, az = geometry
+    ux, uy, uz, ex, ey, ez, ax, ay, az = geometry  # pitch link, pitch axis, yaw axis
     c2 = sqrt(zx * zx + zz * zz)
     s1, c1 = (zx / c2, -zz / c2) if c2 > 0.0 else (0.0, 1.0)
     # s4 = e · x3 and c4 = -e · y3, s5 = a · z3 and c5 = u · z3.
@@ -207,13 +222,12 @@ def _better(first: Joints, second: Joints, instrument: Instrument, near: Joints 
     """Return the solution within limits, and of two the one nearer to `near` (or to zero)."""
     if _violation(first, instrument) >= 0 or _violation(second, instrument) >= 0:
         return second if _violation(second, instrument) < 0 else first
-    goal = near or (0.0,) * 6
-    return min((first, second), key=lambda joints: sum((a - b) ** 2 for a, b in zip(joints, goal, strict=True)))
+    return min((first, second), key=lambda joints: math.dist(joints, near or (0.0,) * 6))
 
 
 def _violation(joints: Joints, instrument: Instrument) -> int:
     """Return the index of the first joint outside its limits, -1 for none."""
-    for index, (low, value, high) in enumerate(zip(instrument.lower, joints, instrument.upper, strict=True)):
+    for index, (value, (low, high)) in enumerate(zip(joints, instrument.limits, strict=True)):
         if not low - TOLERANCE <= value <= high + TOLERANCE:
             return index
     return -1
@@ -224,10 +238,10 @@ def _checked(joints: Joints, instrument: Instrument) -> Joints:
     index = _violation(joints, instrument)
     if index < 0:
         return joints
-    low, high, value = instrument.lower[index], instrument.upper[index], joints[index]
+    (low, high), value = instrument.limits[index], joints[index]
     scale, unit = (1000.0, "mm") if index == INSERTION else (180.0 / pi, "°")
     raise UnreachablePose(
-        f"Pose out of reach: {JOINT_NAMES[index]} would be {value * scale:.2f} {unit}; "
+        f"Pose out of reach: {DVRK_JOINTS[index]} would be {value * scale:.2f} {unit}; "
         f"instrument {instrument.name} allows {low * scale:.2f} to {high * scale:.2f} {unit}."
     )
 

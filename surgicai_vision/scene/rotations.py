@@ -7,7 +7,7 @@ numpy functions wrap it.
 """
 
 from collections.abc import Sequence
-from math import atan2, cos, pi, sin, sqrt
+from math import atan2, cos, nextafter, pi, sin, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,7 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix = NDArray[np.float64]
 
+_LARGEST_ROLL = nextafter(2.0 * pi, 0.0)
 GIMBAL = 1e-9
 """Below this cosine of the pitch, roll and yaw turn about one axis and the yaw is put to 0."""
 
@@ -44,7 +45,7 @@ def matrix_to_rpy_flat(m: Sequence[float]) -> Vector:
     else:
         roll, yaw = atan2(r21, r22), atan2(r10, r00)
     if roll > 0.0:
-        roll -= 2.0 * pi
+        roll = max(roll - 2.0 * pi, -_LARGEST_ROLL)
     return roll, atan2(-r20, cos_pitch), yaw
 
 
