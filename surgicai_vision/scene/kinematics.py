@@ -219,10 +219,9 @@ def _shaft(
 
 
 def _better(first: Joints, second: Joints, instrument: Instrument, near: Joints | None) -> Joints:
-    """Return the solution within limits, and of two the one nearer to `near` (or to zero)."""
-    if _violation(first, instrument) >= 0 or _violation(second, instrument) >= 0:
-        return second if _violation(second, instrument) < 0 else first
-    return min((first, second), key=lambda joints: math.dist(joints, near or (0.0,) * 6))
+    """Return the solution within limits; of two such, or of none, the one nearer to `near` (or to zero)."""
+    within = [joints for joints in (first, second) if _violation(joints, instrument) < 0]
+    return min(within or (first, second), key=lambda joints: math.dist(joints, near or (0.0,) * 6))
 
 
 def _violation(joints: Joints, instrument: Instrument) -> int:
