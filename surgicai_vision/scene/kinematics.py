@@ -198,7 +198,7 @@ def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = No
     if depth < 1e-12:  # the wrist lies in the remote centre: any shaft will do, take the pitch link's own
         return _checked((*_shaft(ux, uy, uz, offset, geometry, near), q6), length)
     joints = (*_shaft(wx / depth, wy / depth, wz / depth, depth + offset, geometry, near), q6)
-    if depth <= offset + TOLERANCE:  # the wrist may be behind the remote centre: 400006 at less than 23 mm of insertion
+    if depth <= 2.0 * offset:  # the wrist may be behind the remote centre: 400006 inserted by less than 23 mm
         behind = (*_shaft(-wx / depth, -wy / depth, -wz / depth, offset - depth, geometry, near), q6)
         return _checked(_better(joints, behind, length, near), length)
     return _checked(joints, length)
