@@ -1,0 +1,37 @@
+"""What every test stands on: a headless GL, no network, few threads, and the recordings where present."""
+
+import os
+
+# Before any test imports mujoco, torch or the hub client: they read these once.
+os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ["HF_HUB_OFFLINE"] = "1"
+os.environ.setdefault("OMP_NUM_THREADS", "2")
+os.environ.setdefault("LP_NUM_THREADS", "2")
+os.environ["SURGICAI_VISION_WEIGHTS"] = ""
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    """The checkout."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of recordings beside the checkout; not every machine has it."""
+    folder = ROOT.parent / "shared"
+    if not folder.is_dir():
+        pytest.skip(f"no recordings: {folder} is not here")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep features of tests out of the user's cache."""
+    monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
