@@ -1,0 +1,260 @@
+"""Render demonstrations: states → pictures, one job an episode, then one LeRobot dataset.
+
+    summary = render_demos(Path("demos"), Path("dataset"), views=("front", "back"), depth=True, workers=2)
+    summary.frames, summary.episodes, summary.seconds, summary.digest
+
+Every state of a demonstration is set in the environment as it was recorded and observed; frame t is the
+state before action t. An episode is committed whole to `<out>.work`, and when all are there the dataset is
+assembled and renamed whole to `out`. Killed anywhere, the same command continues; finished, it does nothing.
+Frames and their order do not depend on the number of workers.
+"""
+
+import functools
+import json
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from surgicai_vision import names
+from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.dataset import layout, pictures
+from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
+from surgicai_vision.dataset.writing import EPISODE_FILE, SUMMARY_FILE, assemble
+from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo
+from surgicai_vision.errors import BadFile, InputError, OutputExists, check_name
+from surgicai_vision.executor import Job, Progress, run
+from surgicai_vision.files import check_output, code_version, read_json, sha256_file, write_json
+
+SIZES = (16, 1024)
+"""Smallest and largest image side [px]; MuJoCo's off-screen buffer ends at the latter."""
+
+
+@dataclass(frozen=True)
+class DatasetSummary:
+    """What a rendering made: frames, episodes, wall-clock seconds and the digest of the content."""
+
+    frames: int
+    episodes: int
+    seconds: float
+    digest: str
+
+
+def render_demos(
+    demos: Path,
+    out: Path,
+    *,
+    views: Sequence[str] = ("front", "back"),
+    size: int = 224,
+    depth: bool = False,
+    segmentation: bool = False,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> DatasetSummary:
+    """Render a folder of demonstrations into a LeRobot dataset.
+
+    Args:
+        demos: folder of demonstrations, of one task.
+        out: dataset folder to make; the same request continues it or finds it finished.
+        views: cameras, in the order of the dataset's columns.
+        size: side of the square pictures [px].
+        depth: also render depth, float32 [m].
+        segmentation: also render part indices (`names.PARTS`).
+        workers: number of processes.
+        progress: called with (frames done, frames, "frames").
+
+    Raises:
+        UnknownName: a view that does not exist.
+        BadFile: `demos` holds no readable demonstrations, or of another scene.
+        OutputExists: `out` holds something else.
+    """
+    started = time.monotonic()
+    for view in views:
+        check_name("view", view, names.CAMERAS)
+    if not views or len(set(views)) != len(views):
+        raise InputError(f"views are {', '.join(views) or 'none'}; give at least one, each once.")
+    if not SIZES[0] <= size <= SIZES[1]:
+        raise InputError(f"size is {size}; it must be within {SIZES[0]} and {SIZES[1]} pixels.")
+    check_output(out, may_resume=names.META_FILE)
+    paths = list_demos(demos)
+    options = {"views": list(views), "size": size, "depth": depth, "segmentation": segmentation}
+    request = {**options, "demos": demos_digest(paths)}
+    if (out / names.META_FILE).exists():
+        return _finished(out, request, started)
+    episodes = [read_demo(path) for path in paths]
+    config = _same_config(episodes, demos)
+    jobs = [
+        Job("render-episode", {"demo": str(path.resolve()), **options}, (sha256_file(path),), len(demo), ("demo",))
+        for path, demo in zip(paths, episodes, strict=True)
+    ]
+    work = out.with_name(f"{out.name}.work")
+    shards = run(jobs, work, workers=workers, progress=progress, unit="frames")
+    meta = _meta(request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], episodes)
+    table = layout.features(views, size, depth, segmentation)
+    assemble(shards, out, table, names.TASK_TEXTS[config.task], meta)
+    shutil.rmtree(work)
+    return DatasetSummary(meta["frames"], meta["episodes"], time.monotonic() - started, meta["digest"])
+
+
+def _finished(out: Path, request: Mapping[str, Any], started: float) -> DatasetSummary:
+    """Return the summary of a finished dataset if it is the one asked for."""
+    meta = read_json(out / names.META_FILE)
+    if meta.get("request") != request:
+        raise OutputExists(
+            f"--out {out} holds a dataset of other demonstrations or options (see {out / names.META_FILE}); "
+            "give another folder."
+        )
+    return DatasetSummary(meta["frames"], meta["episodes"], time.monotonic() - started, meta["digest"])
+
+
+def _same_config(episodes: Sequence[Demo], where: Path) -> TaskConfig:
+    """Return the one configuration of all episodes."""
+    first = episodes[0]
+    for index, demo in enumerate(episodes):
+        if demo.config != first.config or demo.scene_hash != first.scene_hash:
+            raise BadFile(f"{where}: episode {index} was made with another task or scene than episode 0.")
+    return first.config
+
+
+def _meta(
+    request: Mapping[str, Any], config: TaskConfig, summaries: Sequence[Mapping[str, Any]], episodes: Sequence[Demo]
+) -> dict[str, Any]:
+    """Return the content of `meta/surgicai.json`."""
+    return {
+        "request": request,
+        "task": config.task,
+        "task_config": to_mapping(config),
+        "views": request["views"],
+        "image_size": request["size"],
+        "depth": request["depth"],
+        "segmentation": request["segmentation"],
+        "cameras": summaries[0]["cameras"],
+        "units": {"length": "m", "angle": "rad", "depth": "m", "time": "s"},
+        "parts": list(names.PARTS),
+        "fps": names.FPS,
+        "renderers": sorted({summary["renderer"] for summary in summaries}),
+        "scene_hash": episodes[0].scene_hash,
+        "sources": sorted({demo.source for demo in episodes}),
+        "demos_digest": request["demos"],
+        "demos_code_versions": sorted({demo.code_version for demo in episodes}),
+        "code_version": code_version(),
+        "frames": sum(summary["frames"] for summary in summaries),
+        "episodes": len(summaries),
+        "digest": layout.dataset_digest(summary["digest"] for summary in summaries),
+    }
+
+
+@functools.lru_cache(maxsize=1)
+def _env(config: str, views: tuple[str, ...], size: int, depth: bool, segmentation: bool) -> Any:
+    """Return this process's environment; the one before is closed with its GL context."""
+    import surgicai_vision.envs as envs
+
+    return envs.make(
+        from_mapping(TaskConfig, json.loads(config)),
+        obs_type="pixels_agent_pos",
+        cameras=views,
+        image_size=size,
+        depth=depth,
+        segmentation=segmentation,
+    )
+
+
+def render_episode(folder: Path, demo: str, views: Sequence[str], size: int, depth: bool, segmentation: bool) -> None:
+    """Job "render-episode": write one episode's columns and pictures into `folder`."""
+    episode = read_demo(Path(demo))
+    env = _env(json.dumps(to_mapping(episode.config)), tuple(views), size, depth, segmentation)
+    if env.scene.hash != episode.scene_hash:
+        raise BadFile(
+            f"{demo} was recorded in another scene (hash {episode.scene_hash[:12]}, now {env.scene.hash[:12]}); "
+            "record it again with this version."
+        )
+    keys = layout.picture_keys(views, depth, segmentation)
+    content: dict[str, list[bytes]] = {key: [] for key, _, _ in keys}
+    statistics = {key: PictureStatistics() for key, _, _ in keys}
+    hashes = layout.EpisodeDigest(content)
+    poses, needle = [], []
+    for state in episode.state[:-1]:
+        env.set_state_vector(state)
+        observation = env.observe()
+        for key, view, modality in keys:
+            frame = observation["pixels" if modality == names.RGB else modality][view]
+            frame = np.repeat(frame, 3, axis=2) if modality == names.SEGMENTATION else frame
+            content[key].append(pictures.encode(frame))
+            statistics[key].add(frame)
+            hashes.add(key, frame)
+        poses.append(observation["agent_pos"])
+        needle.append(env.needle_pose())
+    columns = _columns(episode, np.stack(poses), np.stack(needle))
+    _write_episode(folder, content, columns)
+    write_json(
+        folder / SUMMARY_FILE,
+        {
+            "frames": len(episode),
+            "digest": hashes.hexdigest(columns),
+            "statistics": {
+                **{key: statistics[key].result() for key in content},
+                **{key: column_statistics(columns[key]) for key in layout.COLUMNS},
+            },
+            "renderer": _renderer(),
+            "cameras": {view: _camera(env, view, size, episode.state) for view in views},
+        },
+    )
+
+
+def _columns(demo: Demo, poses: np.ndarray, needle: np.ndarray) -> dict[str, np.ndarray]:
+    """Return every column of `layout.COLUMNS`, (T,) or (T, n)."""
+    return {
+        names.STATE: poses.astype(np.float32),
+        names.ACTION: demo.action,
+        names.NEEDLE_POSE: needle.astype(np.float32),
+        names.REWARD: demo.reward,
+        names.DONE: np.arange(len(demo)) == len(demo) - 1,
+        names.SUCCESS: demo.success,
+        names.CONTACT: demo.contact,
+        names.PHASE: demo.phase.astype(np.int64),
+        names.SEED: np.full(len(demo), demo.seed, np.int64),
+    }
+
+
+def _write_episode(folder: Path, content: Mapping[str, list[bytes]], columns: Mapping[str, np.ndarray]) -> None:
+    """Write one episode as parquet: pictures as LeRobot's (bytes, path) pairs, columns as lists and scalars."""
+    arrays: dict[str, pa.Array] = {}
+    for key, pictures_ in content.items():
+        paths = [f"frame-{index:06d}" for index in range(len(pictures_))]
+        arrays[key] = pa.StructArray.from_arrays(
+            [pa.array(pictures_, pa.binary()), pa.array(paths, pa.string())], ["bytes", "path"]
+        )
+    for key, values in columns.items():
+        if key in layout.VECTORS:
+            arrays[key] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+        else:
+            arrays[key] = pa.array(values)
+    # Uncompressed: it is read once, to be assembled.
+    pq.write_table(pa.table(arrays), folder / EPISODE_FILE, compression="none", use_dictionary=False)
+
+
+def _renderer() -> str:
+    """Return the GL renderer that drew the pictures."""
+    from surgicai_vision.scene.rendering import renderer_string
+
+    return renderer_string()
+
+
+def _camera(env: Any, view: str, size: int, states: np.ndarray) -> dict[str, Any]:
+    """Return a camera's intrinsics (3, 3) and, unless it moves, T_world_camera (4, 4) (OpenCV axes, [m])."""
+    from surgicai_vision.scene.cameras import extrinsics, intrinsics
+
+    poses = []
+    for state in (states[0], states[-1]):
+        env.set_state_vector(state)
+        poses.append(extrinsics(env.model, env.data, view))
+    return {
+        "intrinsics": intrinsics(env.model, view, size, size).tolist(),
+        "T_world_camera": poses[0].tolist() if np.array_equal(*poses) else None,
+    }

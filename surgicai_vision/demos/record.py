@@ -1,0 +1,206 @@
+"""Record demonstrations: roll an expert from seeded starts and keep the episodes that succeed.
+
+    record(TaskConfig("grasp"), episodes=50, seed=0, out=Path("demos"), workers=2)
+
+Seeds are taken in order from the first one; a seed at which the expert fails is written down as skipped in
+`demos.json` and the next one is taken, so what is kept depends on the seeds alone. The same command
+continues a run that was killed (the finished episodes lie in `<out>.work` until the folder is complete) and
+does nothing when it is complete.
+
+    rollout = roll(env, expert, seed)      # one episode, kept or not
+"""
+
+import functools
+import importlib
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Protocol
+
+import numpy as np
+
+from surgicai_vision import names
+from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.demos.store import MARKER, Demo, list_demos, read_demo, read_marker, write_demo, write_marker
+from surgicai_vision.errors import InputError, OutputExists, SurgicaiError, check_name
+from surgicai_vision.executor import Job, Progress, run
+from surgicai_vision.files import check_output, code_version, read_json, whole_folder, write_json
+
+SOURCES: Mapping[str, str] = MappingProxyType({"expert": "surgicai_vision.demos.expert:Expert"})
+"""Source → "module:class" of what acts; built as `class(env)`."""
+
+MAX_FAILURES = 3
+"""Seeds tried per episode wanted, at most; below one success in three the expert is not fit to teach."""
+
+
+class Actor(Protocol):
+    """What records: an expert that sees the environment itself."""
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+
+    def action(self) -> np.ndarray:
+        """Return the action (7,) float32 for the environment's present state."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One rolled episode, whether it succeeded, and why it is not kept if it did not."""
+
+    demo: Demo
+    success: bool
+    reason: str
+
+
+def roll(env: Any, actor: Actor, seed: int, source: str = "expert") -> Rollout:
+    """Roll one episode of `env` from `seed` and return it with every state on the way."""
+    env.reset(seed=seed)
+    actor.reset()
+    states, rows = [env.get_state()], []
+    info: dict[str, Any] = {}
+    ended = False
+    while not ended:
+        phase = env.phase
+        action = np.asarray(actor.action(), dtype=np.float32)
+        _, reward, terminated, truncated, info = env.step(action)
+        states.append(env.get_state())
+        rows.append((action, phase, reward, info["is_success"], info["contact"]))
+        ended = terminated or truncated
+    action, phase, reward, success, contact = (list(column) for column in zip(*rows, strict=True))
+    demo = Demo(
+        config=env.config,
+        seed=seed,
+        source=source,
+        scene_hash=env.scene.hash,
+        code_version=code_version(),
+        state=np.stack(states).astype(np.float64),
+        action=np.stack(action),
+        phase=np.asarray(phase, dtype=np.int8),
+        reward=np.asarray(reward, dtype=np.float32),
+        success=np.asarray(success, dtype=bool),
+        contact=np.asarray(contact, dtype=bool),
+    )
+    if info["physics_error"]:
+        return Rollout(demo, False, "physics error")
+    return Rollout(demo, bool(success[-1]), "" if success[-1] else f"no success in {len(action)} steps")
+
+
+@functools.lru_cache(maxsize=1)
+def _env(config: TaskConfig) -> Any:
+    """Return this process's environment for `config`."""
+    import surgicai_vision.envs as envs
+
+    return envs.make(config)
+
+
+def record_episode(folder: Path, task: Mapping[str, Any], source: str, seed: int) -> None:
+    """Job "record-episode": roll `seed` and write the episode, or why it failed, into `folder`."""
+    module, _, name = SOURCES[source].partition(":")
+    env = _env(from_mapping(TaskConfig, task))
+    rollout = roll(env, getattr(importlib.import_module(module), name)(env), seed, source)
+    if rollout.success:
+        write_demo(folder, 0, rollout.demo)
+    write_json(folder / "result.json", {"seed": seed, "success": rollout.success, "reason": rollout.reason})
+
+
+def record(
+    config: TaskConfig,
+    *,
+    episodes: int,
+    out: Path,
+    source: str = "expert",
+    seed: int = names.TRAIN_SEED,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Record `episodes` successful demonstrations into the folder `out`; return their files.
+
+    Args:
+        config: task and scene.
+        episodes: how many to keep.
+        out: folder to make; the same request continues it or finds it finished.
+        source: a key of `SOURCES`.
+        seed: first seed; the following ones are taken in order.
+        workers: number of processes.
+        progress: called with (episodes kept, episodes wanted, "episodes").
+
+    Raises:
+        InputError: fewer than one episode, a negative seed, an unknown source.
+        OutputExists: `out` holds something else.
+        SurgicaiError: the expert failed at too many seeds.
+    """
+    check_name("source", source, SOURCES)
+    if episodes < 1 or seed < 0:
+        raise InputError(f"episodes is {episodes} and seed {seed}; they must be at least 1 and 0.")
+    request = {"task": to_mapping(config), "source": source, "seed": seed, "episodes": episodes}
+    check_output(out, may_resume=MARKER)
+    if finished(out, request):
+        return list_demos(out)
+    work = out.with_name(f"{out.name}.work")
+    kept, skipped = _take(request, work, workers, progress or (lambda done, total, unit: None))
+    with whole_folder(out) as folder:
+        for index, path in enumerate(kept):
+            os.link(path, folder / f"episode_{index:06d}.safetensors")
+        write_marker(
+            folder, config.task, source, request=request, skipped=skipped, episodes=episodes, code=code_version()
+        )
+    shutil.rmtree(work)
+    return list_demos(out)
+
+
+def finished(out: Path, request: Mapping[str, Any]) -> bool:
+    """Say whether `out` is the finished result of `request`; `OutputExists` if it is that of another one."""
+    if not (out / MARKER).exists():
+        return False
+    if read_marker(out).get("request") != request:
+        raise OutputExists(
+            f"--out {out} holds demonstrations of another command (see {out / MARKER}); give another folder."
+        )
+    return True
+
+
+def _take(
+    request: Mapping[str, Any], work: Path, workers: int, progress: Progress
+) -> tuple[list[Path], list[dict[str, Any]]]:
+    """Try seeds in order until enough succeeded; return the kept files and the skipped seeds."""
+    kept: list[Path] = []
+    skipped: list[dict[str, Any]] = []
+    wanted, seed = request["episodes"], request["seed"]
+    while len(kept) < wanted:
+        if len(kept) + len(skipped) >= MAX_FAILURES * wanted + 5:
+            reasons = "; ".join(f"seed {row['seed']}: {row['reason']}" for row in skipped[:3])
+            raise SurgicaiError(
+                f"The {request['source']} succeeded at {len(kept)} of {len(kept) + len(skipped)} starts of "
+                f"{request['task']['task']}; {wanted} were wanted ({reasons}; …)."
+            )
+        count = wanted - len(kept)
+        jobs = [
+            Job("record-episode", {"task": request["task"], "source": request["source"], "seed": seed + i})
+            for i in range(count)
+        ]
+        report = functools.partial(_report, progress, len(kept), wanted)
+        for folder in run(jobs, work, workers=workers, progress=report):
+            result = read_json(folder / "result.json")
+            if result["success"]:
+                kept.append(folder / "episode_000000.safetensors")
+            else:
+                skipped.append({"seed": result["seed"], "reason": result["reason"]})
+        seed += count
+        progress(len(kept), wanted, "episodes")
+    return kept, skipped
+
+
+def _report(progress: Progress, before: int, wanted: int, done: int, total: int, unit: str) -> None:
+    """Pass on the progress of one wave of seeds as that of the whole."""
+    progress(before + done, wanted, "episodes")
+
+
+def check_folder(folder: Path) -> int:
+    """Read every episode of `folder`; return their number, `BadFile` at the first damaged one."""
+    paths = list_demos(folder)
+    for path in paths:
+        read_demo(path)
+    return len(paths)

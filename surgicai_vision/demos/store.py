@@ -1,0 +1,183 @@
+"""Demonstrations on disk: state first, no pictures, one file an episode, each written whole.
+
+A folder of demonstrations holds `demos.json` (format, version, task, source, what was skipped) and
+`episode_000000.safetensors`, `episode_000001.safetensors`, … An episode file holds the arrays of `Demo` and,
+in its metadata, everything else as JSON. Nothing in it is executable; a damaged file is a `BadFile`.
+
+    write_demo(folder, 0, demo)        demo = read_demo(list_demos(folder)[0])
+"""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from surgicai_vision import names
+from surgicai_vision.config import TaskConfig, digest, from_mapping, to_mapping
+from surgicai_vision.errors import BadFile, InputError
+from surgicai_vision.files import read_json, sha256_file, write_bytes, write_json
+
+FORMAT, VERSION = "surgicai-vision-demos", 1
+MARKER = "demos.json"
+"""The file that makes a folder a folder of demonstrations."""
+
+ARRAYS = {
+    "state": ("float64", 2),
+    "action": ("float32", 2),
+    "phase": ("int8", 1),
+    "reward": ("float32", 1),
+    "success": ("bool", 1),
+    "contact": ("bool", 1),
+}
+"""Array → (dtype, number of axes) as stored."""
+
+
+@dataclass(frozen=True)
+class Demo:
+    """One episode of T control steps.
+
+    Attributes:
+        config: the task and scene it was made in.
+        seed: seed of the start state; -1 where the episode has none (a foreign recording).
+        source: "expert", "surgicai", …
+        scene_hash: hash of the compiled scene.
+        code_version: version of the code that made it.
+        state: whole simulator state before each step and after the last, (T + 1, n) float64.
+        action: (T, 7) float32, in [-1, 1].
+        phase: index in `names.SUBTASKS` before each step, (T,) int8.
+        reward: (T,) float32, of the step.
+        success: after the step, (T,) bool.
+        contact: jaws touch the needle after the step, (T,) bool.
+
+    Raises:
+        InputError: lengths, shapes or numbers that do not fit each other.
+    """
+
+    config: TaskConfig
+    seed: int
+    source: str
+    scene_hash: str
+    code_version: str
+    state: np.ndarray
+    action: np.ndarray
+    phase: np.ndarray
+    reward: np.ndarray
+    success: np.ndarray
+    contact: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name, (dtype, axes) in ARRAYS.items():
+            array = getattr(self, name)
+            if array.ndim != axes or array.dtype != dtype:
+                raise InputError(
+                    f"Demo.{name} is {array.dtype} with {array.ndim} axes; it must be {dtype} with {axes}."
+                )
+        if len(self.state) != len(self.action) + 1 or not len(self.action):
+            raise InputError(
+                f"Demo has {len(self.state)} states and {len(self.action)} actions; "
+                "there must be at least one action and one state more than actions."
+            )
+        for name in ("phase", "reward", "success", "contact"):
+            if len(getattr(self, name)) != len(self.action):
+                raise InputError(f"Demo has {len(getattr(self, name))} of {name} and {len(self.action)} actions.")
+        if self.action.shape[1] != len(names.ACTION_NAMES):
+            raise InputError(
+                f"Demo.action has {self.action.shape[1]} columns; it must have {len(names.ACTION_NAMES)}."
+            )
+        if not (np.isfinite(self.state).all() and np.isfinite(self.action).all() and np.isfinite(self.reward).all()):
+            raise InputError("Demo holds numbers that are not finite.")
+
+    def __len__(self) -> int:
+        """Return the number of control steps T."""
+        return len(self.action)
+
+
+def demo_bytes(demo: Demo) -> bytes:
+    """Return the content of an episode file."""
+    details = {
+        "format": FORMAT,
+        "version": VERSION,
+        "config": to_mapping(demo.config),
+        "seed": int(demo.seed),
+        "source": demo.source,
+        "scene_hash": demo.scene_hash,
+        "code_version": demo.code_version,
+    }
+    arrays = {name: np.ascontiguousarray(getattr(demo, name)) for name in ARRAYS}
+    return save(arrays, metadata={"demo": json.dumps(details, sort_keys=True)})
+
+
+def write_demo(folder: Path, index: int, demo: Demo) -> Path:
+    """Write episode `index` into `folder`, whole or not at all; return its path."""
+    path = folder / f"episode_{index:06d}.safetensors"
+    write_bytes(path, demo_bytes(demo))
+    return path
+
+
+def read_demo(path: Path) -> Demo:
+    """Read one episode.
+
+    Raises:
+        BadFile: missing, damaged, or not an episode of ours.
+    """
+    try:
+        with safe_open(path, framework="numpy") as file:
+            details = json.loads((file.metadata() or {}).get("demo", "null"))
+            arrays = {name: file.get_tensor(name) for name in ARRAYS}
+        if not isinstance(details, dict) or details.pop("format", None) != FORMAT:
+            raise BadFile(f"{path} is not a demonstration (no '{FORMAT}' in its metadata).")
+        if details.pop("version") != VERSION:
+            raise BadFile(f"{path} has another format version; this release reads version {VERSION}.")
+        details["config"] = from_mapping(TaskConfig, details["config"], str(path))
+        fields = {field.name for field in dataclasses.fields(Demo)} - set(ARRAYS)
+        if set(details) != fields:
+            raise BadFile(f"{path}: its metadata has {sorted(details)}; expected {sorted(fields)}.")
+        return Demo(**details, **arrays)
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise BadFile(f"{path} cannot be read as a demonstration ({error}).") from None
+    except InputError as error:
+        raise error if isinstance(error, BadFile) else BadFile(f"{path}: {error}") from None
+
+
+def write_marker(folder: Path, task: str, source: str, **details: Any) -> None:
+    """Write `demos.json`, which says what the folder holds."""
+    write_json(folder / MARKER, {"format": FORMAT, "version": VERSION, "task": task, "source": source, **details})
+
+
+def read_marker(folder: Path) -> dict[str, Any]:
+    """Read `demos.json`; `BadFile` where `folder` is no folder of demonstrations."""
+    if not (folder / MARKER).is_file():
+        raise BadFile(
+            f"{folder} is not a folder of demonstrations (no {MARKER} in it); make one with "
+            "'surgicai-vision record-demos' or 'import-demos'."
+        )
+    marker = read_json(folder / MARKER)
+    if not isinstance(marker, dict) or marker.get("format") != FORMAT or marker.get("version") != VERSION:
+        raise BadFile(f"{folder / MARKER} is not of format {FORMAT} version {VERSION}.")
+    return marker
+
+
+def list_demos(folder: Path) -> list[Path]:
+    """Return the episode files of a folder of demonstrations, in order.
+
+    Raises:
+        BadFile: no such folder, no episodes in it, or a gap in their numbers.
+    """
+    read_marker(folder)
+    paths = sorted(folder.glob("episode_*.safetensors"))
+    if not paths:
+        raise BadFile(f"{folder} holds no episodes.")
+    for index, path in enumerate(paths):
+        if path.name != f"episode_{index:06d}.safetensors":
+            raise BadFile(f"{folder}: episode {index} is missing (found {path.name} in its place).")
+    return paths
+
+
+def demos_digest(paths: list[Path]) -> str:
+    """sha256 over the episodes' files, in order."""
+    return digest([sha256_file(path) for path in paths])

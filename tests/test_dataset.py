@@ -1,0 +1,238 @@
+"""Datasets: rendered from states, LeRobot's format, nothing lost."""
+
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from fake_env import FakeEnv, FakeExpert
+
+from surgicai_vision import names
+from surgicai_vision.config import TaskConfig
+from surgicai_vision.dataset import layout, open_dataset, pictures, render_demos, rendering
+from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
+from surgicai_vision.demos.record import roll
+from surgicai_vision.demos.store import list_demos, read_demo, write_demo, write_marker
+from surgicai_vision.errors import BadFile, InputError, OutputExists, UnknownName
+
+CONFIG = TaskConfig(max_steps=12)
+SIZE = 32
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """Render with the stand-in environment, in this process."""
+
+    def env(config, views, size, depth, segmentation):
+        return FakeEnv(CONFIG, views, size, depth, segmentation)
+
+    monkeypatch.setattr(rendering, "_env", env)
+    monkeypatch.setattr(rendering, "_renderer", lambda: "none")
+    monkeypatch.setattr(rendering, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()})
+
+
+@pytest.fixture
+def demos(tmp_path):
+    env = FakeEnv(CONFIG)
+    folder = tmp_path / "demos"
+    folder.mkdir()
+    for index, seed in enumerate((1, 2, 4)):
+        write_demo(folder, index, roll(env, FakeExpert(env), seed).demo)
+    write_marker(folder, "grasp", "expert")
+    return folder
+
+
+def render(demos, out, **more):
+    options = {"size": SIZE, "depth": True, "workers": 0, **more}
+    return render_demos(demos, out, **options)
+
+
+def test_every_frame_is_the_picture_of_its_state(tmp_path, fake, demos):
+    summary = render(demos, tmp_path / "set", segmentation=True)
+    dataset = open_dataset(tmp_path / "set")
+    episodes = [read_demo(path) for path in list_demos(demos)]
+    env = FakeEnv(CONFIG, image_size=SIZE, depth=True, segmentation=True)
+    frame = 0
+    columns = dataset.columns()
+    for number, episode in enumerate(episodes):
+        for step, state in enumerate(episode.state[:-1]):
+            env.set_state_vector(state)
+            observation = env.observe()
+            for view in ("front", "back"):
+                np.testing.assert_array_equal(dataset.frames(view, frame, frame + 1)[0], observation["pixels"][view])
+                np.testing.assert_array_equal(dataset.depth(view, frame, frame + 1)[0], observation["depth"][view])
+                parts = dataset.segmentation(view, frame, frame + 1)[0]
+                np.testing.assert_array_equal(parts, observation["segmentation"][view])
+            np.testing.assert_array_equal(columns[names.STATE][frame], env.agent_pos())
+            np.testing.assert_array_equal(columns[names.ACTION][frame], episode.action[step])
+            assert columns[names.SEED][frame] == episode.seed
+            assert columns[names.DONE][frame] == (step == len(episode) - 1)
+            assert dataset.episode_index[frame] == number
+            assert columns["index"][frame] == frame
+            frame += 1
+    assert frame == dataset.length == summary.frames
+    assert summary.episodes == 3
+
+
+def test_frames_across_episodes_equal_single_frames(tmp_path, fake, demos):
+    render(demos, tmp_path / "set")
+    dataset = open_dataset(tmp_path / "set")
+    whole = dataset.frames("back")
+    assert whole.shape == (dataset.length, SIZE, SIZE, 3)
+    np.testing.assert_array_equal(whole[3:-2], dataset.frames("back", 3, dataset.length - 2))
+    assert dataset.frames("back", 4, 4).shape == (0, SIZE, SIZE, 3)
+    with pytest.raises(InputError, match="the dataset has 0 to"):
+        dataset.frames("back", 0, dataset.length + 1)
+    with pytest.raises(UnknownName, match="view of this dataset"):
+        dataset.frames("wrist_psm1", 0, 1)
+
+
+def test_digest_is_that_of_the_decoded_content(tmp_path, fake, demos):
+    summary = render(demos, tmp_path / "set", segmentation=True)
+    dataset = open_dataset(tmp_path / "set")
+    keys = [key for key, _, _ in layout.picture_keys(dataset.views, True, True)]
+    columns, digests = dataset.columns(), []
+    decoded = {key: list(dataset.iterate(key)) for key in keys}
+    for number in range(3):
+        rows = np.flatnonzero(dataset.episode_index == number)
+        digest = layout.EpisodeDigest(keys)
+        for key in keys:
+            for row in rows:
+                digest.add(key, decoded[key][row])
+        digests.append(digest.hexdigest({key: columns[key][rows] for key in layout.COLUMNS}))
+    assert layout.dataset_digest(digests) == summary.digest == dataset.meta["digest"]
+
+
+def test_interrupted_rendering_continues_to_the_same_bytes(tmp_path, fake, demos):
+    def stop(done, total, unit):
+        if done:
+            raise KeyboardInterrupt
+
+    whole = render(demos, tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        render(demos, tmp_path / "set", progress=stop)
+    assert not (tmp_path / "set").exists()
+    assert render(demos, tmp_path / "set").digest == whole.digest
+    assert open_dataset(tmp_path / "set").fingerprint == open_dataset(tmp_path / "whole").fingerprint
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["demos", "set", "whole"]
+
+
+def test_rendering_again_does_nothing_and_other_options_are_refused(tmp_path, fake, demos, monkeypatch):
+    first = render(demos, tmp_path / "set")
+    monkeypatch.setattr(rendering, "_env", None)
+    assert render(demos, tmp_path / "set").digest == first.digest
+    with pytest.raises(OutputExists, match="other demonstrations or options"):
+        render(demos, tmp_path / "set", size=64)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/note.txt").write_text("mine")
+    with pytest.raises(OutputExists, match="already holds files"):
+        render(demos, tmp_path / "full")
+
+
+def test_bad_requests_are_refused_before_any_work(tmp_path, demos):
+    with pytest.raises(UnknownName, match="Did you mean 'front'"):
+        render(demos, tmp_path / "set", views=("frnt",))
+    with pytest.raises(InputError, match="at least one, each once"):
+        render(demos, tmp_path / "set", views=("front", "front"))
+    with pytest.raises(InputError, match="size is 4"):
+        render(demos, tmp_path / "set", size=4)
+    with pytest.raises(BadFile, match="not a folder of demonstrations"):
+        render(tmp_path / "nothing", tmp_path / "set")
+    assert not (tmp_path / "set.work").exists()
+
+
+def test_demos_of_another_scene_are_refused(tmp_path, fake, demos, monkeypatch):
+    class Other(FakeEnv):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            self.scene.hash = "0" * 64
+
+    monkeypatch.setattr(rendering, "_env", lambda config, *rest: Other(CONFIG, *rest))
+    with pytest.raises(InputError, match="recorded in another scene"):
+        render(demos, tmp_path / "set")
+
+
+def test_lerobot_opens_it_offline(tmp_path, fake, demos, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    render(demos, tmp_path / "set")
+    ours = open_dataset(tmp_path / "set")
+    theirs = LeRobotDataset("local/set", root=tmp_path / "set", depth_output_unit="m", video_backend="pyav")
+    assert (theirs.num_frames, theirs.num_episodes, theirs.fps) == (ours.length, 3, names.FPS)
+    for index in (0, 5, ours.length - 1):
+        item = theirs[index]
+        assert item["task"] == names.TASK_TEXTS["grasp"]
+        rgb = np.round(item[names.image_key("back")].numpy().transpose(1, 2, 0) * 255).astype(np.uint8)
+        np.testing.assert_array_equal(rgb, ours.frames("back", index, index + 1)[0])
+        depth = item[names.depth_key("front")].numpy()[0]
+        np.testing.assert_array_equal(depth, ours.depth("front", index, index + 1)[0, ..., 0])
+        np.testing.assert_array_equal(item[names.ACTION].numpy(), ours.columns()[names.ACTION][index])
+    statistics = theirs.meta.stats[names.ACTION]
+    np.testing.assert_allclose(statistics["mean"], ours.columns()[names.ACTION].mean(0), atol=1e-6)
+    np.testing.assert_allclose(statistics["std"], ours.columns()[names.ACTION].std(0), atol=1e-6)
+
+
+def test_statistics_equal_lerobots(fake):
+    from lerobot.datasets.compute_stats import get_feature_stats
+
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (6, 20, 24, 3), dtype=np.uint8)
+    running = PictureStatistics()
+    for frame in frames:
+        running.add(frame)
+    theirs = get_feature_stats(frames.transpose(0, 3, 1, 2), axis=(0, 2, 3), keepdims=True)
+    ours = running.result()
+    for name in ("min", "max", "mean", "std"):
+        assert np.shape(ours[name]) == (3, 1, 1)
+        # LeRobot's own std is 4e-5 off numpy's here; ours is exact.
+        np.testing.assert_allclose(ours[name], theirs[name][0] / 255, atol=1e-4)
+        exact = getattr(frames / 255.0, name)(axis=(0, 1, 2))
+        np.testing.assert_allclose(np.ravel(ours[name]), exact, atol=1e-12)
+    values = rng.normal(size=(50, 7))
+    theirs = get_feature_stats(values, axis=0, keepdims=False)
+    ours = column_statistics(values)
+    assert set(ours) == set(theirs)
+    for name in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(ours[name], theirs[name], atol=1e-9)
+    np.testing.assert_allclose(ours["q50"], theirs["q50"], atol=0.1)
+
+
+@pytest.mark.parametrize("shape", [(20, 30, 3), (17, 17, 1)])
+def test_pictures_are_lossless(shape):
+    rng = np.random.default_rng(1)
+    rgb = rng.integers(0, 256, shape, dtype=np.uint8)
+    np.testing.assert_array_equal(pictures.decode(pictures.encode(rgb), "x")[..., : shape[2]], rgb)
+    depth = rng.random((20, 30, 1), dtype=np.float32)
+    np.testing.assert_array_equal(pictures.decode(pictures.encode(depth), "x"), depth)
+
+
+@pytest.mark.parametrize("spoil", ["no meta", "not json", "key gone", "short data", "data gone", "not parquet"])
+def test_damaged_dataset_is_a_bad_file(tmp_path, fake, demos, spoil):
+    render(demos, tmp_path / "set", depth=False)
+    meta, data = tmp_path / "set" / names.META_FILE, tmp_path / "set/data/chunk-000/file-000.parquet"
+    content = json.loads(meta.read_text())
+    if spoil == "no meta":
+        meta.unlink()
+    elif spoil == "not json":
+        meta.write_text("{")
+    elif spoil == "key gone":
+        del content["views"]
+        meta.write_text(json.dumps(content))
+    elif spoil == "short data":
+        data.write_bytes(data.read_bytes()[:-20])
+    elif spoil == "data gone":
+        data.unlink()
+    else:
+        data.write_bytes(b"PAR1 is not enough PAR1")
+    with pytest.raises(BadFile) as caught:
+        open_dataset(tmp_path / "set")
+    assert "\n" not in str(caught.value)
+
+
+def test_one_row_group_an_episode(tmp_path, fake, demos):
+    render(demos, tmp_path / "set")
+    file = pq.ParquetFile(tmp_path / "set/data/chunk-000/file-000.parquet")
+    lengths = [len(read_demo(path)) for path in list_demos(demos)]
+    assert [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)] == lengths

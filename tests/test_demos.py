@@ -1,0 +1,146 @@
+"""Demonstrations: store and record, on the stand-in environment (the real one: at the end)."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from fake_env import FakeEnv, FakeExpert
+
+from surgicai_vision.config import TaskConfig
+from surgicai_vision.demos import record as recording
+from surgicai_vision.demos.record import record, roll
+from surgicai_vision.demos.store import (
+    ARRAYS,
+    Demo,
+    list_demos,
+    read_demo,
+    read_marker,
+    write_demo,
+    write_marker,
+)
+from surgicai_vision.errors import BadFile, InputError, OutputExists, SurgicaiError
+
+CONFIG = TaskConfig(max_steps=12)
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """Record from the stand-in environment, in this process."""
+    monkeypatch.setattr(recording, "_env", lambda config: FakeEnv(config))
+    monkeypatch.setattr(recording, "SOURCES", {"expert": "fake_env:FakeExpert"})
+
+
+@pytest.fixture
+def demo():
+    env = FakeEnv(CONFIG)
+    return roll(env, FakeExpert(env), 3).demo
+
+
+def test_write_read_returns_the_same_demo(tmp_path, demo):
+    again = read_demo(write_demo(tmp_path, 7, demo))
+    for field in dataclasses.fields(Demo):
+        one, two = getattr(demo, field.name), getattr(again, field.name)
+        if field.name in ARRAYS:
+            assert one.dtype == two.dtype
+            np.testing.assert_array_equal(one, two)
+        else:
+            assert one == two
+    assert [path.name for path in tmp_path.iterdir()] == ["episode_000007.safetensors"]
+
+
+def test_demo_refuses_bad_lengths_quoting_both(demo):
+    with pytest.raises(InputError, match=f"{len(demo)} states and {len(demo)} actions"):
+        dataclasses.replace(demo, state=demo.state[:-1])
+    with pytest.raises(InputError, match=f"2 of reward and {len(demo)} actions"):
+        dataclasses.replace(demo, reward=demo.reward[:2])
+    with pytest.raises(InputError, match="it must be float32"):
+        dataclasses.replace(demo, action=demo.action.astype(np.float64))
+    with pytest.raises(InputError, match="not finite"):
+        dataclasses.replace(demo, state=np.full_like(demo.state, np.nan))
+
+
+@pytest.mark.parametrize("spoil", ["empty", "half", "text", "flipped", "foreign"])
+def test_damaged_episode_is_a_bad_file(tmp_path, demo, spoil):
+    path = write_demo(tmp_path, 0, demo)
+    content = path.read_bytes()
+    header = json.dumps({"x": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}).encode()
+    path.write_bytes(
+        {
+            "empty": b"",
+            "half": content[: len(content) // 2],
+            "text": b"hello",
+            "flipped": content.replace(b"surgicai-vision-demos", b"surgicai-vision-demoz"),
+            "foreign": len(header).to_bytes(8, "little") + header + bytes(4),
+        }[spoil]
+    )
+    with pytest.raises(BadFile) as caught:
+        read_demo(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_folder_without_marker_or_with_a_gap_is_refused(tmp_path, demo):
+    with pytest.raises(BadFile, match="not a folder of demonstrations"):
+        list_demos(tmp_path)
+    write_marker(tmp_path, "grasp", "expert")
+    with pytest.raises(BadFile, match="no episodes"):
+        list_demos(tmp_path)
+    write_demo(tmp_path, 1, demo)
+    with pytest.raises(BadFile, match="episode 0 is missing"):
+        list_demos(tmp_path)
+
+
+def test_record_skips_failed_seeds_and_writes_them_down(tmp_path, fake):
+    seen = []
+    paths = record(
+        CONFIG, episodes=6, seed=0, out=tmp_path / "demos", workers=0, progress=lambda *row: seen.append(row)
+    )
+    demos = [read_demo(path) for path in paths]
+    skipped = [row["seed"] for row in read_marker(tmp_path / "demos")["skipped"]]
+    assert len(demos) == 6
+    assert all(demo.success[-1] and not demo.success[:-1].any() for demo in demos)
+    assert skipped, "the stand-in expert fails at some of these starts"
+    assert sorted([demo.seed for demo in demos] + skipped) == list(range(6 + len(skipped)))
+    assert seen[-1] == (6, 6, "episodes")
+    assert [path.name for path in tmp_path.iterdir()] == ["demos"]
+
+
+def test_record_again_does_nothing_and_another_request_is_refused(tmp_path, fake, monkeypatch):
+    out = tmp_path / "demos"
+    first = record(CONFIG, episodes=2, out=out, workers=0)
+    before = [path.stat().st_mtime_ns for path in first]
+    monkeypatch.setattr(recording, "_env", None)
+    assert record(CONFIG, episodes=2, out=out, workers=0) == first
+    assert [path.stat().st_mtime_ns for path in first] == before
+    with pytest.raises(OutputExists, match="another command"):
+        record(CONFIG, episodes=3, out=out, workers=0)
+
+
+def test_record_continues_where_it_was_stopped(tmp_path, fake, monkeypatch):
+    record(CONFIG, episodes=4, out=tmp_path / "whole", workers=0)
+    calls = []
+
+    def stop(done, total, unit):
+        calls.append(done)
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record(CONFIG, episodes=4, out=tmp_path / "demos", workers=0, progress=stop)
+    assert not (tmp_path / "demos").exists()
+    paths = record(CONFIG, episodes=4, out=tmp_path / "demos", workers=0)
+    for one, two in zip(list_demos(tmp_path / "whole"), paths, strict=True):
+        assert one.read_bytes() == two.read_bytes()
+
+
+def test_record_gives_up_on_an_expert_that_fails(tmp_path, fake, monkeypatch):
+    monkeypatch.setattr(FakeExpert, "action", lambda self: np.zeros(7, np.float32))
+    with pytest.raises(SurgicaiError, match=r"succeeded at 0 of \d+ starts of grasp; 2 were wanted \(seed 0: no"):
+        record(CONFIG, episodes=2, out=tmp_path / "demos", workers=0)
+
+
+@pytest.mark.parametrize(("episodes", "seed"), [(0, 0), (-3, 0), (1, -1)])
+def test_record_refuses_senseless_numbers(tmp_path, episodes, seed):
+    with pytest.raises(InputError, match=f"episodes is {episodes} and seed {seed}"):
+        record(CONFIG, episodes=episodes, seed=seed, out=tmp_path / "demos")
