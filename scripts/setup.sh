@@ -75,7 +75,7 @@ uv_from() {
     maker=$1
     set -- install --quiet --disable-pip-version-check --no-deps --require-hashes -r scripts/uv.txt
     if "$maker" -m pip --version >/dev/null 2>&1; then
-        PIP_REQUIRE_VIRTUALENV=0 "$maker" -m pip "$@" --target "$tools"
+        PIP_REQUIRE_VIRTUALENV=0 PIP_ROOT_USER_ACTION=ignore "$maker" -m pip "$@" --target "$tools"
     else
         "$maker" -m venv "$tools" && "$tools/bin/python" -m pip "$@"
     fi && "$tools/bin/uv" --version >/dev/null || stop "uv could not be installed (see above); install it by any means and run this again"
