@@ -1,0 +1,70 @@
+"""Envs: the five subtasks and the whole procedure as gymnasium environments.
+
+Importing this package registers `names.ENV_IDS`. `make(TaskConfig(task="grasp"), obs_type="pixels")` returns an
+unwrapped env; `gymnasium.make("surgicai_vision/Grasp-v0", obs_type="pixels")` takes the same names, and the fields
+of `TaskConfig` besides.
+"""
+
+from typing import Any
+
+import gymnasium
+
+from surgicai_vision import names
+from surgicai_vision.config import SceneConfig, TaskConfig, from_mapping
+from surgicai_vision.envs.base import SuturingEnv
+from surgicai_vision.envs.grasp import Grasp
+from surgicai_vision.envs.handoff import Handoff
+from surgicai_vision.envs.insert import Insert
+from surgicai_vision.envs.observation import ObservationConfig
+from surgicai_vision.envs.place import Place
+from surgicai_vision.envs.pullout import Pullout
+from surgicai_vision.envs.subtask import Subtask
+from surgicai_vision.envs.suture import Suture
+
+__all__ = ["SUBTASKS", "SuturingEnv", "make", "make_task"]
+
+SUBTASKS: dict[str, Subtask] = {
+    subtask.name: subtask for subtask in (Grasp(), Place(), Insert(), Handoff(), Pullout())
+}
+"""Subtask name → what it is, in the order of the procedure."""
+
+
+def make(
+    config: TaskConfig = TaskConfig(),
+    obs_type: str = "state",
+    cameras: tuple[str, ...] = ("front", "back"),
+    image_size: int | tuple[int, int] = 224,
+    depth: bool = False,
+    segmentation: bool = False,
+    render_mode: str | None = None,
+) -> SuturingEnv:
+    """Return the unwrapped env of a task; see `observation` for what the arguments choose."""
+    size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+    view = ObservationConfig(obs_type, tuple(cameras), size, depth, segmentation)
+    if config.task == names.SUTURE:
+        return Suture(config, tuple(SUBTASKS.values()), view, render_mode)
+    return SuturingEnv(config, (SUBTASKS[config.task],), view, render_mode)
+
+
+def make_task(task: str, scene: SceneConfig | dict[str, Any] | None = None, **arguments: Any) -> SuturingEnv:
+    """Return an env from flat arguments; the entry point of the gymnasium ids.
+
+    Args:
+        task: one of `names.TASKS`.
+        scene: a `SceneConfig`, its fields, or None for the default scene.
+        **arguments: fields of `TaskConfig` and arguments of `make`.
+    """
+    fields = {key: arguments.pop(key) for key in ("step", "tolerance", "reward", "max_steps") if key in arguments}
+    chosen = from_mapping(SceneConfig, scene, "scene") if isinstance(scene, dict) else scene or SceneConfig()
+    return make(TaskConfig(task=task, scene=chosen, **fields), **arguments)
+
+
+for _task, _id in names.ENV_IDS.items():
+    if _id not in gymnasium.registry:
+        gymnasium.register(
+            id=_id,
+            entry_point="surgicai_vision.envs:make_task",
+            kwargs={"task": _task},
+            order_enforce=True,
+            disable_env_checker=False,
+        )

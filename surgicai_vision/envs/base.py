@@ -1,0 +1,318 @@
+"""SuturingEnv: a task of the suture as a gymnasium environment.
+
+Description: two da Vinci PSMs, a needle and a phantom; one subtask, or all five in a row (`suture`).
+Action: Box(-1, 1, (7,), float32): Δx Δy Δz Δroll Δpitch Δyaw of the active arm's tip in its own base frame and
+    Δjaw, each times the step size (`config.STEPS`); every step is 20 ms.
+Observation: see `observation`.
+Reward: sparse: 0 on success, else -1; dense: -(d_trans / 100 + d_angle / 10) with d_trans in cm and d_angle in rad.
+Success: from the measured state: position and geodesic angle within the tolerance, and what the subtask demands
+    (jaw contact, both holes passed, needle out). Never from the command.
+Start: random, seeded by `reset(seed=…)`; covers the end states of the subtask before.
+Termination: success, or a physics error (`info["physics_error"]`, never a success). Truncation: `max_steps`.
+"""
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision import names
+from surgicai_vision.config import TaskConfig
+from surgicai_vision.envs import observation, passage, poses
+from surgicai_vision.envs.control import StepSize
+from surgicai_vision.envs.geometry import Stitch
+from surgicai_vision.envs.observation import ObservationConfig
+from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
+from surgicai_vision.envs.subtask import Subtask
+from surgicai_vision.errors import InputError, PhysicsError
+from surgicai_vision.scene import build_scene
+
+START_DRAWS = 60
+"""Draws of a start state before giving up."""
+RENDER_CAMERA, RENDER_SIZE = "front", (480, 640)
+
+Observation = NDArray[np.float32] | dict[str, Any]
+Info = dict[str, Any]
+
+
+class SuturingEnv(gymnasium.Env):
+    """One task as a gymnasium environment; see the module's docstring.
+
+    Args:
+        config: the task and its scene.
+        subtasks: the subtasks of the task, in order.
+        view: what it shows.
+        render_mode: None or "rgb_array".
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": names.FPS}
+
+    def __init__(
+        self, config: TaskConfig, subtasks: tuple[Subtask, ...], view: ObservationConfig, render_mode: str | None = None
+    ):
+        if render_mode not in (None, "rgb_array"):
+            raise InputError(f"render_mode is '{render_mode}'; allowed: None, rgb_array.")
+        self.config, self.view, self.render_mode = config, view, render_mode
+        self.scene = build_scene(config.scene)
+        self.simulation = Simulation(self.scene)
+        self.stitch = Stitch.of(self.scene.pair)
+        self.observation_space = view.space()
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
+        self._subtasks = subtasks
+        self._step_size = StepSize.of(config.step)
+        self._renderer: Any = None
+
+    # -- gymnasium ------------------------------------------------------------------------------------------------
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
+        """Draw a start state; `seed` makes it reproducible."""
+        super().reset(seed=seed)
+        simulation, first = self.simulation, self._subtasks[0]
+        for _ in range(START_DRAWS):
+            simulation.reset()
+            simulation.memory.phase = float(first.phase)
+            if first.start(simulation, self.stitch, self.np_random):
+                break
+        else:
+            raise PhysicsError(f"No start of '{self.config.task}' was physical in {START_DRAWS} draws.")
+        passage.remember_tip(simulation, simulation.memory)
+        self._remember_tool()
+        info = self.measure()
+        return self.observe(), info
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
+        """Take one control step of 20 ms."""
+        simulation, memory = self.simulation, self.simulation.memory
+        values = self._checked(action)
+        if not simulation.advance(self.subtask.arm, values, self._step_size):
+            memory.diverged = 1.0
+        memory.steps += 1.0
+        self._add_path()
+        passage.watch(simulation, memory, self.stitch.pair)
+        info = self.measure()
+        self._progress(info)
+        terminated = bool(info["is_success"] or info["physics_error"])
+        reward = self.reward(info)
+        return self.observe(), reward, terminated, memory.steps >= self.config.max_steps, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the front camera's picture, (480, 640, 3) uint8, when `render_mode` is "rgb_array"."""
+        if self.render_mode is None:
+            return None
+        return self._pictures(RENDER_SIZE).render(self.data, RENDER_CAMERA, names.RGB)
+
+    def close(self) -> None:
+        """Free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    # -- what it is -----------------------------------------------------------------------------------------------
+
+    @property
+    def model(self) -> Any:
+        """Return the `mujoco.MjModel`."""
+        return self.simulation.model
+
+    @property
+    def data(self) -> Any:
+        """Return the `mujoco.MjData`."""
+        return self.simulation.data
+
+    @property
+    def frame_skip(self) -> int:
+        """Return the physics steps in a control step."""
+        return SUBSTEPS
+
+    @property
+    def dt(self) -> float:
+        """Return the length of a control step [s]."""
+        return SUBSTEPS * float(self.model.opt.timestep)
+
+    control_dt = dt
+
+    @property
+    def task(self) -> str:
+        """Return the task's name."""
+        return self.config.task
+
+    @property
+    def task_description(self) -> str:
+        """Return the task as a sentence, as LeRobot stores it."""
+        return names.TASK_TEXTS[self.config.task]
+
+    @property
+    def subtask(self) -> Subtask:
+        """Return the present subtask."""
+        return self._subtasks[int(self.simulation.memory.phase) - self._subtasks[0].phase]
+
+    @property
+    def phase(self) -> int:
+        """Return the present subtask's index in `names.SUBTASKS`."""
+        return int(self.simulation.memory.phase)
+
+    def named(self, kind: str, name: str) -> int:
+        """Return an element's id; a wrong name lists what exists."""
+        return self.scene.named(kind, name)
+
+    # -- state ----------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> NDArray[np.float64]:
+        """Return the whole state of the episode as one vector."""
+        return self.simulation.get_state()
+
+    def set_state_vector(self, state: NDArray[np.float64]) -> None:
+        """Restore a state of `get_state`: what follows is what followed then."""
+        self.simulation.set_state(state)
+
+    def set_state(self, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
+        """Set positions and velocities, as gymnasium's MujocoEnv does; commands stay as they are."""
+        if np.shape(qpos) != (self.model.nq,) or np.shape(qvel) != (self.model.nv,):
+            raise InputError(
+                f"set_state got shapes {np.shape(qpos)} and {np.shape(qvel)}; "
+                f"this scene needs ({self.model.nq},) and ({self.model.nv},)."
+            )
+        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        self.simulation.refresh()
+
+    # -- measuring ------------------------------------------------------------------------------------------------
+
+    def measure(self) -> Info:
+        """Return the info dict of the present, measured state."""
+        simulation, memory, subtask = self.simulation, self.simulation.memory, self.subtask
+        achieved, desired = subtask.target(simulation, self.stitch)
+        contact = simulation.holds(subtask.arm)
+        distance, turn = poses.distance(achieved, desired), poses.angle(achieved, desired)
+        diverged = memory.diverged > 0.0
+        return {
+            "is_success": not diverged and self._meets(distance, turn, contact),
+            "d_trans": distance,
+            "d_angle": turn,
+            "contact": contact,
+            "phase": int(memory.phase),
+            "holes_passed": int(memory.passed),
+            "needle_slip": self._slip(contact),
+            "physics_error": diverged,
+            "tip_path": memory.tip_path,
+        }
+
+    def _meets(self, distance: float, turn: float, contact: bool) -> bool:
+        """Say whether the present subtask's success conditions hold."""
+        preset = self.config.tolerance
+        tolerance, demands = self.subtask.tolerances[preset], self.subtask.demands[preset]
+        if distance > tolerance.distance or turn > tolerance.angle:
+            return False
+        if demands.contact and not contact:
+            return False
+        passed = self.simulation.memory.passed
+        if demands.holes and not (passed >= demands.holes and passage.in_both(self.simulation, self.stitch.pair)):
+            return False
+        return not demands.out or (passed == 2.0 and passage.is_out(self.simulation, self.stitch.pair))
+
+    def _slip(self, contact: bool) -> NDArray[np.float64]:
+        """Return how far the needle moved in the active jaws since they first held it, (2,) [m, rad]."""
+        simulation, memory = self.simulation, self.simulation.memory
+        if not contact:
+            memory.held = 0.0
+            return np.zeros(2)
+        in_jaws = poses.compose(poses.invert(simulation.grasp(self.subtask.arm)), simulation.needle())
+        if memory.held == 0.0:
+            memory.held, memory.hold = 1.0, in_jaws
+            return np.zeros(2)
+        moved = poses.compose(in_jaws, poses.invert(memory.hold))
+        return np.array([poses.distance(moved, poses.IDENTITY), poses.angle(moved, poses.IDENTITY)])
+
+    def reward(self, info: Info) -> float:
+        """Return the reward of a measurement."""
+        if self.config.reward == "sparse":
+            return 0.0 if info["is_success"] else -1.0
+        return -(info["d_trans"] + info["d_angle"] / 10.0)
+
+    def compute_reward(self, achieved_goal: NDArray, desired_goal: NDArray, info: Any = None) -> NDArray[np.float64]:
+        """Return rewards for (batch, 7) or (7,) goals of obs_type "goal", by position and angle alone (for HER)."""
+        distance, turn = observation.goal_errors(achieved_goal, desired_goal)
+        if self.config.reward == "dense":
+            return -(distance + turn / 10.0)
+        tolerance = self.subtask.tolerances[self.config.tolerance]
+        return np.where((distance <= tolerance.distance) & (turn <= tolerance.angle), 0.0, -1.0)
+
+    # -- observing ------------------------------------------------------------------------------------------------
+
+    def agent_pos(self) -> NDArray[np.float32]:
+        """Return x y z [m], roll pitch yaw, jaw [rad] of the active arm's measured tip in its base, (7,)."""
+        simulation, arm = self.simulation, self.subtask.arm
+        tip = simulation.to_base(arm, simulation.tip(arm))
+        return np.array(observation.seven(arm, tip, simulation.jaw(arm)), dtype=np.float32)
+
+    def needle_pose(self) -> NDArray[np.float32]:
+        """Return the needle's position [m] and quaternion (w, x, y, z) in world, (7,)."""
+        return self.data.qpos[self.scene.needle_qpos].astype(np.float32)
+
+    def observe(self) -> Observation:
+        """Return the observation of the present state."""
+        if self.view.obs_type == "state":
+            return self._state_vector()
+        if self.view.obs_type == "goal":
+            achieved, desired = self.subtask.target(self.simulation, self.stitch)
+            jaw = self.simulation.jaw(self.subtask.arm)
+            return {
+                "observation": self.agent_pos(),
+                "achieved_goal": observation.goal_vector(achieved, jaw),
+                "desired_goal": observation.goal_vector(desired, 0.0),
+            }
+        return self._look()
+
+    def _state_vector(self) -> NDArray[np.float32]:
+        simulation, arm = self.simulation, self.subtask.arm
+        achieved, desired = self.subtask.target(simulation, self.stitch)
+        tip = simulation.tip(arm)
+        goal = poses.compose(poses.compose(desired, poses.invert(achieved)), tip)
+        now, wanted = simulation.to_base(arm, tip), simulation.to_base(arm, goal)
+        return observation.state_vector(arm, now, wanted, simulation.jaw(arm))
+
+    def _look(self) -> dict[str, Any]:
+        view, pictures = self.view, self._pictures(self.view.image_size)
+        groups = {"pixels": names.RGB}
+        if view.depth:
+            groups["depth"] = names.DEPTH
+        if view.segmentation:
+            groups["segmentation"] = names.SEGMENTATION
+        seen: dict[str, Any] = {
+            group: {camera: pictures.render(self.data, camera, modality) for camera in view.cameras}
+            for group, modality in groups.items()
+        }
+        if view.obs_type == "pixels_agent_pos":
+            seen["agent_pos"] = self.agent_pos()
+        return seen
+
+    def _pictures(self, size: tuple[int, int]) -> Any:
+        """Return the renderer of this process for `size`; made on first use, in the worker."""
+        from surgicai_vision.scene.rendering import FrameRenderer
+
+        if self._renderer is None or (self._renderer.height, self._renderer.width) != size:
+            self.close()
+            self._renderer = FrameRenderer(self.model, *size)
+        return self._renderer
+
+    # -- progress -------------------------------------------------------------------------------------------------
+
+    def _checked(self, action: NDArray[np.float32]) -> list[float]:
+        """Return the action as seven floats in [-1, 1]."""
+        values = np.asarray(action, dtype=np.float64).ravel().tolist()
+        if len(values) != 7 or not all(value == value for value in values):
+            raise InputError(f"The action must be 7 finite numbers in [-1, 1]; got {values}.")
+        return [min(max(value, -1.0), 1.0) for value in values]
+
+    def _remember_tool(self) -> None:
+        memory = self.simulation.memory
+        memory.tool_x, memory.tool_y, memory.tool_z = self.simulation.tip(self.subtask.arm)[:3]
+
+    def _add_path(self) -> None:
+        memory = self.simulation.memory
+        x, y, z = self.simulation.tip(self.subtask.arm)[:3]
+        memory.tip_path += ((x - memory.tool_x) ** 2 + (y - memory.tool_y) ** 2 + (z - memory.tool_z) ** 2) ** 0.5
+        memory.tool_x, memory.tool_y, memory.tool_z = x, y, z
+
+    def _progress(self, info: Info) -> None:
+        """Move on to the next subtask, where a task has several; here there is none."""

@@ -1,0 +1,93 @@
+"""Control: an action of the env becomes joint commands of one arm.
+
+The command is a pose of the tool tip in the arm's own base frame plus the jaw angle. An action in [-1, 1]⁷ moves
+it by at most one step size: translation along the base's axes, rotation by a rotation vector in the base's axes
+(for steps of 2° this equals the released code's roll-pitch-yaw increments to first order, and it has no
+singularity), and the jaw. A command that leaves the workspace or a joint limit is not taken: the command stays.
+
+Plain floats throughout: a pose is the tuple of twelve floats of `scene.kinematics`; numpy on 3 × 3 arrays would
+cost more than the physics saves.
+"""
+
+import math
+from typing import NamedTuple
+
+from surgicai_vision.config import STEPS
+from surgicai_vision.errors import UnreachablePose
+from surgicai_vision.scene.kinematics import Joints, Pose, inverse_flat
+from surgicai_vision.scene.rotations import multiply_flat, rotvec_to_matrix_flat
+
+JAW_OPEN = 1.0
+"""Largest commanded jaw angle [rad]; 0 is closed."""
+SQUEEZE, SQUEEZE_BELOW = 0.3, 0.1
+"""Below a command of 0.1 rad the jaw's servo is led up to 0.3 rad past it: the motor's torque limit then sets the
+force of the grip."""
+WORKSPACE = ((-0.09, -0.09, 0.060), (0.09, 0.14, 0.165))
+"""Corners of the box the tips may move in [m, world]."""
+
+
+class Command(NamedTuple):
+    """What an arm is told to do: tip pose in its base, jaw angle [rad], and the joints that put it there."""
+
+    pose: Pose
+    jaw: float
+    joints: Joints
+
+
+class StepSize(NamedTuple):
+    """The largest move of one action: translation [m], rotation [rad], jaw [rad]."""
+
+    translation: float
+    rotation: float
+    jaw: float
+
+    @classmethod
+    def of(cls, preset: str) -> "StepSize":
+        """Return the step size of a preset in `config.STEPS`."""
+        translation, degrees, jaw = STEPS[preset]
+        return cls(translation, math.radians(degrees), jaw)
+
+
+def moved(pose: Pose, action: list[float], step: StepSize) -> Pose:
+    """Return `pose` moved by the first six numbers of `action`."""
+    shift, turn = step.translation, step.rotation
+    rotation = pose[3:]
+    if action[3] or action[4] or action[5]:
+        increment = rotvec_to_matrix_flat(action[3] * turn, action[4] * turn, action[5] * turn)
+        rotation = multiply_flat(increment, rotation)
+    return (pose[0] + action[0] * shift, pose[1] + action[1] * shift, pose[2] + action[2] * shift, *rotation)
+
+
+def follow(command: Command, action: list[float], step: StepSize, base: Pose, instrument: str) -> Command:
+    """Return the command after `action`; the pose stays where the new one cannot be reached.
+
+    Args:
+        command: the present command.
+        action: seven floats in [-1, 1].
+        step: size of an action of 1.
+        base: T_world_base of the arm.
+        instrument: its instrument.
+    """
+    jaw = min(max(command.jaw + action[6] * step.jaw, 0.0), JAW_OPEN)
+    pose = moved(command.pose, action, step)
+    if not in_workspace(pose, base):
+        return Command(command.pose, jaw, command.joints)
+    try:
+        return Command(pose, jaw, inverse_flat(pose, instrument, command.joints))
+    except UnreachablePose:
+        return Command(command.pose, jaw, command.joints)
+
+
+def in_workspace(pose: Pose, base: Pose) -> bool:
+    """Say whether a tip pose in the base lies in the workspace."""
+    (x0, y0, z0), (x1, y1, z1) = WORKSPACE
+    px, py, pz = pose[0], pose[1], pose[2]
+    x = base[0] + base[3] * px + base[4] * py + base[5] * pz
+    y = base[1] + base[6] * px + base[7] * py + base[8] * pz
+    z = base[2] + base[9] * px + base[10] * py + base[11] * pz
+    return x0 <= x <= x1 and y0 <= y <= y1 and z0 <= z <= z1
+
+
+def jaw_servo(jaw: float) -> float:
+    """Return the servo's set point for a commanded jaw angle [rad]."""
+    return jaw - SQUEEZE * max(0.0, 1.0 - jaw / SQUEEZE_BELOW)

@@ -1,0 +1,148 @@
+"""Geometry of the stitch: grasp frames on the needle, the path through the holes, and the goals.
+
+A grasp: the jaws approach along the normal of the needle's plane from its +z side and close in the radial
+direction. One such grasp serves the pick-up from the tissue, the drive through the holes and the pull. With the
+tool's frame (z along the jaws, y across them, x their hinge) and θ the grasped point's angle:
+y = ± radial(θ), z = -normal, tip frame at `GRASP_DEPTH` above the plane. PSM2 takes +radial, PSM1 -radial: the
+signs for which no joint limit is met on the whole path (and those of SurgicAI's demonstrations).
+
+The path: the holes of layout `simple` lie 7.8 mm apart on flanks tilted 46.1°, their axes 43.9° below the
+horizontal. A circle of the needle's radius R through both centres has its centre √(R² - (gap/2)²) = 9.4 mm above
+their middle and runs there at asin(gap / 2R) = 22.6° to the horizontal: 21° off the holes' axes. No rigid arc
+of this radius is perpendicular at both holes, so the needle starts perpendicular at the entry (place), turns
+those 21° about its tip while the tip enters, then follows the circle. In the 3.8 mm openings the circle keeps
+at least 0.9 mm of clearance from the flanks' inner edges (`tests/test_scene.py` measures it).
+"""
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.envs import poses
+from surgicai_vision.names import PSM1, PSM2
+from surgicai_vision.scene import needle
+from surgicai_vision.scene.arm import GRASP_DEPTH
+from surgicai_vision.scene.holes import HolePair
+from surgicai_vision.scene.kinematics import Pose
+
+Matrix = NDArray[np.float64]
+
+GRASP_SIGNS = {PSM1: -1.0, PSM2: 1.0}
+WOUND = np.array([0.0, 1.0, 0.0])
+"""Direction of the wound in world: the normal of the needle's plane during the stitch."""
+INSERT_ANGLE = math.radians(100.0)
+"""The needle's point that the insertion brings to `INSERT_DEPTH` beyond the exit (released code)."""
+INSERT_DEPTH = 0.002
+HANDOFF_ANGLE = math.radians(105.0)
+"""The needle's point that PSM1 grasps (released code)."""
+PULLOUT_SHIFT = np.array([0.030, 0.0, 0.030])
+PULLOUT_TURN = math.radians(-50.0)
+"""End of the pull-out: the exit shifted by `PULLOUT_SHIFT`, the handoff grasp turned about y (released code)."""
+
+
+def grasp_in_needle(arm: str, angle: float, depth: float = GRASP_DEPTH) -> Matrix:
+    """Return T_needle_tip (4, 4): the tool's pose that grasps the needle's point at `angle` [rad].
+
+    Args:
+        arm: "psm1" or "psm2".
+        angle: angle of the grasped point.
+        depth: distance of the tip frame from the needle's plane [m].
+    """
+    y = GRASP_SIGNS[arm] * needle.radial(angle)
+    z = np.array([0.0, 0.0, -1.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
+    pose[:3, 3] = needle.point(angle) - depth * z
+    return pose
+
+
+def needle_frame(angle: float) -> Matrix:
+    """Return T_needle_point (4, 4): the needle's frame shifted to its point at `angle`."""
+    pose = np.eye(4)
+    pose[:3, 3] = needle.point(angle)
+    return pose
+
+
+@dataclass(frozen=True)
+class Stitch:
+    """The path of the needle through one pair of holes, all poses T_world_needle (4, 4).
+
+    Attributes:
+        pair: entry and exit.
+        centre: centre of the circle through both holes [m, world].
+        half: half of the circle's angle between the holes [rad].
+    """
+
+    pair: HolePair
+    centre: Matrix
+    half: float
+
+    @classmethod
+    def of(cls, pair: HolePair) -> "Stitch":
+        """Return the stitch through `pair`."""
+        entry, leave = np.asarray(pair.entry.centre), np.asarray(pair.exit.centre)
+        chord = leave - entry
+        half = float(np.linalg.norm(chord)) / 2
+        up = np.cross(chord / (2 * half), WOUND)
+        centre = (entry + leave) / 2 + up * math.sqrt(needle.RADIUS**2 - half**2)
+        return cls(pair, centre, math.asin(half / needle.RADIUS))
+
+    def on_arc(self, angle_at_entry: float) -> Matrix:
+        """Return the needle's pose on the circle with its point at `angle_at_entry` [rad] in the entry."""
+        radial = (np.asarray(self.pair.entry.centre) - self.centre) / needle.RADIUS
+        return _needle_pose(angle_at_entry, radial, self.centre)
+
+    def angle_at_entry(self, angle: float, beyond: float) -> float:
+        """Return which needle angle is in the entry when the point at `angle` is `beyond` the exit [m]."""
+        return angle - beyond / needle.RADIUS - 2 * self.half
+
+    def place(self) -> Matrix:
+        """Return the needle's pose with its tip in the entry, perpendicular to the entry's plane."""
+        entry = self.pair.entry
+        inward = -entry.rotation[:, 2]
+        radial = np.cross(WOUND, inward)
+        pose = _needle_pose(needle.TIP_ANGLE, radial, np.zeros(3))
+        pose[:3, 3] = np.asarray(entry.centre) - pose[:3, :3] @ needle.point(needle.TIP_ANGLE)
+        return pose
+
+    def inserted(self, extra: float = 0.0) -> Matrix:
+        """Return the goal of the insertion, driven `extra` further [m]."""
+        return self.on_arc(self.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + extra))
+
+    def pulled(self) -> Matrix:
+        """Return the goal of the pull-out: the handoff point at the end point, turned with the inserted needle."""
+        cosine, sine = math.cos(PULLOUT_TURN), math.sin(PULLOUT_TURN)
+        turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+        pose = np.eye(4)
+        pose[:3, :3] = turn @ self.inserted()[:3, :3]
+        pose[:3, 3] = np.asarray(self.pair.exit.centre) + PULLOUT_SHIFT - pose[:3, :3] @ needle.point(HANDOFF_ANGLE)
+        return pose
+
+
+    @functools.cached_property
+    def place_tip(self) -> Pose:
+        """Return the goal of `place` for the needle's frame at its tip."""
+        return poses.flat(self.place() @ needle_frame(needle.TIP_ANGLE))
+
+    @functools.cached_property
+    def insert_point(self) -> Pose:
+        """Return the goal of `insert` for the needle's frame at `INSERT_ANGLE`."""
+        return poses.flat(self.inserted() @ needle_frame(INSERT_ANGLE))
+
+    @functools.cached_property
+    def pullout_point(self) -> Pose:
+        """Return the goal of `pullout` for the needle's frame at `HANDOFF_ANGLE`."""
+        return poses.flat(self.pulled() @ needle_frame(HANDOFF_ANGLE))
+
+
+def _needle_pose(angle: float, radial: Matrix, centre: Matrix) -> Matrix:
+    """Return the needle's pose with its plane's normal along the wound and `radial` at `angle`."""
+    tangent = np.cross(radial, WOUND)
+    x = -math.cos(angle) * radial + math.sin(angle) * tangent
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(WOUND, x), WOUND], axis=1)
+    pose[:3, 3] = centre
+    return pose

@@ -1,0 +1,59 @@
+"""Grasp (SurgicAI: Approach): PSM2 takes the needle that lies at a random pose on the tissue."""
+
+import math
+from types import MappingProxyType
+
+import numpy as np
+
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.geometry import Stitch, grasp_in_needle
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.envs.starts import GRASP_ANGLES
+from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
+from surgicai_vision.names import PSM2
+from surgicai_vision.scene import needle
+from surgicai_vision.scene.arm import GRASP_DEPTH
+from surgicai_vision.scene.kinematics import Pose
+from surgicai_vision.scene.rotations import rpy_to_matrix
+
+SPREAD_X, SPREAD_Y, SPREAD_TURN = 0.003, 0.020, math.radians(30.0)
+"""Half widths of the needle's start about its home [m, m, rad] (released code, Approach)."""
+
+
+def lying_needle(rng: np.random.Generator) -> np.ndarray:
+    """Draw T_world_needle (4, 4) of a needle that lies on the tissue."""
+    pose = np.eye(4)
+    pose[:3, :3] = rpy_to_matrix(0.0, 0.0, rng.uniform(-SPREAD_TURN, SPREAD_TURN))
+    pose[:3, 3] = needle.HOME + [rng.uniform(-SPREAD_X, SPREAD_X), rng.uniform(-SPREAD_Y, SPREAD_Y), 0.0]
+    return pose
+
+
+class Grasp(Subtask):
+    """Close PSM2's jaws on the needle at the grasp angle: 1 mm and 10°, both pads in contact (paper)."""
+
+    name = "grasp"
+    tolerances = MappingProxyType({"paper": Tolerance.of(1.0, 10.0), "released": Tolerance.of(3.0, 10.0)})
+    demands = MappingProxyType({"paper": Demands(contact=True), "released": Demands()})
+
+    def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
+        """Put the needle on the tissue, both arms at home."""
+        simulation.pose_needle(poses.flat(lying_needle(rng)))
+        simulation.memory.grasp_angle = rng.uniform(*GRASP_ANGLES)
+        simulation.settle(20)
+        return True
+
+    def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
+        """Return the jaws' grasp frame and the grasp frame on the needle."""
+        return simulation.grasp(PSM2), grasp_goal(simulation, PSM2, simulation.memory.grasp_angle)
+
+
+def grasp_goal(simulation: Simulation, arm: str, angle: float) -> Pose:
+    """Return the jaws' grasp frame that holds the needle's point at `angle` [rad], in world."""
+    return poses.compose(simulation.needle(), _grasp_frame(arm, angle))
+
+
+def _grasp_frame(arm: str, angle: float) -> Pose:
+    """Return T_needle_grasp: `grasp_in_needle` with the jaws' grasp point for its origin."""
+    shift = np.eye(4)
+    shift[2, 3] = GRASP_DEPTH
+    return poses.flat(grasp_in_needle(arm, angle) @ shift)

@@ -1,0 +1,50 @@
+"""Insert: PSM2 drives the needle through both holes until a third of it is out of the exit."""
+
+import math
+from types import MappingProxyType
+
+import numpy as np
+
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.geometry import INSERT_ANGLE, Stitch, needle_frame
+from surgicai_vision.envs.place import draw_psm2_grasp
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.envs.starts import about_point, draw_rotation, hold_needle
+from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
+from surgicai_vision.names import PSM2
+from surgicai_vision.scene import needle
+from surgicai_vision.scene.kinematics import Pose
+
+START_SHIFT, START_TURN = 0.0055, math.radians(12.0)
+"""How far the tip may be off the entry at the start (paper)."""
+_POINT = poses.flat(needle_frame(INSERT_ANGLE))
+
+
+class Insert(Subtask):
+    """Bring the needle's 100° point 2 mm beyond the exit: 5 mm, 10°, through both holes (paper)."""
+
+    name = "insert"
+    tolerances = MappingProxyType({"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(1.0, 5.0)})
+    demands = MappingProxyType({"paper": Demands(holes=2), "released": Demands()})
+
+    def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
+        """Hold the needle with its tip near the entry, outside the tissue."""
+        nominal = stitch.place()
+        tip = nominal[:3, :3] @ needle.point(needle.TIP_ANGLE) + nominal[:3, 3]
+        shift = draw_in_ball(rng, START_SHIFT)
+        outward = stitch.pair.entry.rotation[:, 2]
+        if shift @ outward < -0.0005:
+            shift = shift - 2 * (shift @ outward) * outward
+        needle_pose = about_point(nominal, tip, draw_rotation(rng, START_TURN), shift)
+        held = hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose))
+        return held and not simulation.touches_phantom()
+
+    def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
+        """Return the needle's frame at 100° and where it ends."""
+        return poses.compose(simulation.needle(), _POINT), stitch.insert_point
+
+
+def draw_in_ball(rng: np.random.Generator, radius: float) -> np.ndarray:
+    """Draw a point (3,) in a ball [m]."""
+    direction = rng.normal(size=3)
+    return direction / np.linalg.norm(direction) * radius * rng.uniform() ** (1 / 3)

@@ -1,0 +1,119 @@
+"""Observation: what a policy may see, chosen by one argument.
+
+`state`             (21,) float32: tip now (7), tip that would meet the goal (7), error (7); each 7 is x y z [cm],
+                    roll pitch yaw [rad], jaw [rad] in the active arm's base (released code's layout). The error's
+                    rotation is the rotation vector from now to the goal, so it never wraps.
+`goal`              Dict for hindsight relabelling: `observation` (7), `achieved_goal` (7), `desired_goal` (7): the
+                    measured frame that success is judged by and its goal, in world, x y z [m], rotation vector, jaw.
+`pixels`            Dict with `pixels`: view → (height, width, 3) uint8 RGB; with depth=True `depth`: view →
+                    (height, width, 1) float32 [m]; with segmentation=True `segmentation`: view → (…, 1) uint8.
+`pixels_agent_pos`  the same and `agent_pos` (7,) float32: x y z [m], roll pitch yaw [rad], jaw [rad] of the active
+                    arm's measured tip in its own base, as a dVRK reports it.
+
+Pictures and proprioception are all that vision types hold: no goal, no needle pose.
+"""
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from gymnasium import spaces
+
+from surgicai_vision import names
+from surgicai_vision.errors import InputError, check_name
+from surgicai_vision.scene.kinematics import STARTS, Pose
+from surgicai_vision.scene.rotations import matrix_to_rpy_flat, matrix_to_rotvec_flat, multiply_flat
+
+
+@dataclass(frozen=True)
+class ObservationConfig:
+    """What an env shows.
+
+    Attributes:
+        obs_type: one of `names.OBS_TYPES`.
+        cameras: views, in order.
+        image_size: height and width of a picture.
+        depth: add depth pictures.
+        segmentation: add segmentation pictures.
+    """
+
+    obs_type: str = "state"
+    cameras: tuple[str, ...] = ("front", "back")
+    image_size: tuple[int, int] = (224, 224)
+    depth: bool = False
+    segmentation: bool = False
+
+    def __post_init__(self) -> None:
+        check_name("obs_type", self.obs_type, names.OBS_TYPES)
+        for camera in self.cameras:
+            check_name("camera", camera, names.CAMERAS)
+        if len(set(self.cameras)) != len(self.cameras):
+            raise InputError(f"cameras names one view twice: {', '.join(self.cameras)}.")
+        if self.visual and not self.cameras:
+            raise InputError(f"cameras is empty; allowed: {', '.join(names.CAMERAS)}.")
+        if min(self.image_size) < 16 or self.image_size[0] > 960 or self.image_size[1] > 1280:
+            raise InputError(f"image_size is {self.image_size}; allowed: 16 × 16 to 960 × 1280 (height × width).")
+
+    @property
+    def visual(self) -> bool:
+        """Say whether it holds pictures."""
+        return self.obs_type in ("pixels", "pixels_agent_pos")
+
+    def space(self) -> spaces.Space:
+        """Return the observation space."""
+        if self.obs_type == "state":
+            return _box(21)
+        if self.obs_type == "goal":
+            return spaces.Dict({key: _box(7) for key in ("observation", "achieved_goal", "desired_goal")})
+        height, width = self.image_size
+        groups: dict[str, spaces.Space] = {"pixels": self._views(spaces.Box(0, 255, (height, width, 3), np.uint8))}
+        if self.depth:
+            groups["depth"] = self._views(spaces.Box(0.0, np.inf, (height, width, 1), np.float32))
+        if self.segmentation:
+            last = len(names.PARTS) - 1
+            groups["segmentation"] = self._views(spaces.Box(0, last, (height, width, 1), np.uint8))
+        if self.obs_type == "pixels_agent_pos":
+            groups["agent_pos"] = _box(7)
+        return spaces.Dict(groups)
+
+    def _views(self, space: spaces.Box) -> spaces.Dict:
+        return spaces.Dict(dict.fromkeys(self.cameras, space))
+
+
+def _box(size: int) -> spaces.Box:
+    return spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+
+def seven(arm: str, pose: Pose, jaw: float, scale: float = 1.0) -> list[float]:
+    """Return x y z (times `scale`), roll pitch yaw, jaw of a tip pose in the arm's base.
+
+    Roll is in (-2π, 0] as in the released code; yaw is unwrapped about the arm's start, half a turn either way.
+    """
+    roll, pitch, yaw = matrix_to_rpy_flat(pose[3:])
+    home = STARTS[arm][5]
+    yaw = home + (yaw - home + pi) % (2 * pi) - pi
+    return [pose[0] * scale, pose[1] * scale, pose[2] * scale, roll, pitch, yaw, jaw]
+
+
+def state_vector(arm: str, now: Pose, goal: Pose, jaw: float) -> np.ndarray:
+    """Return the 21 values of obs_type "state"; poses in the arm's base."""
+    current, wanted = seven(arm, now, jaw, 100.0), seven(arm, goal, 0.0, 100.0)
+    r = now[3:]
+    turn = multiply_flat(goal[3:], (r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
+    error = [b - a for a, b in zip(current[:3], wanted[:3], strict=True)]
+    return np.array([*current, *wanted, *error, *matrix_to_rotvec_flat(turn), -jaw], dtype=np.float32)
+
+
+def goal_vector(pose: Pose, jaw: float) -> np.ndarray:
+    """Return x y z [m], rotation vector [rad], jaw [rad] of a pose in world, shape (7,)."""
+    return np.array([*pose[:3], *matrix_to_rotvec_flat(pose[3:]), jaw], dtype=np.float32)
+
+
+def goal_errors(achieved: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return distance [m] and geodesic angle [rad] between goal vectors of shape (7,) or (batch, 7)."""
+    from scipy.spatial.transform import Rotation
+
+    one, other = np.atleast_2d(achieved).astype(np.float64), np.atleast_2d(desired).astype(np.float64)
+    distance = np.linalg.norm(one[:, :3] - other[:, :3], axis=1)
+    turn = (Rotation.from_rotvec(other[:, 3:6]) * Rotation.from_rotvec(one[:, 3:6]).inv()).magnitude()
+    return (distance, turn) if np.ndim(achieved) > 1 else (distance[0], turn[0])

@@ -1,0 +1,68 @@
+"""Passage: did the needle go through both holes, in travel direction, through the openings?
+
+Two tests that must agree, so that tunnelling or teleporting never counts. In time: the tip crosses the entry's
+plane inwards, then the exit's plane outwards, each inside the opening, and never moves further than `JUMP` in
+one control step. In space: the needle's polyline crosses both planes inside the openings now.
+"""
+
+import math
+
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.memory import Memory
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.scene import needle
+from surgicai_vision.scene.holes import OPENING, Hole, HolePair, crossing, inside
+
+JUMP = 0.004
+"""Furthest the tip can move in one control step [m]: eight times the default step size."""
+
+Point = tuple[float, float, float]
+
+
+def watch(simulation: Simulation, memory: Memory, pair: HolePair) -> None:
+    """Update `memory.passed` with the tip's move since the last measurement."""
+    now = simulation.needle_point(needle.TIP_ANGLE)
+    before = (memory.tip_x, memory.tip_y, memory.tip_z)
+    memory.tip_x, memory.tip_y, memory.tip_z = now
+    if math.dist(now, before) > JUMP:
+        return
+    if memory.passed == 0.0 and _passes(before, now, pair.entry, inward=True):
+        memory.passed = 1.0
+    elif memory.passed == 1.0:
+        if _passes(before, now, pair.exit, inward=False):
+            memory.passed = 2.0
+        elif _passes(before, now, pair.entry, inward=False):
+            memory.passed = 0.0
+    elif memory.passed == 2.0 and _passes(before, now, pair.exit, inward=True):
+        memory.passed = 1.0
+
+
+def remember_tip(simulation: Simulation, memory: Memory) -> None:
+    """Start watching from the tip's present place."""
+    memory.tip_x, memory.tip_y, memory.tip_z = simulation.needle_point(needle.TIP_ANGLE)
+
+
+def in_both(simulation: Simulation, pair: HolePair) -> bool:
+    """Say whether the needle lies in both openings now."""
+    pose = poses.square(simulation.needle())
+    line = needle.polyline() @ pose[:3, :3].T + pose[:3, 3]
+    return inside(crossing(line, pair.entry, inward=True)) and inside(crossing(line, pair.exit, inward=False))
+
+
+def is_out(simulation: Simulation, pair: HolePair) -> bool:
+    """Say whether the whole needle is beyond the exit's plane."""
+    pose = poses.square(simulation.needle())
+    line = needle.polyline(13) @ pose[:3, :3].T + pose[:3, 3]
+    return bool((((line - pair.exit.centre) @ pair.exit.rotation)[:, 2] > 0).all())
+
+
+def _passes(before: Point, now: Point, hole: Hole, inward: bool) -> bool:
+    """Say whether the way from `before` to `now` crosses the hole's plane inside the opening."""
+    cosine, sine = math.cos(hole.tilt), math.sin(hole.tilt)
+    x, y, z = hole.centre
+    start, end = sine * (before[0] - x) + cosine * (before[2] - z), sine * (now[0] - x) + cosine * (now[2] - z)
+    if not (start > 0.0 >= end if inward else start <= 0.0 < end):
+        return False
+    share = start / (start - end)
+    dx, dy, dz = (b + share * (n - b) - c for b, n, c in zip(before, now, hole.centre, strict=True))
+    return abs(cosine * dx - sine * dz) < OPENING / 2 and abs(dy) < OPENING / 2

@@ -1,0 +1,44 @@
+"""Place: PSM2 brings the needle's tip to the entry, perpendicular to the entry's plane."""
+
+import math
+from types import MappingProxyType
+
+import numpy as np
+
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.geometry import Stitch, needle_frame
+from surgicai_vision.envs.grasp import lying_needle
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.envs.starts import GRASP_ANGLES, SAFE_ANGLES, draw_grasp_error, grasp_pose, hold_needle
+from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
+from surgicai_vision.names import PSM2
+from surgicai_vision.scene import needle
+from surgicai_vision.scene.kinematics import Pose
+
+GRASP_SHIFT, GRASP_TILT = 0.0015, math.radians(12.0)
+"""How far PSM2's grasp may be off at the start of place and insert (paper)."""
+_TIP = poses.flat(needle_frame(needle.TIP_ANGLE))
+
+
+def draw_psm2_grasp(rng: np.random.Generator, needle_pose: np.ndarray) -> np.ndarray:
+    """Draw T_world_tip (4, 4) of PSM2's imperfect grasp of a needle, within the angles that work."""
+    angle, error = rng.uniform(*GRASP_ANGLES), draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
+    low, high = (limit - error.along / needle.RADIUS for limit in SAFE_ANGLES)
+    return grasp_pose(PSM2, needle_pose, min(max(angle, low), high), error)
+
+
+class Place(Subtask):
+    """Put the needle's tip into the entry: 5 mm and 10° of the needle's whole orientation (paper)."""
+
+    name = "place"
+    tolerances = MappingProxyType({"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(5.0, 10.0)})
+    demands = MappingProxyType({"paper": Demands(), "released": Demands()})
+
+    def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
+        """Hold the needle that still lies on the tissue."""
+        needle_pose = lying_needle(rng)
+        return hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose))
+
+    def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
+        """Return the needle's frame at its tip and that frame in the entry."""
+        return poses.compose(simulation.needle(), _TIP), stitch.place_tip

@@ -1,0 +1,44 @@
+"""Pullout: PSM1 pulls the needle wholly out of the tissue, to a fixed end point."""
+
+import math
+from types import MappingProxyType
+
+import numpy as np
+
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.geometry import HANDOFF_ANGLE, Stitch, needle_frame
+from surgicai_vision.envs.handoff import inserted_needle
+from surgicai_vision.envs.place import draw_psm2_grasp
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.envs.starts import draw_grasp_error, grasp_pose, hold_needle
+from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
+from surgicai_vision.names import PSM1, PSM2
+from surgicai_vision.scene.kinematics import Pose
+
+GRASP_SHIFT, GRASP_TILT = 0.0015, math.radians(20.0)
+"""How far PSM1's grasp may be off at the start (paper)."""
+RETREAT, RELEASED_JAW = 0.025, 0.5
+"""Where PSM2 is after it let go: drawn back along its axis [m], jaw open [rad]."""
+_POINT = poses.flat(needle_frame(HANDOFF_ANGLE))
+
+
+class Pullout(Subtask):
+    """Bring the needle's 105° point to the end point: 5 mm, 20°, wholly out (paper)."""
+
+    name = "pullout"
+    tolerances = MappingProxyType({"paper": Tolerance.of(5.0, 20.0), "released": Tolerance.of(5.0, 5.0)})
+    demands = MappingProxyType({"paper": Demands(out=True), "released": Demands()})
+
+    def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
+        """Hold the inserted needle with PSM1, PSM2 drawn back with open jaws."""
+        needle_pose = inserted_needle(stitch, rng)
+        simulation.memory.passed = 2.0
+        away = draw_psm2_grasp(rng, needle_pose)
+        away[:3, 3] -= RETREAT * away[:3, 2]
+        simulation.pose_arm(PSM2, simulation.to_base(PSM2, poses.flat(away)), RELEASED_JAW)
+        error = draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
+        return hold_needle(simulation, PSM1, needle_pose, grasp_pose(PSM1, needle_pose, HANDOFF_ANGLE, error))
+
+    def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
+        """Return the needle's frame at 105° and where it ends."""
+        return poses.compose(simulation.needle(), _POINT), stitch.pullout_point

@@ -1,0 +1,238 @@
+"""Simulation: one scene in motion. Physics, commands of both arms, measured poses and contacts, the whole state.
+
+Interface:
+    Simulation(scene)                     owns a MjData
+    .advance(arm, action) -> bool         one control step; False when the physics diverged
+    .tip(arm) .grasp(arm) .needle()       measured poses in world, twelve floats (`scene.kinematics.Pose`)
+    .touching(arm) -> (bool, bool)        does the left, the right jaw pad touch the needle
+    .get_state() / .set_state(vector)     everything: MuJoCo's integration state and `memory`
+
+A control step is ten physics steps of 2 ms, cut so that it *ends* with MuJoCo's position and velocity stages
+(`mj_step1`): measured poses, contacts and pictures belong to the state they are read with, and a restored state
+gives the same ones, bit for bit. MuJoCo resets itself on divergence; the clock shows it.
+"""
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision import names
+from surgicai_vision.envs import control, poses
+from surgicai_vision.envs.control import Command, StepSize
+from surgicai_vision.envs.memory import Memory
+from surgicai_vision.errors import InputError, UnreachablePose
+from surgicai_vision.scene import Scene, kinematics, needle
+from surgicai_vision.scene.arm import GRASP_DEPTH
+from surgicai_vision.scene.kinematics import Pose
+from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
+
+SUBSTEPS = 10
+STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+RELEASE_STEPS, RELEASE_JAW, RELEASE_SHIFT = 40, 0.1, 0.001
+"""How PSM2 lets go after the handoff: jaw opened by 0.1 rad a step to 0.5, then drawn back 1 mm a step."""
+
+
+class Simulation:
+    """One scene in motion; see the module's docstring."""
+
+    def __init__(self, scene: Scene):
+        self.scene = scene
+        self.model = scene.model
+        self.data = mujoco.MjData(scene.model)
+        self.memory = Memory()
+        self.commands: dict[str, Command] = {}
+        self.bases = {arm: poses.flat(kinematics.base_in_world(arm)) for arm in names.ARMS}
+        self._from_world = {arm: poses.invert(base) for arm, base in self.bases.items()}
+        self._needle_id = self.model.body("needle").id
+        self._phantom_id = self.model.body("phantom").id
+        self._pads = {arm: scene.arms[arm].pads for arm in names.ARMS}
+        self._needle_geoms = (scene.needle_geoms.start, scene.needle_geoms.stop)
+        self._ctrl = self.data.ctrl
+        self._xpos, self._xmat = self.data.xpos, self.data.xmat
+        self._tip_ids = {arm: scene.arms[arm].tip_body for arm in names.ARMS}
+        self.reset()
+
+    def reset(self) -> None:
+        """Put everything at home: both arms at their start, the needle flat at its home."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.memory = Memory()
+        for arm in names.ARMS:
+            self.pose_arm(arm, poses.flat(kinematics.start_in_base(arm)), kinematics.STARTS[arm][6])
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Recompute positions, velocities and contacts of the present state."""
+        mujoco.mj_step1(self.model, self.data)
+
+    # -- setting --------------------------------------------------------------------------------------------------
+
+    def pose_arm(self, arm: str, pose: Pose, jaw: float, measured_jaw: float | None = None) -> None:
+        """Put an arm's joints at a tip pose in its base, at rest, and command it to stay.
+
+        Args:
+            arm: "psm1" or "psm2".
+            pose: T_base_tip.
+            jaw: commanded jaw angle [rad].
+            measured_jaw: the fingers' angle [rad], by default the commanded one.
+
+        Raises:
+            UnreachablePose: outside the joint limits.
+        """
+        near = self.commands[arm].joints if arm in self.commands else None
+        try:
+            joints = kinematics.inverse_flat(pose, self.scene.config.instrument, near)
+        except UnreachablePose:
+            joints = kinematics.inverse_flat(pose, self.scene.config.instrument)
+        ids = self.scene.arms[arm]
+        self.data.qpos[ids.qpos] = joints
+        finger = jaw if measured_jaw is None else measured_jaw
+        self.data.qpos[ids.finger_qpos : ids.finger_qpos + 2] = finger
+        self.command(arm, Command(pose, jaw, joints))
+
+    def command(self, arm: str, command: Command) -> None:
+        """Make `command` the arm's present command."""
+        self.commands[arm] = command
+        ids = self.scene.arms[arm]
+        self._ctrl[ids.actuators] = command.joints
+        self._ctrl[ids.jaw_actuator] = control.jaw_servo(command.jaw)
+
+    def pose_needle(self, pose: Pose) -> None:
+        """Put the needle at a pose in world, at rest."""
+        free = self.scene.needle_qpos.start
+        self.data.qpos[free : free + 3] = pose[:3]
+        self.data.qpos[free + 3 : free + 7] = matrix_to_quaternion_flat(pose[3:])
+
+    def to_base(self, arm: str, pose: Pose) -> Pose:
+        """Return a pose in world as one in the arm's base."""
+        return poses.compose(self._from_world[arm], pose)
+
+    def settle(self, steps: int) -> None:
+        """Let the physics run under the present commands for `steps` physics steps."""
+        if steps:
+            mujoco.mj_step(self.model, self.data, steps)
+        self.data.time = 0.0
+        self.refresh()
+
+    # -- moving ---------------------------------------------------------------------------------------------------
+
+    def advance(self, arm: str, action: list[float], step: StepSize) -> bool:
+        """Take one control step of 20 ms; return False when MuJoCo diverged and reset itself.
+
+        Args:
+            arm: the arm the action moves.
+            action: seven floats in [-1, 1].
+            step: size of an action of 1.
+        """
+        instrument = self.scene.config.instrument
+        self.command(arm, control.follow(self.commands[arm], action, step, self.bases[arm], instrument))
+        if self.memory.release > 0:
+            self._let_go()
+        data = self.data
+        due = data.time + SUBSTEPS * self.model.opt.timestep
+        mujoco.mj_step2(self.model, data)
+        mujoco.mj_step(self.model, data, SUBSTEPS - 1)
+        mujoco.mj_step1(self.model, data)
+        return abs(data.time - due) < 1e-9
+
+    def _let_go(self) -> None:
+        """Open PSM2's jaw, then draw the tool back along its axis."""
+        memory, command = self.memory, self.commands[names.PSM2]
+        memory.release -= 1
+        jaw = min(command.jaw + RELEASE_JAW, 0.5)
+        back = [0.0] * 7
+        if jaw >= 0.5:
+            back[:3] = [-command.pose[5], -command.pose[8], -command.pose[11]]
+        step = StepSize(RELEASE_SHIFT, 0.0, 0.0)
+        moved = control.follow(command, back, step, self.bases[names.PSM2], self.scene.config.instrument)
+        self.command(names.PSM2, moved._replace(jaw=jaw))
+
+    # -- measuring ------------------------------------------------------------------------------------------------
+
+    def _body(self, index: int) -> Pose:
+        return (*self._xpos[index].tolist(), *self._xmat[index].tolist())
+
+    def tip(self, arm: str) -> Pose:
+        """Return T_world_tip of an arm, measured."""
+        return self._body(self._tip_ids[arm])
+
+    def grasp(self, arm: str) -> Pose:
+        """Return T_world_grasp: the tip's frame shifted to the jaws' grasp point."""
+        x, y, z, *rotation = self.tip(arm)
+        return (
+            x + GRASP_DEPTH * rotation[2],
+            y + GRASP_DEPTH * rotation[5],
+            z + GRASP_DEPTH * rotation[8],
+            *rotation,
+        )
+
+    def needle(self) -> Pose:
+        """Return T_world_needle, measured."""
+        return self._body(self._needle_id)
+
+    def jaw(self, arm: str) -> float:
+        """Return the measured angle of the left finger [rad]."""
+        return float(self.data.qpos[self.scene.arms[arm].finger_qpos])
+
+    def needle_point(self, angle: float) -> tuple[float, float, float]:
+        """Return the needle's point at `angle` [rad] in world [m]."""
+        x, y, z, r0, r1, _, r3, r4, _, r6, r7, _ = self.needle()
+        along, across = -needle.RADIUS * math.cos(angle), needle.RADIUS * math.sin(angle)
+        return x + r0 * along + r1 * across, y + r3 * along + r4 * across, z + r6 * along + r7 * across
+
+    def touching(self, arm: str) -> tuple[bool, bool]:
+        """Say whether the left and the right jaw pad touch the needle: the jaws' contact sensors."""
+        left, right = self._pads[arm]
+        first, last = self._needle_geoms
+        found_left = found_right = False
+        for one, other in self.data.contact.geom.tolist():
+            if first <= one < last:
+                one, other = other, one
+            if first <= other < last:
+                found_left = found_left or one == left
+                found_right = found_right or one == right
+        return found_left, found_right
+
+    def holds(self, arm: str) -> bool:
+        """Say whether both jaw pads of an arm touch the needle."""
+        left, right = self.touching(arm)
+        return left and right
+
+    def touches_phantom(self) -> bool:
+        """Say whether anything touches the phantom."""
+        body = self.model.geom_bodyid[self.data.contact.geom]
+        return bool((body == self._phantom_id).any())
+
+    # -- state ----------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> NDArray[np.float64]:
+        """Return everything as one vector: MuJoCo's integration state, commands and memory inside its user data."""
+        values = [*self.memory.pack()]
+        for arm in names.ARMS:
+            values += [*self.commands[arm].pose, self.commands[arm].jaw]
+        self.data.userdata[: len(values)] = values
+        state = np.empty(mujoco.mj_stateSize(self.model, STATE))
+        mujoco.mj_getState(self.model, self.data, state, STATE)
+        return state
+
+    def set_state(self, state: NDArray[np.float64]) -> None:
+        """Restore a vector of `get_state`.
+
+        Raises:
+            InputError: of another length, or not finite.
+        """
+        vector = np.ascontiguousarray(state, dtype=np.float64)
+        size = mujoco.mj_stateSize(self.model, STATE)
+        if vector.shape != (size,):
+            raise InputError(f"The state has shape {vector.shape}; this scene's states have shape ({size},).")
+        if not np.isfinite(vector).all():
+            raise InputError("The state holds numbers that are not finite.")
+        mujoco.mj_setState(self.model, self.data, vector, STATE)
+        values = self.data.userdata.tolist()
+        self.memory = Memory.unpack(values)
+        for index, arm in enumerate(names.ARMS):
+            start = Memory.SIZE + 13 * index
+            joints = tuple(self.data.ctrl[self.scene.arms[arm].actuators].tolist())
+            self.commands[arm] = Command(tuple(values[start : start + 12]), values[start + 12], joints)
+        self.refresh()

@@ -1,0 +1,99 @@
+"""Starts: put the needle into an arm's jaws by solving for the pose, not by playing the subtasks before.
+
+The jaws are posed closed around the needle and the physics settles for `SETTLE` steps; a start that then is not
+a grasp, or that touches the phantom where it should not, is refused and drawn again.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.geometry import grasp_in_needle
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.errors import UnreachablePose
+from surgicai_vision.scene import needle
+from surgicai_vision.scene.arm import GRASP_DEPTH, PAD_OFFSET
+from surgicai_vision.scene.rotations import rotvec_to_matrix
+
+Matrix = NDArray[np.float64]
+
+SETTLE = 60
+"""Physics steps (2 ms) a start state settles."""
+CLOSED_JAW = (needle.BODY_RADIUS - PAD_OFFSET) / GRASP_DEPTH
+"""Finger angle [rad] at which the pads touch the needle."""
+GRASP_ANGLES = (math.radians(5.0), math.radians(20.0))
+"""Needle angle of PSM2's grasp (released code, Approach)."""
+SAFE_ANGLES = (math.radians(4.0), math.radians(27.0))
+"""Where a grasp off by its error still has the needle between the pads and passes the entry."""
+
+
+class GraspError(NamedTuple):
+    """How far a grasp is off the nominal one."""
+
+    along: float
+    """Along the needle [m]."""
+    depth: float
+    """Along the jaws; negative is shallower [m]."""
+    tilt: tuple[float, float]
+    """Rotation vector about the tool's x and y axis, through the grasped point [rad]."""
+
+
+def draw_grasp_error(rng: np.random.Generator, shift: float, angle: float) -> GraspError:
+    """Draw a grasp error: at most `shift` [m] along the needle and in depth, at most `angle` [rad] about two axes.
+
+    The third rotation and the third translation do not exist: the jaws' flat pads take them away on closing.
+    """
+    along = rng.uniform(-shift, shift)
+    depth = rng.uniform(-0.6, 0.2) * math.sqrt(shift**2 - along**2)
+    size, direction = angle * math.sqrt(rng.uniform()), rng.uniform(0.0, 2 * math.pi)
+    return GraspError(along, depth, (size * math.cos(direction), size * math.sin(direction)))
+
+
+def grasp_pose(arm: str, needle_pose: Matrix, angle: float, error: GraspError | None = None) -> Matrix:
+    """Return T_world_tip (4, 4) of a grasp of the needle's point at `angle` [rad], off by `error`."""
+    if error is None:
+        return needle_pose @ grasp_in_needle(arm, angle)
+    grasp = needle_pose @ grasp_in_needle(arm, angle + error.along / needle.RADIUS, GRASP_DEPTH - error.depth)
+    pivot = np.eye(4)
+    pivot[2, 3] = GRASP_DEPTH - error.depth
+    turn = np.eye(4)
+    turn[:3, :3] = rotvec_to_matrix([*error.tilt, 0.0])
+    return grasp @ pivot @ turn @ np.linalg.inv(pivot)
+
+
+def hold_needle(simulation: Simulation, arm: str, needle_pose: Matrix, tip: Matrix) -> bool:
+    """Pose the needle and `arm` around it, close, settle; say whether both pads hold it where it was put.
+
+    Args:
+        simulation: already reset.
+        arm: the holding arm.
+        needle_pose: T_world_needle (4, 4).
+        tip: T_world_tip (4, 4) of the arm.
+    """
+    simulation.pose_needle(poses.flat(needle_pose))
+    try:
+        simulation.pose_arm(arm, simulation.to_base(arm, poses.flat(tip)), 0.0, CLOSED_JAW)
+    except UnreachablePose:
+        return False
+    simulation.settle(SETTLE)
+    now = simulation.needle()
+    wanted = poses.flat(needle_pose)
+    near = poses.distance(now, wanted) < 0.002 and poses.angle(now, wanted) < math.radians(8.0)
+    return near and simulation.holds(arm)
+
+
+def draw_rotation(rng: np.random.Generator, angle: float) -> Matrix:
+    """Draw a rotation (3, 3) by at most `angle` [rad] about a random axis."""
+    axis = rng.normal(size=3)
+    return rotvec_to_matrix(axis / np.linalg.norm(axis) * rng.uniform(0.0, angle))
+
+
+def about_point(pose: Matrix, point: Matrix, rotation: Matrix, shift: Matrix) -> Matrix:
+    """Return `pose` turned by `rotation` about `point` (world) and shifted by `shift` (world)."""
+    moved = pose.copy()
+    moved[:3, :3] = rotation @ pose[:3, :3]
+    moved[:3, 3] = point + rotation @ (pose[:3, 3] - point) + shift
+    return moved

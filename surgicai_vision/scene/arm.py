@@ -1,0 +1,147 @@
+"""Arm: one da Vinci PSM as a MuJoCo kinematic tree, built from the same DH table as `kinematics`.
+
+Bodies follow the modified DH frames; the last one, `tip`, is the wrist-yaw axis, with +z along the jaws, ±y the
+direction in which they open and x their hinge. The jaws' grasp point lies `GRASP_DEPTH` along z.
+
+Actuators are position servos with the natural frequency `BANDWIDTH` on each joint's own inertia, gravity
+compensated: the joints follow a commanded pose as a dVRK's do, and give way to contact by a finite stiffness.
+The two fingers are coupled by an equality, so that one torque-limited motor closes both (about 2.5 N each).
+Numbers without another source were measured by `benchmarks/grip.py`.
+"""
+
+import math
+
+import mujoco
+
+from surgicai_vision.scene.kinematics import DVRK_JOINTS, Instrument
+from surgicai_vision.scene.needle import BODY_RADIUS, CONTACT
+
+GRASP_DEPTH = 0.010
+"""Grasp point beyond the wrist-yaw axis [m] (SurgicAI)."""
+PAD_END = 0.0125
+"""End of the jaw pads beyond the wrist-yaw axis [m]: 2.5 mm past the grasp point."""
+PAD_WIDTH = 0.003
+PAD_THICKNESS = 0.0010
+PAD_OFFSET = BODY_RADIUS - 0.00005
+"""Inner faces of the closed jaws from their middle plane [m]: parallel when they hold the needle."""
+JAW_LIMITS = (-0.06, 1.0)
+"""Angle of each finger [rad]; below 0 only when the jaws close on nothing."""
+JAW_GAIN, JAW_TORQUE, JAW_ARMATURE = 1.0, 0.05, 1e-5
+SHAFT_RADIUS, SHAFT_LENGTH = 0.004, 0.36
+WRIST_RADIUS = 0.003
+BANDWIDTH = 100.0
+"""[rad/s]"""
+ARMATURE = (0.02, 0.02, 0.5, 2e-4, 1e-4, 1e-4)
+MASSES = (0.01, 0.01, 0.05, 0.005, 0.005, 0.004)
+"""Link masses [kg]; small beside the armature, which stands for the geared motors."""
+
+
+def add_arm(spec: mujoco.MjSpec, arm: str, base: mujoco.MjsBody, instrument: Instrument, bits: dict[str, int]) -> None:
+    """Add the arm `arm` to `spec` below its base body.
+
+    Args:
+        spec: the scene; gets joints and actuators named `{arm}_…`.
+        arm: "psm1" or "psm2".
+        base: the body at the remote centre of motion, in the arm's base frame.
+        instrument: lengths and joint limits.
+        bits: collision bits of the instrument.
+    """
+    body = base
+    for index, name in enumerate(DVRK_JOINTS):
+        body = _add_link(body, arm, name, index, instrument)
+        _add_servo(spec, f"{arm}_{name}", index)
+        if index == 3:
+            _capsule(body, f"{arm}_shaft", [0, 0, -SHAFT_LENGTH, 0, 0, -SHAFT_RADIUS], SHAFT_RADIUS, bits)
+        if index == 4:
+            _capsule(body, f"{arm}_wrist", [0, 0, 0, instrument.pitch_to_yaw, 0, 0], WRIST_RADIUS, bits)
+    tip = body.add_body(name=f"{arm}_tip", quat=_frame(instrument.dh[6].alpha, instrument.dh[6].offset))
+    tip.add_site(name=f"{arm}_tip", size=[0.0005] * 3, group=4)
+    tip.add_site(name=f"{arm}_grasp", pos=[0, 0, GRASP_DEPTH], size=[0.0005] * 3, group=4)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        _add_finger(tip, f"{arm}_{side}", sign, bits)
+    _couple_fingers(spec, arm)
+
+
+def _frame(alpha: float, offset: float) -> list[float]:
+    """Return the quaternion (wxyz) of RotX(alpha)·RotZ(offset)."""
+    ca, sa, co, so = math.cos(alpha / 2), math.sin(alpha / 2), math.cos(offset / 2), math.sin(offset / 2)
+    return [ca * co, sa * co, -sa * so, ca * so]
+
+
+def _add_link(parent: mujoco.MjsBody, arm: str, name: str, index: int, instrument: Instrument) -> mujoco.MjsBody:
+    """Add the body and the joint of one row of the DH table."""
+    row = instrument.dh[index]
+    body = parent.add_body(
+        name=f"{arm}_{name}_link",
+        pos=[row.a, -row.d * math.sin(row.alpha), row.d * math.cos(row.alpha)],
+        quat=_frame(row.alpha, row.offset),
+    )
+    body.gravcomp = 1.0
+    body.mass, body.inertia, body.explicitinertial = MASSES[index], [MASSES[index] * 1e-4] * 3, True
+    body.add_joint(
+        name=f"{arm}_{name}",
+        type=mujoco.mjtJoint.mjJNT_SLIDE if row.prismatic else mujoco.mjtJoint.mjJNT_HINGE,
+        axis=[0, 0, 1],
+        range=list(instrument.limits[index]),
+        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        armature=ARMATURE[index],
+    )
+    return body
+
+
+def _add_servo(spec: mujoco.MjSpec, joint: str, index: int) -> None:
+    """Add a position servo with natural frequency `BANDWIDTH`, critically damped."""
+    actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator.set_to_position(kp=ARMATURE[index] * BANDWIDTH**2, kv=2 * ARMATURE[index] * BANDWIDTH)
+
+
+def _capsule(body: mujoco.MjsBody, name: str, fromto: list[float], radius: float, bits: dict[str, int]) -> None:
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=fromto,
+        size=[radius, 0, 0],
+        material="steel",
+        mass=0,
+        **bits,
+    )
+
+
+def _add_finger(tip: mujoco.MjsBody, name: str, side: float, bits: dict[str, int]) -> None:
+    """Add one finger: its hinge opens towards +y (side = 1) or -y (side = -1)."""
+    body = tip.add_body(name=f"{name}_finger")
+    body.gravcomp = 1.0
+    body.mass, body.inertia, body.explicitinertial = 0.001, [1e-7] * 3, True
+    body.ipos = [0.0, 0.0, 0.006]
+    body.add_joint(
+        name=f"{name}_finger",
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=[-side, 0, 0],
+        range=list(JAW_LIMITS),
+        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        armature=JAW_ARMATURE,
+    )
+    start = 0.0045
+    body.add_geom(
+        name=f"{name}_pad",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[0, side * (PAD_OFFSET + PAD_THICKNESS / 2), (start + PAD_END) / 2],
+        size=[PAD_WIDTH / 2, PAD_THICKNESS / 2, (PAD_END - start) / 2],
+        material="jaw",
+        mass=0,
+        **CONTACT,
+        **bits,
+    )
+
+
+def _couple_fingers(spec: mujoco.MjSpec, arm: str) -> None:
+    """Tie the right finger's angle to the left one's, and drive both by one motor."""
+    equality = spec.add_equality(name=f"{arm}_fingers", type=mujoco.mjtEq.mjEQ_JOINT)
+    equality.name1, equality.name2 = f"{arm}_right_finger", f"{arm}_left_finger"
+    equality.data[:5] = [0, 1, 0, 0, 0]
+    equality.solref = [0.004, 1.0]
+    equality.solimp = [0.99, 0.999, 0.0001, 0.5, 2.0]
+    actuator = spec.add_actuator(name=f"{arm}_jaw", target=f"{arm}_left_finger", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator.set_to_position(kp=JAW_GAIN, kv=2 * math.sqrt(2 * JAW_GAIN * JAW_ARMATURE))
+    actuator.forcelimited = True
+    actuator.forcerange = [-JAW_TORQUE, JAW_TORQUE]

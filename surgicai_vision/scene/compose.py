@@ -1,0 +1,171 @@
+"""Compose: a `SceneConfig` becomes one MuJoCo model, through `mujoco.MjSpec`.
+
+Interface: `build_scene(config) -> Scene`, cached per process. `Scene` holds the model, the ids that later stages
+need, and the scene hash: sha256 over the compiled XML and the configuration, so any change of geometry changes it.
+
+World: metres, z up, gravity 9.81 m/s². Solver settings are those under which a friction grasp holds
+(`benchmarks/grip.py` shows what each of them is worth): Newton, elliptic cones, impratio 100, Euler, 2 ms.
+"""
+
+import functools
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import mujoco
+
+from surgicai_vision import config as configuration
+from surgicai_vision import names
+from surgicai_vision.config import SceneConfig
+from surgicai_vision.errors import UnknownName
+from surgicai_vision.scene import arm, holes, kinematics, look, needle, phantom, rotations, thread
+# from surgicai_vision.scene.cameras import add_world_cameras, add_wrist_camera
+
+TIMESTEP = 0.002
+USER_DATA = 96
+"""Numbers the envs keep inside MuJoCo's state (goal, progress), so that one vector is the whole state."""
+
+SURFACES, GRIP, FIRM, ARMS, THREAD = 1, 2, 4, 8, 16
+"""Collision bits: needle on tissue, needle in jaws, instruments on firm tissue, instrument on instrument,
+thread on tissue and instruments."""
+
+
+@dataclass(frozen=True)
+class ArmIds:
+    """Where one arm's numbers stand in MuJoCo's arrays."""
+
+    qpos: slice
+    finger_qpos: int
+    actuators: slice
+    jaw_actuator: int
+    tip_site: int
+    grasp_site: int
+    tip_body: int
+    pads: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled scene.
+
+    Attributes:
+        model: the MuJoCo model; shared, not to be written by envs without randomisation.
+        config: what it was built from.
+        hash: sha256 (hex) of the compiled XML and the configuration.
+        instrument: the PSM instrument.
+        arms: arm name → its ids.
+        pair: the hole pair of this scene's stitch.
+        needle_qpos: the needle's position and quaternion in qpos.
+        needle_geoms: ids of the needle's capsules, from base to tip.
+    """
+
+    model: mujoco.MjModel
+    config: SceneConfig
+    hash: str
+    instrument: kinematics.Instrument
+    arms: Mapping[str, ArmIds]
+    pair: holes.HolePair
+    needle_qpos: slice
+    needle_geoms: range
+
+    def named(self, kind: str, name: str) -> int:
+        """Return the id of a named body, joint, geom, site, camera, actuator or sensor.
+
+        Raises:
+            UnknownName: listing what exists.
+        """
+        kinds = {k: getattr(self.model, f"n{k}") for k in ("body", "geom", "site", "sensor")}
+        kinds |= {"joint": self.model.njnt, "camera": self.model.ncam, "actuator": self.model.nu}
+        if kind not in kinds:
+            raise UnknownName("kind of element", kind, kinds)
+        look_up = getattr(self.model, kind)
+        known = [look_up(index).name for index in range(kinds[kind])]
+        if name not in known:
+            raise UnknownName(kind, name, known)
+        return known.index(name)
+
+
+@functools.lru_cache(maxsize=8)
+def build_scene(config: SceneConfig = SceneConfig()) -> Scene:
+    """Return the compiled scene of `config`; the same object for the same configuration in one process."""
+    spec = build_spec(config)
+    model = spec.compile()
+    free = int(model.joint("needle").qposadr[0])
+    first = model.geom("needle_0").id
+    text = spec.to_xml() + configuration.digest(config)
+    return Scene(
+        model=model,
+        config=config,
+        hash=hashlib.sha256(text.encode()).hexdigest(),
+        instrument=kinematics.INSTRUMENTS[config.instrument],
+        arms=MappingProxyType({name: _arm_ids(model, name) for name in names.ARMS}),
+        pair=holes.PAIRS[config.layout][config.hole_pair - 1],
+        needle_qpos=slice(free, free + 7),
+        needle_geoms=range(first, first + needle.SEGMENTS),
+    )
+
+
+def build_spec(config: SceneConfig) -> mujoco.MjSpec:
+    """Return the scene as an editable `mujoco.MjSpec`."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "surgicai-vision"
+    _set_options(spec)
+    look.add_materials(spec)
+    look.add_surroundings(spec)
+    phantom.add_phantom(
+        spec,
+        config.layout,
+        needle={"contype": 0, "conaffinity": SURFACES | THREAD},
+        arm={"contype": 0, "conaffinity": FIRM},
+    )
+    body = needle.add_needle(spec, {"contype": SURFACES | GRIP, "conaffinity": 0})
+    thread.add_thread(spec, body, needle.point(0.0).tolist(), config.thread, {"contype": THREAD, "conaffinity": 0})
+    for name in names.ARMS:
+        _add_arm(spec, config, name)
+    look.dress(spec)
+    #     add_world_cameras(spec)
+    return spec
+
+
+def _add_arm(spec: mujoco.MjSpec, config: SceneConfig, name: str) -> None:
+    """Add one arm at its base pose, with its wrist camera."""
+    pose = kinematics.base_in_world(name)
+    quat = rotations.matrix_to_quaternion(pose[:3, :3])
+    base = spec.worldbody.add_body(name=f"{name}_base", pos=pose[:3, 3].tolist(), quat=quat.tolist())
+    touching = {names.PSM1: (FIRM | ARMS, GRIP | THREAD), names.PSM2: (FIRM, GRIP | THREAD | ARMS)}[name]
+    bits = {"contype": touching[0], "conaffinity": touching[1]}
+    arm.add_arm(spec, name, base, kinematics.INSTRUMENTS[config.instrument], bits)
+    #     add_wrist_camera(spec, name)
+
+
+def _set_options(spec: mujoco.MjSpec) -> None:
+    """Set the solver, the visual ranges and the size of the user data."""
+    option = spec.option
+    option.timestep = TIMESTEP
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    option.impratio, option.iterations, option.tolerance = 100.0, 50, 1e-10
+    spec.nuserdata = USER_DATA
+    spec.stat.extent, spec.stat.center = 0.1, [0.0, 0.044, 0.08]
+    spec.visual.map.znear, spec.visual.map.zfar = 0.02, 20.0
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    spec.compiler.degree = False
+    spec.compiler.autolimits = True
+
+
+def _arm_ids(model: mujoco.MjModel, name: str) -> ArmIds:
+    first = model.joint(f"{name}_{kinematics.DVRK_JOINTS[0]}").qposadr[0]
+    servo = model.actuator(f"{name}_{kinematics.DVRK_JOINTS[0]}").id
+    return ArmIds(
+        qpos=slice(first, first + 6),
+        finger_qpos=int(model.joint(f"{name}_left_finger").qposadr[0]),
+        actuators=slice(servo, servo + 6),
+        jaw_actuator=model.actuator(f"{name}_jaw").id,
+        tip_site=model.site(f"{name}_tip").id,
+        grasp_site=model.site(f"{name}_grasp").id,
+        tip_body=model.body(f"{name}_tip").id,
+        pads=(model.geom(f"{name}_left_pad").id, model.geom(f"{name}_right_pad").id),
+    )
+

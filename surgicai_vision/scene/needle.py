@@ -1,0 +1,88 @@
+"""Needle: a rigid arc of capsules, one free body whose origin is the centre of the arc.
+
+Needle frame (facts of SurgicAI's released code): the point at angle θ [rad] is p(θ) = (-R cos θ, R sin θ, 0);
+0 is the base, where the thread is tied, `TIP_ANGLE` the tip; +z is the normal of the needle's plane.
+
+Sources: radius 10.18 mm and the 0°–120° arc from SurgicAI's scene; the diameter of 0.9 mm is between that of
+the new surgical robotics challenge (0.98 × 0.86 mm) and SurgicAI's (0.725 mm), and both taper towards the tip.
+Contact numbers were measured by `benchmarks/grip.py`.
+"""
+
+import math
+
+import mujoco
+import numpy as np
+
+RADIUS = 0.01018
+"""Radius of the arc [m]."""
+TIP_ANGLE = math.radians(120.0)
+BODY_RADIUS = 0.00045
+"""Half of the needle's thickness [m]."""
+TIP_RADIUS = 0.000155
+"""Half of the thickness at the tip [m]."""
+SEGMENTS = 16
+MASS = 0.0002
+"""[kg]; a steel needle of this size."""
+HOME = np.array([-0.02079, 0.05620, 0.07171])
+"""Needle frame at the centre of the start distribution, lying flat [m, world]."""
+
+CONTACT = {
+    "condim": 4,
+    "friction": [1.0, 0.002, 0.0001],
+    "solref": [0.004, 1.0],
+    "solimp": [0.99, 0.999, 0.0001, 0.5, 2.0],
+}
+"""Stiff contact with torsional friction: what lets two flat jaws hold a round needle."""
+
+
+def point(angle: float) -> np.ndarray:
+    """Return the arc's point at `angle` [rad] in the needle frame, shape (3,) [m]."""
+    return np.array([-RADIUS * math.cos(angle), RADIUS * math.sin(angle), 0.0])
+
+
+def tangent(angle: float) -> np.ndarray:
+    """Return the unit tangent towards the tip at `angle` [rad] in the needle frame, shape (3,)."""
+    return np.array([math.sin(angle), math.cos(angle), 0.0])
+
+
+def radial(angle: float) -> np.ndarray:
+    """Return the unit vector from the centre to the arc at `angle` [rad] in the needle frame, shape (3,)."""
+    return np.array([-math.cos(angle), math.sin(angle), 0.0])
+
+
+def polyline(points: int = 61) -> np.ndarray:
+    """Return points along the needle from base to tip in its frame, shape (points, 3) [m]."""
+    angles = np.linspace(0.0, TIP_ANGLE, points)
+    return np.stack([-RADIUS * np.cos(angles), RADIUS * np.sin(angles), np.zeros_like(angles)], axis=1)
+
+
+def thickness(angle: float) -> float:
+    """Return half of the needle's thickness at `angle` [rad]: it tapers over the last quarter [m]."""
+    share = max(0.0, (angle / TIP_ANGLE - 0.75) / 0.25)
+    return BODY_RADIUS + share * (TIP_RADIUS - BODY_RADIUS)
+
+
+def add_needle(spec: mujoco.MjSpec, collision: dict[str, int]) -> mujoco.MjsBody:
+    """Add the needle's free body to `spec` at `HOME` and return it.
+
+    Args:
+        spec: the scene.
+        collision: `contype` and `conaffinity` of the needle.
+    """
+    body = spec.worldbody.add_body(name="needle", pos=HOME.tolist())
+    body.add_freejoint(name="needle")
+    edges = np.linspace(0.0, TIP_ANGLE, SEGMENTS + 1)
+    for index, (start, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        body.add_geom(
+            name=f"needle_{index}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=[*point(start), *point(end)],
+            size=[thickness((start + end) / 2), 0, 0],
+            mass=MASS / SEGMENTS,
+            material="needle",
+            **CONTACT,
+            **collision,
+        )
+    body.add_site(name="needle_base", pos=point(0.0).tolist(), size=[0.0003] * 3, group=4)
+    body.add_site(name="needle_tip", pos=point(TIP_ANGLE).tolist(), size=[0.0003] * 3, group=4)
+    return body

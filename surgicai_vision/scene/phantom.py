@@ -1,0 +1,120 @@
+"""Phantom: a tissue pad with a ridge along y; the four hole pairs open on the ridge's two flanks.
+
+Only the walls are solid: each flank is a plate of `WALL` thickness with square openings, so the needle runs
+free inside the ridge, as in SurgicAI's phantom, whose holes hang on springs. The openings are wide for the same
+reason as there: the needle's arc meets them 21° off their axis.
+
+Tissue yields to steel: the jaws may dent the pad by `DENT` before they meet its firm layer, while the needle,
+a hundred times lighter, lies on its surface. Without it no jaw whose pads reach past the grasp point could
+take a needle that lies flat.
+"""
+
+import math
+
+import mujoco
+import numpy as np
+
+from surgicai_vision.scene.holes import OPENING, PAIRS, SURFACE, Hole, HolePair
+
+SIZE = (0.0797, 0.173, 0.0393)
+"""Extent of the phantom [m] (SurgicAI)."""
+ORIGIN = (0.0, 0.01476)
+"""Centre of the phantom in x and y [m, world] (SurgicAI)."""
+WALL = 0.0010
+"""Thickness of the flanks [m]."""
+DENT = 0.0025
+"""How far the jaws may dent the tissue [m]."""
+CREST = 0.0012
+"""Radius of the ridge's rounded top [m]."""
+
+CONTACT = {"condim": 3, "friction": [0.4, 0.002, 0.0001], "solref": [0.004, 1.0]}
+
+
+def add_phantom(spec: mujoco.MjSpec, layout: str, needle: dict[str, int], arm: dict[str, int]) -> None:
+    """Add the phantom to `spec` as one fixed body.
+
+    Args:
+        spec: the scene.
+        layout: a key of `holes.PAIRS`.
+        needle: collision bits of what the needle and thread touch.
+        arm: collision bits of what the instruments touch.
+    """
+    body = spec.worldbody.add_body(name="phantom")
+    both = {key: needle[key] | arm[key] for key in needle}
+    half = [side / 2 for side in SIZE]
+    for name, top, bits, group in (("pad", SURFACE, needle, 0), ("firm", SURFACE - DENT, arm, 4)):
+        body.add_geom(
+            name=f"phantom_{name}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[*ORIGIN, top - half[2]],
+            size=half,
+            material="tissue",
+            group=group,
+            **CONTACT,
+            **bits,
+        )
+    pairs = PAIRS[layout]
+    edges = _edges(pairs)
+    for index, (pair, start, end) in enumerate(zip(pairs, edges[:-1], edges[1:], strict=True), start=1):
+        for side, hole in (("entry", pair.entry), ("exit", pair.exit)):
+            _add_flank(body, f"phantom_{side}{index}", hole, start, end, _rise(pair, hole), both)
+        _add_crest(body, f"phantom_crest{index}", pair, start, end, both)
+
+
+def _edges(pairs: tuple[HolePair, ...]) -> list[float]:
+    """Return the five y [m] that part the ridge into one piece a hole pair, falling."""
+    rows = [pair.entry.centre[1] for pair in pairs]
+    between = [(first + second) / 2 for first, second in zip(rows[:-1], rows[1:], strict=True)]
+    return [rows[0] + 0.012, *between, rows[-1] - 0.012]
+
+
+def _rise(pair: HolePair, hole: Hole) -> float:
+    """Return the length of the flank from the hole's centre up to the crest [m]."""
+    return (pair.gap / 2 - CREST * math.sin(abs(hole.tilt))) / math.cos(hole.tilt)
+
+
+def _add_flank(
+    body: mujoco.MjsBody, name: str, hole: Hole, start: float, end: float, rise: float, bits: dict[str, int]
+) -> None:
+    """Add the four boxes that frame one opening, from the crest down to the pad."""
+    opening = OPENING / 2
+    drop = (hole.centre[2] - SURFACE) / math.sin(abs(hole.tilt)) + WALL
+    up = -math.copysign(1.0, hole.tilt)
+    near, far = end - hole.centre[1], start - hole.centre[1]
+    rectangles = {
+        "top": (opening, rise, near, far),
+        "bottom": (-drop, -opening, near, far),
+        "left": (-opening, opening, near, -opening),
+        "right": (-opening, opening, opening, far),
+    }
+    for part, (low, high, first, last) in rectangles.items():
+        local = np.array([up * (low + high) / 2, (first + last) / 2, -WALL / 2])
+        body.add_geom(
+            name=f"{name}_{part}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=(np.asarray(hole.centre) + hole.rotation @ local).tolist(),
+            quat=[math.cos(hole.tilt / 2), 0.0, math.sin(hole.tilt / 2), 0.0],
+            size=[(high - low) / 2, (last - first) / 2, WALL / 2],
+            material="tissue",
+            **CONTACT,
+            **bits,
+        )
+
+
+def _add_crest(
+    body: mujoco.MjsBody, name: str, pair: HolePair, start: float, end: float, bits: dict[str, int]
+) -> None:
+    """Add the ridge's rounded top, touching the upper ends of both flanks from inside."""
+    tilt = abs(pair.entry.tilt)
+    rise = _rise(pair, pair.entry)
+    x = (pair.entry.centre[0] + pair.exit.centre[0]) / 2
+    z = pair.entry.centre[2] + rise * math.sin(tilt) - CREST * math.cos(tilt)
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=[x, end, z, x, start, z],
+        size=[CREST, 0, 0],
+        material="tissue",
+        **CONTACT,
+        **bits,
+    )
