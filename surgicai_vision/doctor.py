@@ -149,7 +149,8 @@ def check_gl(finding: Finding) -> Check:
     """Report the GL renderer and its speed."""
     backend = os.environ.get("MUJOCO_GL") or "egl"
     if "error" in finding:
-        return Check("GL", "fail", f"{backend}: nothing renders ({finding['error']})", GL_LINE)
+        advice = "GL works and our scene does not: report it" if "renderer" in finding else GL_LINE
+        return Check("GL", "fail", f"{backend}: nothing renders ({finding['error']})", advice)
     speed = f"{finding['frames_per_second']:.0f} frames/s of the grasp scene at {FRAME_SIZE} × {FRAME_SIZE}"
     return Check("GL", "ok", f"{backend}, {finding['renderer']}: {speed}")
 
@@ -210,24 +211,31 @@ def finish_probe(process: subprocess.Popen[str]) -> Finding:
 
 
 def probe_gl() -> Finding:
-    """Render the grasp scene and time it."""
+    """Open a GL context, then render the grasp scene in it and time that."""
+    from surgicai_vision.scene.rendering import renderer_string
+
+    finding: Finding = {"renderer": renderer_string()}
+    try:
+        finding["frames_per_second"] = rendering_speed()
+    except Exception as error:  # reported as a line of its own; the context above was made
+        finding["error"] = f"{type(error).__name__}: {error}"
+    return finding
+
+
+def rendering_speed() -> float:
+    """Return how many frames/s of the grasp scene's front view this machine renders."""
     from surgicai_vision import envs
     from surgicai_vision.config import TaskConfig
-    from surgicai_vision.scene.rendering import FrameRenderer, renderer_string
+    from surgicai_vision.scene.rendering import FrameRenderer
 
     env = envs.make(TaskConfig())
     env.reset(seed=0)
-    renderer = FrameRenderer(env.model, FRAME_SIZE, FRAME_SIZE)
-    try:
+    with FrameRenderer(env.model, FRAME_SIZE, FRAME_SIZE) as renderer:
         renderer.render(env.data, "front")
         begin = time.perf_counter()
         for _ in range(FRAMES):
             renderer.render(env.data, "front")
-        speed = FRAMES / (time.perf_counter() - begin)
-        return {"renderer": renderer_string(), "frames_per_second": speed}
-    finally:
-        renderer.close()
-        env.close()
+        return FRAMES / (time.perf_counter() - begin)
 
 
 def probe_gpu() -> Finding:

@@ -127,6 +127,11 @@ def test_doctor_names_gl_renderer_and_speed() -> None:
     assert finding["renderer"] in check.detail
 
 
+def test_doctor_tells_a_missing_gl_from_a_broken_scene() -> None:
+    assert "apt-get" in doctor.check_gl({"error": "no EGL"}).advice
+    assert "report" in doctor.check_gl({"renderer": "llvmpipe", "error": "no camera"}).advice
+
+
 def test_doctor_knows_which_encoders_work_offline() -> None:
     checks = {
         check.name: check for check in doctor.check_encoders(doctor.finish_probe(doctor.start_probe("encoders")))
