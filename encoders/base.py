@@ -1,0 +1,255 @@
+"""What every encoder is: a frozen network behind one call.
+
+Interface:
+
+* `EncoderCard`, `Plugin` (from encoders.card): what a member file offers. `plugin.build(card, path)` returns
+  the final card (a variant of the weights may change it) and a `torch.nn.Module` of (B, 3, S, S)
+  normalised pictures → (B, dim).
+* `Encoder(card, network, pool)`: the final class. `encoder(frames (B, H, W, 3) uint8 RGB) -> (B, dim)
+  float32`, frozen for good: eval mode, no gradient, and nothing can put it back into training.
+* `state_sha256(module)`: one hash over all parameters and buffers.
+* `read_tensors(path)`: safetensors, or a torch file read with `weights_only=True`.
+* `load_exactly(network, tensors, where)`: load; names and shapes must fit to the last.
+
+The same picture gives the same feature, whatever batch it is in. Two things see to that. Features are
+rounded to the values float16 can hold, so a live feature equals its row in the feature cache. And a batch
+is cut into pieces of `CPU_BATCH` pictures on a CPU, where oneDNN's bf16 convolutions were measured to give
+the same bits for batches of 1, 2, 3, 5, 8, 16 and 20, at any position and with one or two threads (fp32:
+the same bits for any batch, 3e-7 between thread counts); on CUDA, where the algorithm may follow the
+batch's size, every piece is padded to `CUDA_BATCH`.
+"""
+
+import hashlib
+import pickle
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import nn
+
+from encoders.card import EncoderCard, Plugin
+from surgicai_vision.config import digest
+from surgicai_vision.errors import BadFile, InputError, SurgicaiError, check_name
+
+__all__ = [
+    "POOLS",
+    "Encoder",
+    "EncoderCard",
+    "Plugin",
+    "freeze",
+    "load_exactly",
+    "read_tensors",
+    "read_torch",
+    "state_sha256",
+]
+
+POOLS = ("global", "spatial", "tokens")
+CPU_BATCH = 16  # larger batches leave the cache: ResNet-50 in bf16 42 pictures/s at 16, 31 at 64
+CUDA_BATCH = 64
+FINGERPRINT_VERSION = 1  # raise when the same weights and card begin to give other features
+
+
+def state_sha256(module: nn.Module) -> str:
+    """sha256 (hex) over names, types, shapes and bytes of all parameters and buffers."""
+    total = hashlib.sha256()
+    for name, tensor in sorted(module.state_dict().items()):
+        total.update(f"{name} {tensor.dtype} {tuple(tensor.shape)};".encode())
+        total.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return total.hexdigest()
+
+
+def freeze(module: nn.Module) -> nn.Module:
+    """Put `module` into eval mode for good: no gradients, and `train()` does nothing any more."""
+    module.eval().requires_grad_(False)
+    for part in module.modules():
+        part.train = partial(_stay, part)  # type: ignore[method-assign]
+    return module
+
+
+def _stay(part: nn.Module, mode: bool = True) -> nn.Module:
+    """Stand in for `train` on a frozen module: nothing changes."""
+    return part
+
+
+def best_device() -> torch.device:
+    """Return the CUDA device when there is one, else the CPU."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def best_dtype(device: torch.device) -> torch.dtype:
+    """Return bfloat16 where the device multiplies it natively, else float32."""
+    if device.type == "cuda":
+        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
+    probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
+    native = any(getattr(torch.cpu, probe, lambda: False)() for probe in probes)
+    return torch.bfloat16 if native else torch.float32
+
+
+@final
+class Encoder:
+    """A frozen picture encoder: uint8 RGB frames in, one float32 feature row each out.
+
+    Attributes:
+        card: the encoder's card.
+        pool: "global" (one vector), "spatial" (feature map) or "tokens", flattened.
+        shape: shape of one feature before flattening: (dim,), (C, h, w) or (N, C).
+        dim: length of a feature row.
+        weights_sha256: hash of the network's state as loaded, before any cast.
+        fingerprint: hash of everything a feature depends on.
+    """
+
+    def __init__(
+        self,
+        card: EncoderCard,
+        network: nn.Module,
+        pool: str = "global",
+        device: torch.device | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        self.card = card
+        self.pool = check_name("pool", pool, POOLS)
+        self.weights_sha256 = state_sha256(network)
+        self._device = device or best_device()
+        self._dtype = dtype or best_dtype(self._device)
+        self._network = freeze(network).to(self._device, self._dtype).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        low, high = card.input_range
+        mean, std = torch.tensor(card.mean), torch.tensor(card.std)
+        self._scale = ((high - low) / 255 / std).to(self._device)
+        self._shift = ((low - mean) / std).to(self._device)
+        size = card.input_size
+        self.shape = tuple(self._run(np.zeros((1, size, size, 3), np.uint8)).shape[1:])
+        self.dim = int(np.prod(self.shape))
+        self.fingerprint = digest(self._identity())
+
+    def __call__(self, frames: np.ndarray) -> np.ndarray:
+        """Encode pictures.
+
+        Args:
+            frames: (B, H, W, 3) uint8 RGB; any size, resized to the network's own with antialiasing.
+
+        Returns:
+            (B, dim) float32, every value exactly representable in float16.
+
+        Raises:
+            InputError: frames of another shape or type.
+            SurgicaiError: the network gave a value that is not finite in float16.
+        """
+        frames = np.asarray(frames)
+        if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
+            raise InputError(
+                f"Encoder '{self.card.name}' takes (batch, height, width, 3) uint8 RGB pictures, "
+                f"got {frames.shape} {frames.dtype}."
+            )
+        if not len(frames):
+            return np.zeros((0, self.dim), np.float32)
+        step = CUDA_BATCH if self._device.type == "cuda" else CPU_BATCH
+        pieces = [self._run(frames[at : at + step]) for at in range(0, len(frames), step)]
+        features = torch.cat(pieces).reshape(len(frames), self.dim).half().float().cpu().numpy()
+        if not np.isfinite(features).all():
+            raise SurgicaiError(
+                f"Encoder '{self.card.name}' gave a feature that is not finite in float16; "
+                "its weights or its preprocessing are wrong."
+            )
+        return features
+
+    def preprocess(self, frames: np.ndarray) -> torch.Tensor:
+        """Return uint8 RGB (B, H, W, 3) frames as normalised float32 (B, 3, S, S) pictures."""
+        pictures = torch.from_numpy(np.ascontiguousarray(frames)).to(self._device).permute(0, 3, 1, 2).float()
+        size = (self.card.input_size, self.card.input_size)
+        if pictures.shape[-2:] != size:
+            mode = self.card.interpolation
+            pictures = nn.functional.interpolate(pictures, size, mode=mode, antialias=True).clamp(0, 255)
+        return pictures * self._scale[:, None, None] + self._shift[:, None, None]
+
+    def state_sha256(self) -> str:
+        """Hash the live network: weights and buffers, as they stand in memory now."""
+        return state_sha256(self._network)
+
+    @torch.inference_mode()
+    def _run(self, frames: np.ndarray) -> torch.Tensor:
+        """Encode one piece of at most a batch; (b, *shape) float32 on the device."""
+        count = len(frames)
+        if self._device.type == "cuda":
+            frames = np.concatenate([frames, np.zeros((CUDA_BATCH - count, *frames.shape[1:]), np.uint8)])
+        pictures = self.preprocess(frames).to(self._dtype).contiguous(memory_format=torch.channels_last)
+        return self._pooled(pictures)[:count].float()
+
+    def _pooled(self, pictures: torch.Tensor) -> torch.Tensor:
+        """Return the network's answer as `pool` asks: vector, feature map or tokens."""
+        if self.pool == "global":
+            return self._network(pictures)
+        features = self._network.forward_features(pictures)  # type: ignore[operator]
+        if self.pool == "spatial":
+            if features.ndim != 4:
+                raise InputError(f"Encoder '{self.card.name}' has tokens, no feature map; use pool 'tokens'.")
+            return features
+        return features.flatten(2).transpose(1, 2) if features.ndim == 4 else features
+
+    def _identity(self) -> dict[str, Any]:
+        """Everything a feature depends on, as plain data."""
+        card = asdict(self.card)
+        keys = ("architecture", "input_size", "input_range", "mean", "std", "interpolation", "channel_order")
+        return {
+            "version": FINGERPRINT_VERSION,
+            "weights": self.weights_sha256,
+            "pool": self.pool,
+            "compute": f"{self._device.type} {self._dtype}",
+            **{key: card[key] for key in keys},
+        }
+
+
+DAMAGED = (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, zipfile.BadZipFile)
+"""What `torch.load` raises on a file that is no torch file, cut short, or holds more than tensors."""
+
+
+def read_tensors(path: Path) -> dict[str, torch.Tensor]:
+    """Read a flat table of tensors from a safetensors or a torch file; no code in it can run."""
+    if path.suffix == ".safetensors":
+        try:
+            return load_file(path)
+        except (SafetensorError, OSError) as error:
+            raise BadFile(f"{path} is not a whole safetensors file ({_one_line(error)}).") from None
+    return read_torch(path)
+
+
+def read_torch(path: Path) -> dict[str, torch.Tensor]:
+    """Read a torch file with `weights_only=True`; wrappers like {"model": …} are opened."""
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except DAMAGED as error:
+        raise BadFile(f"{path} is not a whole torch file of weights alone ({_one_line(error)}).") from None
+    for wrapper in ("state_dict", "model", "r3m"):
+        if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
+            content = content[wrapper]
+    if not isinstance(content, Mapping):
+        raise BadFile(f"{path} holds {type(content).__name__}, not a table of weights.")
+    return {str(key): value for key, value in content.items() if isinstance(value, torch.Tensor)}
+
+
+def load_exactly(network: nn.Module, tensors: Mapping[str, torch.Tensor], where: object) -> None:
+    """Load `tensors` into `network`; refuse a missing, an unexpected or a misshapen tensor by name."""
+    wanted = network.state_dict()
+    missing = sorted(wanted.keys() - tensors.keys())
+    # Old checkpoints lack BatchNorm's counter, which nothing reads in eval mode.
+    missing = [name for name in missing if not name.endswith("num_batches_tracked")]
+    unexpected = sorted(tensors.keys() - wanted.keys())
+    shapes = [name for name in wanted.keys() & tensors.keys() if wanted[name].shape != tensors[name].shape]
+    for problem, names in (("lacks", missing), ("holds unexpected", unexpected), ("has the wrong shape of", shapes)):
+        if names:
+            raise BadFile(
+                f"{where} {problem} {len(names)} of {len(wanted)} tensors ('{names[0]}' first): "
+                "not weights of this architecture."
+            )
+    network.load_state_dict(dict(tensors), strict=False)
+
+
+def _one_line(error: Exception) -> str:
+    """First line of an error's text, cut to a readable length."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:120]

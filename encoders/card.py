@@ -1,0 +1,67 @@
+"""An encoder's card, and what a member file offers: plain data, so that listing encoders loads no torch."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import nn
+
+
+@dataclass(frozen=True)
+class EncoderCard:
+    """Where an encoder comes from and what it wants to see.
+
+    Attributes:
+        name: the name users give.
+        architecture: the network, in words of the library that builds it.
+        source: hub repository, package or "seed" the weights come from.
+        revision: revision of that repository, version of that package, or the seed.
+        filename: the weights file's name there; None where no file exists.
+        sha256: the file's hash where it is known beforehand.
+        licence: SPDX name of the weights' licence.
+        offline: True when no download is ever needed.
+        input_size: side of the square picture the network takes [px].
+        input_range: what 0 and 255 become before mean and std are applied.
+        mean: per-channel mean (R, G, B), in units of `input_range`.
+        std: per-channel standard deviation, in units of `input_range`.
+        interpolation: "bilinear" or "bicubic", always antialiased, for pictures of another size.
+        dim: length of the global feature.
+        paper: where the encoder was published.
+        note: what a user must know before comparing it with others.
+    """
+
+    name: str
+    architecture: str
+    source: str
+    revision: str
+    filename: str | None
+    sha256: str | None
+    licence: str
+    offline: bool
+    input_size: int
+    input_range: tuple[float, float]
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+    interpolation: str
+    dim: int
+    paper: str
+    note: str = ""
+    channel_order: str = "RGB"
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A member of the family: its card and the function that builds its network.
+
+    Attributes:
+        card: the card as published.
+        build: (card, weights file or None) → (final card, network).
+        known: further published files the loader knows, filename → sha256.
+    """
+
+    card: EncoderCard
+    build: "Callable[[EncoderCard, Path | None], tuple[EncoderCard, nn.Module]]"
+    known: Mapping[str, str] = MappingProxyType({})

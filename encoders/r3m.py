@@ -1,0 +1,69 @@
+"""`r3m`: ResNets trained on Ego4D by time contrast and language (Nair et al., CoRL 2022).
+
+R3M takes pictures in 0–255, divides by 255 and normalises with ImageNet's statistics itself; the card
+writes that as a mean and a standard deviation in units of 0–255. The released SurgicAI code normalised a
+second time before it (facts of the paper's code, deviation 2).
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from encoders.card import EncoderCard, Plugin
+from surgicai_vision.errors import BadFile
+
+if TYPE_CHECKING:
+    from torch import nn
+
+PREFIX = "convnet."
+
+CARD = EncoderCard(
+    name="r3m",
+    architecture="timm resnet50",
+    source="surajnair/r3m-50",
+    revision="31f0eac",
+    filename="pytorch_model.bin",
+    sha256="eb7cfd6b5309310738e47da21091faa38c361f6581ce62cd5247eb5b1a14da8a",
+    licence="MIT",
+    offline=False,
+    input_size=224,
+    input_range=(0.0, 255.0),
+    mean=(0.485 * 255, 0.456 * 255, 0.406 * 255),
+    std=(0.229 * 255, 0.224 * 255, 0.225 * 255),
+    interpolation="bilinear",
+    dim=2048,
+    paper="Nair et al., R3M, CoRL 2022",
+)
+
+
+def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
+    """Build the network from an R3M file; its language and reward heads are left out."""
+    import timm
+
+    from encoders.base import load_exactly, read_tensors
+
+    if path is None:
+        raise BadFile(f"Encoder '{card.name}' needs a weights file.")
+    named = {key.removeprefix("module."): value for key, value in read_tensors(path).items()}
+    tensors = {key.removeprefix(PREFIX): value for key, value in named.items() if key.startswith(PREFIX)}
+    network = timm.create_model(card.architecture.removeprefix("timm "), num_classes=0)
+    load_exactly(network, {k: v for k, v in tensors.items() if not k.startswith("fc.")}, path)
+    return card, network
+
+
+def _smaller(depth: int) -> EncoderCard:
+    """Card of R3M with a ResNet of `depth` layers."""
+    return replace(
+        CARD,
+        name=f"r3m-{depth}",
+        architecture=f"timm resnet{depth}",
+        source=f"surajnair/r3m-{depth}",
+        revision="main",
+        sha256=None,
+        dim=512,
+    )
+
+
+R3M = Plugin(CARD, build)
+R3M_34 = Plugin(_smaller(34), build)
+R3M_18 = Plugin(_smaller(18), build)

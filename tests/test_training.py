@@ -1,0 +1,256 @@
+"""Training: from the cache to a checkpoint that is read back or refused."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from policies.bc import BC, BCRecipe
+from surgicai_vision import names
+from surgicai_vision.checkpoint import CARD, WEIGHTS, check_encoder, check_task, read_checkpoint
+from surgicai_vision.config import TaskConfig
+from surgicai_vision.errors import BadFile, InputError, OutputExists, UnknownName
+from surgicai_vision.features import Features
+from surgicai_vision.registry import load_policy, load_recipe, recipe_names
+from surgicai_vision.training import split, train
+
+DIM = 12
+
+
+@dataclass
+class FakeDataset:
+    """A dataset in memory: the action is a smooth function of the state, plus one of the features."""
+
+    episodes: int = 5
+    steps: int = 40
+    config: TaskConfig = field(default_factory=TaskConfig)
+    image_size: int = 224
+    fingerprint: str = "fake"
+
+    def __post_init__(self) -> None:
+        generator = np.random.default_rng(0)
+        self.length = self.episodes * self.steps
+        self.episode_index = np.repeat(np.arange(self.episodes), self.steps)
+        self.rows = generator.normal(size=(self.length, DIM)).astype(np.float16)
+        state = (generator.normal(size=(self.length, 7)) * 0.01).astype(np.float32)
+        action = np.tanh(state * 100 + self.rows[:, :1]).astype(np.float32)
+        self._columns = {names.STATE: state, names.ACTION: action}
+
+    def columns(self) -> dict[str, np.ndarray]:
+        return dict(self._columns)
+
+
+def features_of(fake: FakeDataset, view: str = "back", **changes: object) -> Features:
+    card = dict.fromkeys(("input_size", "input_range", "mean", "std", "interpolation", "channel_order"), 0)
+    manifest = {
+        "dataset": fake.fingerprint,
+        "view": view,
+        "encoder": "fake",
+        "card": card,
+        "pool": "global",
+        "encoder_fingerprint": "f",
+        "weights_sha256": "w",
+        "dim": DIM,
+        **changes,
+    }
+    return Features(Path("."), manifest, fake.rows)
+
+
+QUICK = BCRecipe(hidden=(32,), epochs=12, batch_size=32, learning_rate=1e-2)
+
+
+def tensors_of(folder: Path) -> bytes:
+    return (folder / WEIGHTS).read_bytes()
+
+
+def test_paper_recipe_is_the_paper() -> None:
+    assert load_recipe("bc", "paper") == BCRecipe()
+    assert BCRecipe().hidden == (256, 256, 256) and BCRecipe().learning_rate == 1e-3
+    assert BCRecipe().epochs == 30 and BCRecipe().batch_size == 256 and BCRecipe().batch_norm
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_every_recipe_loads(name: str) -> None:
+    assert isinstance(load_recipe("bc", name), BCRecipe)
+
+
+def test_recipes_refuse_unknown_keys_and_values(tmp_path: Path) -> None:
+    with pytest.raises(UnknownName, match="learning_rate"):
+        load_recipe("bc", "paper", {"learnin_rate": 1.0})
+    with pytest.raises(UnknownName, match="paper"):
+        load_recipe("bc", "papre")
+    with pytest.raises(InputError, match="epochs"):
+        load_recipe("bc", "paper", {"epochs": 0})
+    (tmp_path / "bad.yaml").write_text("[")
+    with pytest.raises(BadFile):
+        load_recipe("bc", tmp_path / "bad.yaml")
+
+
+def test_network_is_three_layers_each_preceded_by_batch_norm() -> None:
+    kinds = [type(layer).__name__ for layer in BC.make(BCRecipe(), (2048,)).layers]
+    assert kinds == ["BatchNorm1d", "Linear", "ReLU"] * 3 + ["Linear", "Tanh"]
+
+
+def test_split_is_by_episode() -> None:
+    index = np.repeat(np.arange(20), 7)
+    rows, held, episodes = split(index, BCRecipe(), seed=3)
+    assert len(episodes) == 2 and set(index[held]) == set(episodes)
+    assert not set(index[rows]) & set(index[held])
+    assert sorted([*rows, *held]) == list(range(len(index)))
+    again = split(index, BCRecipe(), seed=3)[2]
+    assert again == episodes and split(index, BCRecipe(), seed=4)[2] != episodes
+
+
+def test_training_learns_and_reads_back(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    checkpoint = train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "a")
+    assert checkpoint.train_losses[-1] < 0.5 * checkpoint.train_losses[0]
+    assert len(checkpoint.validation_losses) == QUICK.epochs == checkpoint.epoch
+    assert read_checkpoint(tmp_path / "a") == checkpoint
+    policy = load_policy(tmp_path / "a")
+    rows, state = dataset.rows[:9].astype(np.float32), dataset.columns()[names.STATE][:9]
+    action = policy.act(rows, state)
+    assert action.shape == (9, 7) and action.dtype == np.float32 and np.abs(action).max() <= 1
+    assert np.array_equal(action, load_policy(tmp_path / "a").act(rows, state))
+    alone = np.concatenate([policy.act(rows[i : i + 1], state[i : i + 1]) for i in range(9)])
+    assert np.array_equal(action, alone), "an action depends on the batch it was asked in"
+
+
+def test_statistics_are_those_of_the_training_frames(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "a")
+    policy = load_policy(tmp_path / "a")
+    rows, _, _ = split(dataset.episode_index, QUICK, 0)
+    inputs = np.concatenate([dataset.rows.astype(np.float32), dataset.columns()[names.STATE]], axis=1)[rows]
+    np.testing.assert_allclose(policy.input_mean, inputs.mean(0), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(policy.input_std, inputs.std(0), rtol=1e-4)
+
+
+def test_same_seed_same_weights_other_seed_others(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        torch.manual_seed(hash(name) % 1000)  # the caller's random state must not matter
+        train(dataset, [features_of(dataset)], BC, QUICK, seed=seed, out=tmp_path / name)
+    assert tensors_of(tmp_path / "a") == tensors_of(tmp_path / "b") != tensors_of(tmp_path / "c")
+
+
+def test_training_leaves_the_callers_random_state(tmp_path: Path) -> None:
+    before = torch.get_rng_state()
+    dataset = FakeDataset()
+    train(dataset, [], BC, QUICK, out=tmp_path / "a")
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_broken_off_training_resumes_to_the_same_weights(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+
+    def stop(done: int, total: int) -> None:
+        if done == 7:
+            raise KeyboardInterrupt
+
+    train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "broken", progress=stop)
+    with pytest.raises(BadFile, match="has not ended"):
+        read_checkpoint(tmp_path / "broken")
+    seen: list[int] = []
+    train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "broken", progress=lambda d, t: seen.append(d))
+    assert seen[0] == 5 and seen[-1] == QUICK.epochs
+    assert tensors_of(tmp_path / "whole") == tensors_of(tmp_path / "broken")
+    assert not (tmp_path / "broken" / "training_state.pt").exists()
+
+
+def test_training_again_does_nothing_and_another_request_is_refused(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    first = train(dataset, [], BC, QUICK, out=tmp_path / "a")
+    assert train(dataset, [], BC, QUICK, out=tmp_path / "a", progress=lambda d, t: pytest.fail("trained")) == first
+    with pytest.raises(OutputExists):
+        train(dataset, [], BC, QUICK, seed=1, out=tmp_path / "a")
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.tex").write_text("x")
+    with pytest.raises(OutputExists):
+        train(dataset, [], BC, QUICK, out=tmp_path / "foreign")
+
+
+def test_proprioception_alone_and_several_views(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    state = dataset.columns()[names.STATE][:4]
+    train(dataset, [], BC, QUICK, out=tmp_path / "none")
+    assert load_policy(tmp_path / "none").act(None, state).shape == (4, 7)
+    views = [features_of(dataset, "front"), features_of(dataset, "back")]
+    checkpoint = train(dataset, views, BC, QUICK, out=tmp_path / "two")
+    assert checkpoint.views == ("front", "back") and checkpoint.visual == (DIM, DIM)
+    both = np.tile(dataset.rows[:4].astype(np.float32), 2)
+    assert load_policy(tmp_path / "two").act(both, state).shape == (4, 7)
+
+
+def test_epoch_checkpoints_and_fine_tuning(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    train(dataset, [], BC, QUICK, out=tmp_path / "a", save_every=5)
+    kept = sorted(path.name for path in (tmp_path / "a" / "epochs").iterdir())
+    assert kept == ["epoch_0005", "epoch_0010"]
+    early = load_policy(tmp_path / "a" / "epochs" / "epoch_0005")
+    assert early.checkpoint.epoch == 5
+    tuned = train(dataset, [], BC, QUICK, out=tmp_path / "b", start=load_policy(tmp_path / "a"))
+    assert tuned.train_losses[0] < read_checkpoint(tmp_path / "a").train_losses[0]
+
+
+def test_wrong_inputs_are_refused(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    with pytest.raises(InputError, match="another dataset"):
+        train(dataset, [features_of(dataset, dataset="other")], BC, QUICK, out=tmp_path / "a")
+    mixed = [features_of(dataset), features_of(dataset, "front", encoder_fingerprint="g")]
+    with pytest.raises(InputError, match="several encoders"):
+        train(dataset, mixed, BC, QUICK, out=tmp_path / "a")
+    with pytest.raises(InputError, match="blind"):
+        BC.make(BCRecipe(proprioception=False), ())
+    assert not (tmp_path / "a").exists()
+    dataset.columns()[names.ACTION][3] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        train(dataset, [], BC, QUICK, out=tmp_path / "a")
+
+
+def test_policy_refuses_wrong_observations(tmp_path: Path) -> None:
+    policy = BC.make(QUICK, (DIM,))
+    policy.eval()
+    good, state = np.zeros((2, DIM), np.float32), np.zeros((2, 7), np.float32)
+    for features, pose in ((None, state), (good[:, 1:], state), (good, state[:1]), (good, state[:, 1:])):
+        with pytest.raises(InputError):
+            policy.act(features, pose)
+    with pytest.raises(InputError, match="not finite"):
+        policy.act(good * np.nan, state)
+
+
+def test_tampered_checkpoints_are_refused(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    folder = tmp_path / "a"
+    train(dataset, [], BC, QUICK, out=folder)
+    card, weights = (folder / CARD).read_text(), tensors_of(folder)
+    (folder / WEIGHTS).write_bytes(weights[:-4] + b"abcd")
+    with pytest.raises(BadFile, match="sha256"):
+        load_policy(folder)
+    (folder / WEIGHTS).unlink()
+    with pytest.raises(BadFile, match="Cannot read"):
+        load_policy(folder)
+    (folder / WEIGHTS).write_bytes(weights)
+    for change in ({"seed": 5}, {"format": 99}):
+        (folder / CARD).write_text(json.dumps({**json.loads(card), **change}))
+        with pytest.raises(BadFile):
+            load_policy(folder)
+    (folder / CARD).write_text(card[:50])
+    with pytest.raises(BadFile, match="JSON"):
+        load_policy(folder)
+    with pytest.raises(BadFile, match="not a checkpoint"):
+        load_policy(tmp_path)
+
+
+def test_another_encoder_or_task_is_refused(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    checkpoint = train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "a")
+    with pytest.raises(InputError, match="needs encoder 'fake'"):
+        check_encoder(checkpoint, None)
+    with pytest.raises(InputError, match="not 'place'"):
+        check_task(checkpoint, "place")
