@@ -1,6 +1,6 @@
 """Agents: what acts in an evaluation. The expert, two baselines, and a policy with its frozen encoder."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, final
 
@@ -8,10 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.errors import UnreachablePose
-
-CHUNK = 8
-"""Frames an encoder sees at once. Fixed (the last chunk is padded), because a library may choose another
-algorithm, with other rounding, for another batch size, and a policy's episode must not depend on it."""
 
 
 @final
@@ -109,26 +105,18 @@ class PolicyAgent:
             poses = np.stack([_agent_pos(o, env) for o, env in zip(observations, envs, strict=True)])
             if self.cameras:
                 views = [np.stack([o["pixels"][view] for o in observations]) for view in self.cameras]
-                features = np.concatenate([in_chunks(self._encoder, frames) for frames in views], axis=1)
-                return in_chunks(self._policy.act, features, poses)
-            return in_chunks(lambda chunk: self._policy.act(None, chunk), poses)
+                features = np.concatenate([self._encoder(frames) for frames in views], axis=1)
+                return self._actions(features, poses)
+            return self._actions(None, poses)
+
+    def _actions(self, features: NDArray[np.float32] | None, poses: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(self._policy.act(features, poses), np.float32)
 
 
 def _agent_pos(observation: Any, env: Any) -> NDArray[np.float32]:
     """The measured tip pose and jaw (7,): from the observation, or asked of an env that renders nothing."""
     pose = observation["agent_pos"] if isinstance(observation, dict) else env.agent_pos()
     return np.asarray(pose, np.float32)
-
-
-def in_chunks(function: Callable[..., Any], *arrays: NDArray[Any]) -> NDArray[np.float32]:
-    """Apply `function` to rows in chunks of exactly `CHUNK`, the last one padded by repeating its last row."""
-    count, parts = len(arrays[0]), []
-    for start in range(0, count, CHUNK):
-        chunks = [array[start : start + CHUNK] for array in arrays]
-        missing = CHUNK - len(chunks[0])
-        padded = [np.concatenate([chunk, np.repeat(chunk[-1:], missing, axis=0)]) for chunk in chunks]
-        parts.append(np.asarray(function(*padded), np.float32)[: CHUNK - missing])
-    return np.concatenate(parts)
 
 
 @contextmanager
@@ -142,4 +130,3 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-

@@ -36,7 +36,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"{PROGRAM}: {INTERRUPTED}", file=sys.stderr)
         return 1
     except BrokenPipeError:
-        sys.stdout = open(os.devnull, "w")  # the reader has gone; Python would complain at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains at exit
         return 1
     except OSError as error:
         if error.filename is None:

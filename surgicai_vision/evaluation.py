@@ -2,7 +2,8 @@
 
 Episodes run in lock step in `batch` slots, so that an encoder sees many frames at once; a slot whose
 episode ends takes the next seed. Seeds are shared out over spawned processes. The result depends on
-neither: every episode has its own state and random numbers, and an agent computes in chunks of fixed size.
+neither: every episode has its own state and random numbers, and encoders and policies give a row the same
+answer in any batch.
 
 An episode ends at success, at the task's step limit, or at an error (diverged physics, a start that cannot
 be made, an action that is not finite). An error is a failure, counted in `errors` as well.
@@ -23,7 +24,7 @@ from surgicai_vision.errors import InputError, PhysicsError, SurgicaiError
 from surgicai_vision.statistics import clopper_pearson, mean_and_std
 
 BATCH = 8
-"""Slots of a process; also the chunk in which agents encode."""
+"""Slots of a process: enough for the encoder to gain from batches."""
 
 FILM_FRAMES = 9
 """States kept of each episode, evenly spaced from the first to the last."""

@@ -26,8 +26,14 @@ class Console:
     def stage(self, title: str, unit: str = "") -> Iterator[Progress]:
         """Show a progress bar for one stage; yields the function that moves it."""
         from rich.console import Console as Rich
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-        from rich.progress import TimeRemainingColumn
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
 
         columns = (
             TextColumn("{task.description:<46}"),

@@ -1,9 +1,16 @@
 """Where verbs read and write when nothing else is said: below `outputs/` in the current folder."""
 
+import os
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+from surgicai_vision import files
+from surgicai_vision.errors import BadFile, InputError, check_name
 
 OUTPUTS = Path("outputs")
+CORES = len(os.sched_getaffinity(0))
 
 
 def demos_folder(task: str) -> Path:
@@ -25,3 +32,59 @@ def train_folder(task: str, encoder: str | None, views: Sequence[str], seed: int
 def evaluation_folder(task: str, policy: str, seed: int, episodes: int) -> Path:
     """One evaluation."""
     return OUTPUTS / "evaluations" / f"{task}-{policy}-starts{seed}+{episodes}"
+
+
+def check_folder(out: Path, marker: str) -> None:
+    """Refuse an output folder that cannot be written or holds something else, before any work.
+
+    Args:
+        out: the folder to be made or continued.
+        marker: the file that marks it as ours.
+    """
+    files.check_output(out, may_resume=marker)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=files.TEMPORARY):
+            pass
+    except OSError as error:
+        raise InputError(f"--out {out} cannot be written: {error.strerror}; choose another folder.") from None
+
+
+def demos_task(folder: Path) -> str:
+    """Read which task a folder of demonstrations shows."""
+    from surgicai_vision.demos.store import read_marker
+
+    return str(read_marker(folder)["task"])
+
+
+def open_dataset(folder: str | None, task: str, views: Sequence[str]) -> Any:
+    """Open a dataset, by default the task's; say which command makes it where there is none.
+
+    Raises:
+        BadFile: no dataset there.
+        UnknownName: a view the dataset does not have.
+    """
+    path = Path(folder) if folder else dataset_folder(task)
+    if not path.exists():
+        command = f"surgicai-vision render-demos --task {task} --episodes 50"
+        raise BadFile(f"There is no dataset {path}; make it by `{command}`, or give one with --dataset DIR.")
+    from surgicai_vision.dataset.reading import open_dataset as open_folder
+
+    dataset = open_folder(path)
+    for view in views:
+        check_name("view of this dataset", view, dataset.views)
+    return dataset
+
+
+def check_file(path: Path, name: str, suffixes: Sequence[str]) -> None:
+    """Make the folder of an output file, before any work; refuse an ending that cannot be written."""
+    if path.suffix not in suffixes:
+        raise InputError(f"{name} {path} ends in '{path.suffix}'; allowed: {', '.join(suffixes)}.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    except OSError as error:
+        raise InputError(f"{name} {path} cannot be written: {error.strerror}; choose another place.") from None
+    os.close(descriptor)
+    if not path.stat().st_size:
+        path.unlink()

@@ -80,10 +80,10 @@ def many_of(kind: str, allowed: Iterable[str]) -> Check:
     """Return a check that admits a list without repetition of names among `allowed`."""
     known = tuple(allowed)
 
-    def check(name: str, values: tuple[str, ...]) -> None:
-        for value in values:
+    def check(name: str, values: tuple[str, ...] | None) -> None:
+        for value in values or ():
             check_name(kind, value, known)
-            if values.count(value) > 1:
+            if values and values.count(value) > 1:
                 raise InputError(f"{name} names '{value}' twice; give each {kind} once.")
 
     return check

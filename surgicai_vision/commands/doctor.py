@@ -1,0 +1,32 @@
+"""`doctor`: check this machine and say what to do."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from surgicai_vision.commands.console import Console
+
+EXAMPLE = "surgicai-vision doctor"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `doctor`: none of its own."""
+
+
+def run(options: Options, console: Console) -> dict[str, Any]:
+    """Print one line a check; the exit code is 1 when something must be mended."""
+    from surgicai_vision.doctor import check
+
+    checks = check()
+    width = max(len(line.name) for line in checks)
+    for line in checks:
+        console.say(f"{line.status:<7}  {line.name:<{width}}  {line.detail}")
+        if line.advice:
+            console.say(f"{'':<7}  {'':<{width}}  → {line.advice}")
+    worst = "fail" if any(line.status == "fail" for line in checks) else "ok"
+    return {
+        "status": worst,
+        "checks": [dataclasses.asdict(line) for line in checks],
+        "exit_code": 1 if worst == "fail" else 0,
+    }

@@ -1,0 +1,53 @@
+"""`encode`: compute a dataset's frozen features."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from surgicai_vision import names, registry
+from surgicai_vision.commands import folders
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.options import many_of, one_of, option
+
+EXAMPLE = "surgicai-vision encode --task grasp --encoder imagenet-lite --view front,back"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `encode`."""
+
+    task: str = option("grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
+    dataset: str | None = option(None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>")
+    encoder: str = option(
+        "imagenet-lite",
+        f"one of {', '.join(registry.encoder_names())}",
+        check=one_of("encoder", registry.encoder_names()),
+    )
+    view: tuple[str, ...] = option(
+        ("front", "back"), "views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]"
+    )
+    weights: str | None = option(None, "file with the encoder's pretrained weights", metavar="FILE")
+
+
+def run(options: Options, console: Console) -> dict[str, Any]:
+    """Encode every view and say where the features are."""
+    registry.find_weights(options.encoder, options.weights)
+    dataset = folders.open_dataset(options.dataset, options.task, options.view)
+    from surgicai_vision.features import encode
+
+    encoder = registry.load_encoder(options.encoder, options.weights)
+    entries = []
+    for view in options.view:
+        with console.stage(f"encoding {view} by {options.encoder}", "frames") as progress:
+            features = encode(dataset, view, encoder, progress=progress)
+        state = f"{features.encoded} frames encoded" if features.encoded else "at hand"
+        console.say(f"{options.encoder} {view}: {len(features.rows)} × {features.dim}, {state}: {features.folder}")
+        entries.append(
+            {
+                "view": view,
+                "frames": len(features.rows),
+                "dim": features.dim,
+                "encoded": features.encoded,
+                "folder": str(features.folder),
+            }
+        )
+    return {"encoder": options.encoder, "weights_sha256": encoder.weights_sha256, "features": entries}

@@ -1,0 +1,92 @@
+"""`evaluate`: run a policy from held-out starts and count successes."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision import names
+from surgicai_vision.commands import folders
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.options import Env, config_only, not_negative, one_of, option, positive
+from surgicai_vision.errors import InputError, UnknownName
+
+EXAMPLE = "surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `evaluate`."""
+
+    policy: str = option(dataclasses.MISSING, "a checkpoint folder, or expert, random or zero", metavar="POLICY")
+    task: str | None = option(
+        None,
+        f"the task: {', '.join(names.TASKS)}",
+        check=one_of("task", names.TASKS),
+        default_text="the checkpoint's, else grasp",
+    )
+    episodes: int = option(20, "number of episodes", check=positive, metavar="N")
+    seed: int = option(names.TEST_SEED, "seed of the first start; each episode takes the next", check=not_negative)
+    workers: int | None = option(
+        None, "processes", check=positive, metavar="N", default_text="one a core, at most one for four episodes"
+    )
+    weights: str | None = option(None, "file with the encoder's pretrained weights", metavar="FILE")
+    out: str | None = option(
+        None,
+        "folder for the rows; an earlier evaluation in it is replaced",
+        metavar="DIR",
+        default_text="outputs/evaluations/<task>-<policy>-starts<seed>+<episodes>",
+    )
+    env: Env | None = config_only()
+
+
+def run(options: Options, console: Console) -> dict[str, Any]:
+    """Evaluate, keep the rows and print the summary."""
+    from surgicai_vision import cells
+    from surgicai_vision.results import MARKER
+
+    subject = _subject(options)
+    seeds = range(options.seed, options.seed + options.episodes)
+    default = folders.evaluation_folder(subject.config.task, subject.name, options.seed, options.episodes)
+    out = Path(options.out) if options.out else default
+    folders.check_folder(out, MARKER)
+    title = f"evaluating {subject.name} on {subject.config.task}"
+    with console.stage(title, "steps") as progress:
+        result = cells.evaluate_into(out, subject, seeds, options.workers, progress)
+    console.say(summary_line(result))
+    console.say(f"episodes: {out}")
+    return {**result, "out": str(out)}
+
+
+def _subject(options: Options) -> Any:
+    """Say who acts in which task: a baseline, or a checkpoint in the task it was trained for."""
+    from surgicai_vision import cells
+
+    folder = Path(options.policy)
+    if options.policy in cells.BASELINES:
+        config = (options.env or Env()).task_config(options.task or "grasp")
+        return cells.baseline_subject(options.policy, config)
+    if not folder.exists() and folder.parent == Path():
+        raise UnknownName("policy or checkpoint folder", options.policy, cells.BASELINES)
+    subject = cells.checkpoint_subject(folder, options.weights)
+    trained_for = subject.config.task
+    if options.task not in (None, trained_for):
+        raise InputError(f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out.")
+    if options.env:
+        subject = dataclasses.replace(subject, config=options.env.task_config(trained_for))
+    return subject
+
+
+def summary_line(result: dict[str, Any]) -> str:
+    """Return a result in one line for people."""
+    low, high = result["ci95"]
+    line = (
+        f"{result['policy']} on {result['task']}: {result['successes']}/{result['episodes']} "
+        f"({100 * result['success_rate']:.0f} %, 95 % interval {100 * low:.0f}–{100 * high:.0f} %)"
+    )
+    length, steps = result["trajectory_length_mm"], result["time_steps"]
+    if length["mean"] is not None:
+        line += f", {length['mean']:.1f} mm and {steps['mean']:.0f} steps"
+    if result["errors"]:
+        line += f", {result['errors']} errors"
+    return line

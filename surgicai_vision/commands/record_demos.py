@@ -1,0 +1,39 @@
+"""`record-demos`: record demonstrations by the scripted expert."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision import names
+from surgicai_vision.commands import folders
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.options import Env, config_only, not_negative, one_of, option, positive
+
+EXAMPLE = "surgicai-vision record-demos --task grasp --episodes 50"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `record-demos`."""
+
+    task: str = option("grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
+    episodes: int = option(50, "successful episodes to keep", check=positive, metavar="N")
+    seed: int = option(names.TRAIN_SEED, "seed of the first start; each episode takes the next", check=not_negative)
+    workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
+    out: str | None = option(None, "folder to make or to continue", metavar="DIR", default_text="outputs/demos/<task>")
+    env: Env | None = config_only()
+
+
+def run(options: Options, console: Console) -> dict[str, Any]:
+    """Record and say where the demonstrations are."""
+    from surgicai_vision.demos.record import record
+
+    config = (options.env or Env()).task_config(options.task)
+    out = Path(options.out) if options.out else folders.demos_folder(options.task)
+    folders.check_folder(out, "demos.json")
+    with console.stage(f"recording {options.task}", "episodes") as progress:
+        paths = record(
+            config, episodes=options.episodes, out=out, seed=options.seed, workers=options.workers, progress=progress
+        )
+    console.say(f"{len(paths)} demonstrations of {options.task}: {out}")
+    return {"task": options.task, "episodes": len(paths), "demos": str(out)}

@@ -1,0 +1,65 @@
+"""`scene`: show what every camera sees."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision import names
+from surgicai_vision.commands import folders
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.options import Env, config_only, many_of, not_negative, one_of, option, positive
+from surgicai_vision.errors import InputError
+
+EXAMPLE = "surgicai-vision scene --task grasp --seed 0 --sheet sheet.png"
+QUALITIES = ("fast", "high")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `scene`."""
+
+    task: str = option("grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
+    seed: int = option(names.TRAIN_SEED, "seed of the start", check=not_negative)
+    view: tuple[str, ...] = option(
+        names.CAMERAS, "views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]"
+    )
+    size: int = option(336, "height and width of each picture [px]", check=positive, metavar="PX")
+    quality: str = option("high", "fast (as datasets are rendered) or high", check=one_of("quality", QUALITIES))
+    sheet: str | None = option(None, "where to write it", metavar="FILE.png", default_text="outputs/scene-<task>.png")
+    env: Env | None = config_only()
+
+
+def run(options: Options, console: Console) -> dict[str, Any]:
+    """Roll the expert once and draw the start and the end as every camera sees them."""
+    from surgicai_vision import cells, pictures
+    from surgicai_vision.evaluation import evaluate
+    from surgicai_vision.provenance import provenance
+
+    config = (options.env or Env()).task_config(options.task)
+    path = Path(options.sheet) if options.sheet else folders.OUTPUTS / f"scene-{options.task}.png"
+    if not options.view:
+        raise InputError(f"--view is empty; give some of {', '.join(names.CAMERAS)}.")
+    folders.check_file(path, "--sheet", (".png", ".jpg", ".pdf", ".svg"))
+    with console.stage(f"rolling the expert of {options.task}", "steps") as progress:
+        episode = evaluate(cells.expert, config, [options.seed], workers=1, progress=progress)[0]
+    moments = {"start": episode.film.states[0], f"end, step {episode.row.steps}": episode.film.states[-1]}
+    shown = [(moment, modality) for moment in moments for modality in names.MODALITIES]
+    rows, total = [], len(options.view)
+    with console.stage("rendering", "views") as progress, pictures.stage(config, options.size, options.quality) as see:
+        for done, view in enumerate(options.view):
+            rows.append((view, [see(moments[moment], view, modality) for moment, modality in shown]))
+            progress(done + 1, total)
+    outcome = "success" if episode.row.success else f"failure ({episode.row.failure})"
+    title = f"{options.task}, seed {options.seed}: the expert's episode, {outcome} after {episode.row.steps} steps"
+    figure = pictures.sheet(rows, [f"{moment}: {modality}" for moment, modality in shown], title)
+    figure.savefig(path, dpi=140)
+    console.say(f"sheet: {path}")
+    return {
+        "sheet": str(path),
+        "task": options.task,
+        "seed": options.seed,
+        "views": list(options.view),
+        "success": episode.row.success,
+        "steps": episode.row.steps,
+        "renderer": provenance()["renderer"],
+    }
