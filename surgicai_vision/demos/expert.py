@@ -38,7 +38,7 @@ DRIVE = math.radians(1.8)
 """Rotation of the needle per control step on the circle [rad]."""
 LEAD = math.radians(9.0)
 """Furthest the command may run ahead of the needle [rad]."""
-EXTRA = 0.0022
+EXTRA = 0.0014
 """How far the insertion goes past its goal when the episode lets it [m]: room for PSM1's jaws."""
 HANDOFF_OFFSET = math.radians(4.0)
 """The expert takes the needle a little nearer to the tip than the goal, away from the tissue."""
