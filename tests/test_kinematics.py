@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from surgicai_vision.errors import InputError, UnknownName, UnreachablePose
 from surgicai_vision.scene import kinematics
-from surgicai_vision.scene.kinematics import INSTRUMENTS, DVRK_JOINTS, forward, inverse, limits
+from surgicai_vision.scene.kinematics import DVRK_JOINTS, INSTRUMENTS, forward, inverse, limits
 from surgicai_vision.scene.rotations import geodesic_angle, matrix_to_rpy
 
 instruments = st.sampled_from(sorted(INSTRUMENTS))

@@ -1,7 +1,8 @@
 """Kinematics of the da Vinci patient-side manipulator (PSM): joints ⇄ pose of the tool tip in the arm's base.
 
-`Instrument.dh` is the modified DH table that the surgical robotics challenge publishes. The base origin is the remote centre of motion: the shaft passes through it, so both directions are closed
-forms. Multiplied out, with L = L_tool - L_rcc and s, c for sine and cosine:
+`Instrument.dh` is the modified DH table that the surgical robotics challenge publishes. The base origin is the
+remote centre of motion: the shaft passes through it, so both directions are closed forms. Multiplied out, with
+L = L_tool - L_rcc and s, c for sine and cosine:
 
     shaft  z3 = (s1 c2, -s2, -c1 c2),  x3 = (-s1 s2, -c2, c1 s2),  y3 = (-c1, 0, -s1)
     wrist  w  = (q3 + L) z3                       where the pitch axis meets the shaft

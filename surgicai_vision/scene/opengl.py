@@ -1,0 +1,86 @@
+"""OpenGL without a display: one context for the whole process, made on first use and freed at its end.
+
+Software rendering runs in the calling thread ($LP_NUM_THREADS is put to 0): one process per core is faster than one
+threaded process, and a forked child, which lacks its parent's threads, would wait for them for ever.
+"""
+
+import atexit
+import importlib
+import os
+import platform
+from collections.abc import Callable
+from types import MappingProxyType
+from typing import Any
+
+from surgicai_vision.errors import InputError, check_name
+
+BACKENDS = MappingProxyType(
+    {"egl": "mujoco.egl", "osmesa": "mujoco.osmesa", "glfw": "mujoco.glfw", "cgl": "mujoco.cgl"}
+)
+"""$MUJOCO_GL → the module that has its `GLContext`."""
+
+_context: Any = None
+_closers: list[Callable[[], None]] = []
+
+
+def make_current() -> None:
+    """Direct this thread's OpenGL calls to the process's context; make it if there is none yet.
+
+    Raises:
+        InputError: no OpenGL on this machine; says what to install.
+    """
+    global _context
+    if _context is None:
+        os.environ["LP_NUM_THREADS"] = "0"
+        _context = _new_context()
+        atexit.register(_close)  # after the backend's own handler, hence run before it
+    _context.make_current()
+
+
+def renderer_string() -> str:
+    """Return what draws the pictures, as OpenGL names it: "llvmpipe (LLVM 15.0.6, 256 bits)"."""
+    make_current()
+    from OpenGL import GL  # only now: the backend's module has told PyOpenGL its platform
+
+    return str(GL.glGetString(GL.GL_RENDERER).decode())
+
+
+def before_closing(closer: Callable[[], None]) -> None:
+    """Have `closer` called at the end of the process, while the context is current."""
+    _closers.append(closer)
+
+
+def _new_context() -> Any:
+    """Return a context of the backend that $MUJOCO_GL names; on Linux EGL where it names none."""
+    default = {"Linux": "egl", "Darwin": "cgl"}.get(platform.system(), "glfw")
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip() or default
+    module = BACKENDS[check_name("MUJOCO_GL backend", backend, BACKENDS)]
+    try:
+        return importlib.import_module(module).GLContext(64, 64)
+    except (ImportError, AttributeError, OSError, RuntimeError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(
+            f"No OpenGL through '{backend}' ({reason}). On Debian or Ubuntu: apt-get install libegl1 libgl1; "
+            f"or set MUJOCO_GL to another of: {', '.join(BACKENDS)}."
+        ) from error
+
+
+def _close() -> None:
+    """Free everything while the backend still lives."""
+    global _context
+    if _context is not None:
+        _context.make_current()
+        for closer in _closers:
+            closer()
+        _context.free()
+        _context = None
+
+
+def _forget() -> None:
+    """Leave the parent's context alone in a forked child, which makes its own."""
+    global _context
+    _context = None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)

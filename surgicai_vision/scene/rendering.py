@@ -1,0 +1,260 @@
+"""Rendering: a state becomes pictures, in software, without a display.
+
+One OpenGL context serves the whole process and lives until it ends; every (model, size, quality) has one set of
+GPU objects inside it, shared by its `FrameRenderer`s and freed with the last of them. Several contexts in one
+process corrupt each other's segmentation when an older one is collected late, and cost 50 ms each.
+
+On llvmpipe the time of a frame goes into shadows, multisampling and the triangles of capsules, in this order:
+quality "fast" has none of the first two and few of the third; "high" is for pictures that people look at.
+"""
+
+import contextlib
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.errors import InputError, check_name
+from surgicai_vision.names import DEPTH, MODALITIES, PARTS, RGB, SEGMENTATION
+from surgicai_vision.scene import opengl
+from surgicai_vision.scene.cameras import camera_id
+from surgicai_vision.scene.opengl import renderer_string
+
+__all__ = ["QUALITIES", "FrameRenderer", "parts_of_geoms", "renderer_string"]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What a picture costs: multisampling, shadow map [pixel], triangles round and along a capsule, quads a face."""
+
+    samples: int
+    shadow: int
+    slices: int
+    stacks: int
+    quads: int
+
+
+QUALITIES = MappingProxyType({"fast": Quality(0, 0, 12, 6, 1), "high": Quality(8, 4096, 32, 16, 4)})
+MAX_SIDE = 4096
+"""Largest height and width of a picture [pixel]."""
+
+
+class FrameRenderer:
+    """Pictures of one model at one size. Close it, or use it as a context manager.
+
+    Use a renderer in the thread and the process that made it.
+    """
+
+    def __init__(self, model: mujoco.MjModel, height: int, width: int, quality: str = "fast"):
+        """Prepare pictures of `height` × `width` [pixel] in quality "fast" or "high".
+
+        Raises:
+            UnknownName: another quality.
+            InputError: a size outside 1..4096, or no OpenGL on this machine.
+        """
+        check_name("quality", quality, QUALITIES)
+        for side in (height, width):
+            if not 1 <= side <= MAX_SIDE:
+                raise InputError(f"A picture of {height} × {width} pixels; each side must be 1 to {MAX_SIDE}.")
+        self.model, self.height, self.width, self.quality = model, int(height), int(width), quality
+        self._cameras: dict[str, mujoco.MjvCamera] = {}
+        self._target: _Target | None = _acquire(model, self.height, self.width, quality)
+
+    def render(self, data: mujoco.MjData, camera: str, modality: str = RGB) -> NDArray[Any]:
+        """Return one picture of the state `data`, an array of its own.
+
+        Args:
+            data: a state that has been through `mj_forward`.
+            camera: name of a camera of the model.
+            modality: "rgb" → (H, W, 3) uint8; "depth" → (H, W, 1) float32 [m] along the camera's axis, the far plane
+                where nothing stands; "segmentation" → (H, W, 1) uint8, an index of `names.PARTS`.
+
+        Raises:
+            UnknownName: another camera or modality; the message lists what exists.
+        """
+        return self.render_all(data, camera, (modality,))[modality]
+
+    def render_all(self, data: mujoco.MjData, camera: str, modalities: Iterable[str]) -> dict[str, NDArray[Any]]:
+        """Return several modalities of one view as `render` does; depth and segmentation share one pass."""
+        wanted = tuple(modalities)
+        for modality in wanted:
+            check_name("modality", modality, MODALITIES)
+        target = self._target
+        if target is None:
+            raise InputError("This FrameRenderer is closed; make a new one.")
+        if target.lost:  # a forked child of the process that made it
+            target = self._target = _acquire(self.model, self.height, self.width, self.quality)
+        view = self._cameras.get(camera) or self._view(camera)
+        return target.draw(data, view, wanted)
+
+    def close(self) -> None:
+        """Free what no other renderer uses. A second call does nothing."""
+        target, self._target = getattr(self, "_target", None), None
+        if target is not None:
+            _release(target)
+
+    def __enter__(self) -> "FrameRenderer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        self.close()
+
+    def _view(self, camera: str) -> mujoco.MjvCamera:
+        """Return MuJoCo's handle of a camera and keep it."""
+        view = mujoco.MjvCamera()
+        view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera_id(self.model, camera)
+        self._cameras[camera] = view
+        return view
+
+
+class _Target:
+    """One model's GPU objects at one size and quality."""
+
+    def __init__(self, key: tuple[int, int, int, str], model: mujoco.MjModel):
+        _, height, width, name = key
+        quality = QUALITIES[name]
+        self.key, self.model, self.users, self.lost = key, model, 0, False
+        with _visual_settings(model, quality, height, width):
+            self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        self.context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        self.scene = mujoco.MjvScene(model=model, maxgeom=model.ngeom + 100)
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = quality.shadow > 0
+        self.option = mujoco.MjvOption()
+        self.area = mujoco.MjrRect(0, 0, width, height)
+        self.colours = np.empty((height, width, 3), dtype=np.uint8)
+        self.depths = np.empty((height, width), dtype=np.float32)
+        self.parts = parts_of_geoms(model)
+        self.codes = np.zeros(0, dtype=np.uint8)
+
+    def draw(self, data: mujoco.MjData, view: mujoco.MjvCamera, wanted: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+        """Return the wanted modalities from at most two passes."""
+        opengl.make_current()
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self.model, data, self.option, None, view, everything, self.scene)
+        pictures: dict[str, NDArray[Any]] = {}
+        if RGB in wanted:
+            mujoco.mjr_render(self.area, self.scene, self.context)
+            mujoco.mjr_readPixels(self.colours, None, self.area, self.context)
+            pictures[RGB] = self.colours[::-1].copy()  # OpenGL's first row is the lowest
+        if DEPTH in wanted or SEGMENTATION in wanted:
+            self._draw_ids()
+            if DEPTH in wanted:
+                pictures[DEPTH] = self._depth()
+            if SEGMENTATION in wanted:
+                pictures[SEGMENTATION] = self._segmentation()
+        return pictures
+
+    def _draw_ids(self) -> None:
+        """Draw each geom in the colour of its number; such a pass has the exact depth as well."""
+        flags = self.scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
+        try:
+            mujoco.mjr_render(self.area, self.scene, self.context)
+        finally:
+            flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
+        mujoco.mjr_readPixels(self.colours, self.depths, self.area, self.context)
+
+    def _depth(self) -> NDArray[np.float32]:
+        """Return metres from the depth buffer, which is 1 at the near plane and 0 at the far plane."""
+        extent = self.model.stat.extent
+        near, far = self.model.vis.map.znear * extent, self.model.vis.map.zfar * extent
+        stored = self.depths[::-1, :, None].astype(np.float64)
+        metres: NDArray[np.float64] = near * far / (near + stored * (far - near))
+        return metres.astype(np.float32)
+
+    def _segmentation(self) -> NDArray[np.uint8]:
+        """Return parts from colours: a geom's number in the scene plus 1, in base 256, red first."""
+        if len(self.codes) != self.scene.ngeom + 1:  # the same geoms are visible in every frame of a model
+            self.codes = np.zeros(self.scene.ngeom + 1, dtype=np.uint8)
+            for geom in self.scene.geoms[: self.scene.ngeom]:
+                if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.segid >= 0:
+                    self.codes[geom.segid + 1] = self.parts[geom.objid]
+        code = self.colours[::-1, :, 0:1].astype(np.int32)
+        if len(self.codes) > 256:
+            code = code + self.colours[::-1, :, 1:2] * 256 + self.colours[::-1, :, 2:3] * 65536
+        return self.codes[code]
+
+
+def parts_of_geoms(model: mujoco.MjModel) -> NDArray[np.uint8]:
+    """Return each geom's index in `names.PARTS` (ngeom,), by the name of the first named part among its bodies."""
+    found = np.zeros(model.ngeom, dtype=np.uint8)
+    for geom in range(model.ngeom):
+        body = int(model.geom_bodyid[geom])
+        while body > 0 and not found[geom]:
+            prefix = model.body(body).name.split("_")[0]
+            found[geom] = PARTS.index(prefix) if prefix in PARTS else 0
+            body = int(model.body_parentid[body])
+    return found
+
+
+_targets: dict[tuple[int, int, int, str], _Target] = {}
+
+
+def _acquire(model: mujoco.MjModel, height: int, width: int, quality: str) -> _Target:
+    """Return the target for these arguments; `_release` it once."""
+    key = (id(model), height, width, quality)
+    if key not in _targets:
+        opengl.make_current()
+        _targets[key] = _Target(key, model)
+    _targets[key].users += 1
+    return _targets[key]
+
+
+def _release(target: _Target) -> None:
+    """Free the target with its last user, in the OpenGL context that made it."""
+    target.users -= 1
+    if target.users == 0 and not target.lost:
+        del _targets[target.key]
+        opengl.make_current()
+        target.context.free()
+
+
+def _free_all() -> None:
+    """Free every target while OpenGL still lives."""
+    for target in tuple(_targets.values()):
+        target.users = 1
+        _release(target)
+
+
+def _forget() -> None:
+    """Leave the parent's GPU objects alone in a forked child."""
+    for target in _targets.values():
+        target.lost = True
+    _targets.clear()
+
+
+opengl.before_closing(_free_all)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
+
+
+@contextlib.contextmanager
+def _visual_settings(model: mujoco.MjModel, quality: Quality, height: int, width: int) -> Iterator[None]:
+    """Lend the model the settings that OpenGL objects are made from; they are read only then."""
+    look, screen = model.vis.quality, model.vis.global_
+    settings = (
+        (look, "offsamples", quality.samples),
+        (look, "shadowsize", quality.shadow),
+        (look, "numslices", quality.slices),
+        (look, "numstacks", quality.stacks),
+        (look, "numquads", quality.quads),
+        (screen, "offheight", height),
+        (screen, "offwidth", width),
+    )
+    before = [getattr(group, name) for group, name, _ in settings]
+    try:
+        for group, name, value in settings:
+            setattr(group, name, value)
+        yield
+    finally:
+        for (group, name, _), value in zip(settings, before, strict=True):
+            setattr(group, name, value)
