@@ -20,7 +20,7 @@ from surgicai_vision import names
 from surgicai_vision.config import SceneConfig
 from surgicai_vision.errors import UnknownName
 from surgicai_vision.scene import arm, holes, kinematics, look, needle, phantom, rotations, thread
-# from surgicai_vision.scene.cameras import add_world_cameras, add_wrist_camera
+from surgicai_vision.scene.cameras import add_world_cameras, add_wrist_camera
 
 TIMESTEP = 0.002
 USER_DATA = 96
@@ -124,7 +124,7 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     for name in names.ARMS:
         _add_arm(spec, config, name)
     look.dress(spec)
-    #     add_world_cameras(spec)
+    add_world_cameras(spec)
     return spec
 
 
@@ -136,7 +136,7 @@ def _add_arm(spec: mujoco.MjSpec, config: SceneConfig, name: str) -> None:
     touching = {names.PSM1: (FIRM | ARMS, GRIP | THREAD), names.PSM2: (FIRM, GRIP | THREAD | ARMS)}[name]
     bits = {"contype": touching[0], "conaffinity": touching[1]}
     arm.add_arm(spec, name, base, kinematics.INSTRUMENTS[config.instrument], bits)
-    #     add_wrist_camera(spec, name)
+    add_wrist_camera(spec, name, config.instrument)
 
 
 def _set_options(spec: mujoco.MjSpec) -> None:
