@@ -30,6 +30,8 @@ HOVER, HANDOFF_BACK = 0.010, 0.015
 OPEN_ABOVE, OPEN_HANDOFF = 0.35, 0.25
 """Jaw angles [rad] wide enough for the needle and narrow enough for its neighbours."""
 ALIGNED, ALIGNED_ANGLE = 0.0006, math.radians(4.0)
+CLOSING, CLOSING_ANGLE = 0.002, math.radians(20.0)
+"""Off by less than this the jaws, once closing, go on closing [m, rad]."""
 CLEAR = 0.004
 """Height of the needle's lowest point over the tissue at which it may turn and travel [m]."""
 OUTSIDE = 0.006
@@ -127,12 +129,13 @@ def _take(scene: _Sight, goal: Matrix, back: float, opened: float) -> Wish:
     depth = float(offset @ axis)
     beside = float(np.linalg.norm(offset - depth * axis))
     turned = _angle(scene.tip, goal)
+    lined_up = beside < 2 * ALIGNED and turned < 2 * ALIGNED_ANGLE
+    closing = scene.command_jaw < opened - 2 * scene.step.jaw
+    if closing and beside < CLOSING and abs(depth) < CLOSING and turned < CLOSING_ANGLE:
+        return Wish(goal if not scene.holds else scene.command, 0.0)
     if beside < ALIGNED and abs(depth) < ALIGNED and turned < ALIGNED_ANGLE:
         return Wish(goal, 0.0)
-    if scene.holds and scene.command_jaw < 0.05 and beside < 3 * ALIGNED and abs(depth) < 3 * ALIGNED:
-        return Wish(goal, 0.0)
-    lined_up = beside < 2 * ALIGNED and turned < 2 * ALIGNED_ANGLE
-    if lined_up and scene.command_jaw > opened - 0.1:
+    if lined_up and not closing:
         return Wish(goal, opened)
     retreat = min(depth, -back) if not lined_up and depth > -back else -back
     return Wish(_shifted(goal, retreat * axis), opened)

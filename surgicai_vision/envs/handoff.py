@@ -15,7 +15,7 @@ from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
 from surgicai_vision.names import PSM1, PSM2
 from surgicai_vision.scene.kinematics import Pose
 
-DRIVEN = (0.001, 0.003)
+DRIVEN = (0.0, 0.002)
 """How far the insertion went past its goal [m]: room for PSM1's jaws beside the exit."""
 OFF_PATH, OFF_TURN = 0.0003, math.radians(2.0)
 """Scatter of the inserted needle about the circle [m, rad], inside the openings' clearance."""
