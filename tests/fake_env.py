@@ -53,7 +53,7 @@ class FakeEnv:
             depth = (0.1 + 0.001 * y + 0.01 * self.state[1]).astype(np.float32)[..., None]
             observation["depth"] = dict.fromkeys(self.cameras, depth)
         if self.segmentation:
-            parts = ((x + y) % 6).astype(np.uint8)[..., None]
+            parts = ((x + y + int(self.state[2])) % 6).astype(np.uint8)[..., None]
             observation["segmentation"] = dict.fromkeys(self.cameras, parts)
         return observation
 

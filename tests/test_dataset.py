@@ -1,15 +1,17 @@
 """Datasets: rendered from states, LeRobot's format, nothing lost."""
 
 import json
+import re
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from fake_env import FakeEnv, FakeExpert
 
 from surgicai_vision import names
 from surgicai_vision.config import TaskConfig
-from surgicai_vision.dataset import layout, open_dataset, pictures, render_demos, rendering
+from surgicai_vision.dataset import check_dataset, layout, metadata, open_dataset, pictures, render_demos, rendering
 from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
 from surgicai_vision.demos.record import roll
 from surgicai_vision.demos.store import list_demos, read_demo, write_demo, write_marker
@@ -92,7 +94,7 @@ def test_digest_is_that_of_the_decoded_content(tmp_path, fake, demos):
     dataset = open_dataset(tmp_path / "set")
     keys = [key for key, _, _ in layout.picture_keys(dataset.views, True, True)]
     columns, digests = dataset.columns(), []
-    decoded = {key: list(dataset.iterate(key)) for key in keys}
+    decoded = {key: list(dataset.decoded(key, 0, dataset.length)) for key in keys}
     for number in range(3):
         rows = np.flatnonzero(dataset.episode_index == number)
         digest = layout.EpisodeDigest(keys)
@@ -199,6 +201,48 @@ def test_statistics_equal_lerobots(fake):
     np.testing.assert_allclose(ours["q50"], theirs["q50"], atol=0.1)
 
 
+def test_metadata_equals_lerobots(tmp_path, fake, demos):
+    """What we write without LeRobot is what LeRobot writes: same tables, same types, same numbers."""
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+    render(demos, tmp_path / "set", segmentation=True)
+    table = layout.features(("front", "back"), SIZE, True, True)
+    theirs = LeRobotDatasetMetadata.create(
+        "local/set", names.FPS, table, robot_type=metadata.ROBOT_TYPE, root=tmp_path / "theirs", use_videos=False
+    )
+    text = names.TASK_TEXTS["grasp"]
+    theirs.save_episode_tasks([text])
+    ours = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet")
+    for row in ours.to_pylist():
+        place = {key: row[key] for key in row if key.startswith(("data/", "dataset_"))}
+        statistics = {}
+        for key in row:
+            if key.startswith("stats/"):
+                _, feature, name = key.split("/")
+                statistics.setdefault(feature, {})[name] = np.array(row[key])
+        theirs.save_episode(row["episode_index"], row["length"], row["tasks"], statistics, place)
+    theirs.finalize()
+    written = pq.read_table(tmp_path / "theirs/meta/episodes/chunk-000/file-000.parquet")
+    assert ours.select(written.column_names).equals(written)
+    for name in ("info.json", "stats.json"):
+        one, two = (json.loads((tmp_path / which / "meta" / name).read_text()) for which in ("set", "theirs"))
+        if name == "info.json":
+            assert one == two
+            assert list(one["features"]) == list(two["features"])
+        else:
+            assert one.keys() == two.keys()
+            for key in one:
+                for statistic in one[key]:
+                    np.testing.assert_allclose(one[key][statistic], two[key][statistic], atol=1e-9)
+    one, two = (pq.read_table(tmp_path / which / "meta/tasks.parquet") for which in ("set", "theirs"))
+    assert one.equals(two)
+    schema = get_hf_features_from_features(theirs.features).arrow_schema
+    data = pq.read_schema(tmp_path / "set/data/chunk-000/file-000.parquet")
+    assert data.equals(schema)
+    assert json.loads(data.metadata[b"huggingface"]) == json.loads(schema.metadata[b"huggingface"])
+
+
 @pytest.mark.parametrize("shape", [(20, 30, 3), (17, 17, 1)])
 def test_pictures_are_lossless(shape):
     rng = np.random.default_rng(1)
@@ -236,3 +280,73 @@ def test_one_row_group_an_episode(tmp_path, fake, demos):
     file = pq.ParquetFile(tmp_path / "set/data/chunk-000/file-000.parquet")
     lengths = [len(read_demo(path)) for path in list_demos(demos)]
     assert [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)] == lengths
+
+
+def rewrite(path, change):
+    """Write a data file again with one column changed by `change(table)`."""
+    table = pq.read_table(path)
+    pq.write_table(change(table), path, row_group_size=len(table))
+
+
+def picture(frame):
+    return {"bytes": pictures.encode(frame), "path": "x"}
+
+
+def with_picture(table, key, row, value):
+    column = table.column(key).to_pylist()
+    column[row] = value if isinstance(value, dict) else column[value]
+    field = table.field(key)
+    return table.set_column(table.schema.get_field_index(key), field, pa.array(column, field.type))
+
+
+def with_value(table, key, row, value):
+    column = table.column(key).to_pylist()
+    column[row] = value
+    field = table.field(key)
+    return table.set_column(table.schema.get_field_index(key), field, pa.array(column, field.type))
+
+
+FRONT, DEPTH = names.image_key("front"), names.depth_key("back")
+DAMAGE = {
+    "black": (lambda t: with_picture(t, FRONT, 3, picture(np.zeros((SIZE, SIZE, 3), np.uint8))), "frame 3.*black"),
+    "size": (lambda t: with_picture(t, FRONT, 2, picture(np.eye(20, dtype=np.uint8)[..., None])), "20 × 20"),
+    "repeated": (lambda t: with_picture(t, FRONT, 2, 1), "frame 2.*picture before it again"),
+    "no picture": (lambda t: with_picture(t, FRONT, 1, {"bytes": b"PNG", "path": "x"}), "cannot be decoded"),
+    "depth": (
+        lambda t: with_picture(t, DEPTH, 0, picture(np.full((SIZE, SIZE, 1), np.nan, np.float32))),
+        "frame 0.*not finite and positive",
+    ),
+    "nan": (lambda t: with_value(t, names.STATE, 4, [float("nan")] * 7), "observation.state: 1 frames.*first 4"),
+    "order": (lambda t: with_value(t, "index", 4, 9), "index: not 0, 1, 2"),
+    "frame": (lambda t: with_value(t, "frame_index", 2, 0), "episode 0: frame_index"),
+    "done": (lambda t: with_value(t, names.DONE, 0, True), "episode 0: next.done"),
+    "seed": (lambda t: with_value(t, names.SEED, 0, 77), "different seeds"),
+    "statistics": (lambda t: with_value(t, names.REWARD, 0, -50.0), "min of next.reward is not that"),
+    "content": (lambda t: with_value(t, names.ACTION, 0, [0.1] * 7), "digest: the content has"),
+}
+
+
+def test_a_good_dataset_has_no_problems(tmp_path, fake, demos):
+    summary = render(demos, tmp_path / "set", segmentation=True)
+    report = check_dataset(tmp_path / "set")
+    assert report.problems == ()
+    assert (report.ok, report.frames, report.episodes, report.digest) == (True, summary.frames, 3, summary.digest)
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_check_finds_damage(tmp_path, fake, demos, name):
+    render(demos, tmp_path / "set")
+    change, message = DAMAGE[name]
+    rewrite(tmp_path / "set/data/chunk-000/file-000.parquet", change)
+    report = check_dataset(tmp_path / "set")
+    assert any(re.search(message, problem) for problem in report.problems), report.problems
+    assert not any("\n" in problem for problem in report.problems)
+
+
+def test_check_finds_damaged_metadata(tmp_path, fake, demos):
+    render(demos, tmp_path / "set")
+    info = tmp_path / "set/meta/info.json"
+    info.write_text(info.read_text().replace('"total_episodes": 3', '"total_episodes": 4'))
+    assert "meta/info.json: its counts are not those of the data." in check_dataset(tmp_path / "set").problems
+    (tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").write_bytes(b"")
+    assert any("LeRobot's metadata cannot be read" in line for line in check_dataset(tmp_path / "set").problems)

@@ -112,12 +112,13 @@ class Dataset:
         self._check("segmentation", self.has_segmentation)
         return self._pictures(names.segmentation_key(self._view(view)), start, stop)[..., :1]
 
-    def iterate(self, key: str) -> Iterator[np.ndarray]:
-        """Yield the decoded pictures of a column, all of them in order."""
-        for position in range(len(self._groups)):
-            start = self._groups[position][2]
-            for index, content in enumerate(self._content(key, position)):
-                yield pictures.decode(content, f"{self.path}: {key}, frame {start + index}")
+    def decoded(self, key: str, start: int, stop: int) -> Iterator[np.ndarray]:
+        """Yield the pictures start … stop - 1 of a column as they decode, whatever their size."""
+        for position, (_, _, first, count) in enumerate(self._groups):
+            low, high = max(start, first), min(stop, first + count)
+            content = self._content(key, position) if low < high else []
+            for index in range(low, high):
+                yield pictures.decode(content[index - first], f"{self.path}: {key}, frame {index}")
 
     def _view(self, view: str) -> str:
         return check_name("view of this dataset", view, self.views)
@@ -143,17 +144,13 @@ class Dataset:
         depth = key in [names.depth_key(view) for view in self.views]
         shape = (stop - start, self.image_size, self.image_size, 1 if depth else 3)
         batch = np.empty(shape, np.float32 if depth else np.uint8)
-        for position, (_, _, first, count) in enumerate(self._groups):
-            low, high = max(start, first), min(stop, first + count)
-            if low >= high:
-                continue
-            content = self._content(key, position)
-            for index in range(low, high):
-                where = f"{self.path}: {key}, frame {index}"
-                frame = pictures.decode(content[index - first], where)
-                if frame.shape != shape[1:] or frame.dtype != batch.dtype:
-                    raise BadFile(f"{where}: it is {frame.shape} {frame.dtype}; expected {shape[1:]} {batch.dtype}.")
-                batch[index - start] = frame
+        for index, frame in enumerate(self.decoded(key, start, stop)):
+            if frame.shape != shape[1:] or frame.dtype != batch.dtype:
+                raise BadFile(
+                    f"{self.path}: {key}, frame {start + index}: it is {frame.shape} {frame.dtype}; "
+                    f"expected {shape[1:]} {batch.dtype}."
+                )
+            batch[index] = frame
         return batch
 
     def _content(self, key: str, position: int) -> list[pa.Buffer]:
