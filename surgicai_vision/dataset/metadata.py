@@ -61,7 +61,8 @@ def data_path(file: int) -> str:
 
 def arrow_schema(features: Features) -> pa.Schema:
     """Return the schema of a data file: Arrow types, and the same as Hugging Face's feature types."""
-    fields, hub = [], {}
+    fields: list[pa.Field] = []
+    hub: dict[str, Any] = {}
     for key, feature in all_features(features).items():
         if feature["dtype"] == "image":
             fields.append(pa.field(key, pa.struct({"bytes": pa.binary(), "path": pa.string()})))

@@ -26,7 +26,7 @@ from surgicai_vision import names
 from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.dataset import layout, pictures
 from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
-from surgicai_vision.dataset.writing import EPISODE_FILE, SUMMARY_FILE, assemble
+from surgicai_vision.dataset.writing import EPISODE_FILE, SUMMARY_FILE, assemble, compression
 from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo
 from surgicai_vision.errors import BadFile, InputError, OutputExists, check_name
 from surgicai_vision.executor import Job, Progress, run
@@ -191,7 +191,7 @@ def render_episode(folder: Path, demo: str, views: Sequence[str], size: int, dep
         poses.append(observation["agent_pos"])
         needle.append(env.needle_pose())
     columns = _columns(episode, np.stack(poses), np.stack(needle))
-    _write_episode(folder, content, columns)
+    _write_episode(folder, content, columns, [key for key, _, modality in keys if modality == names.DEPTH])
     write_json(
         folder / SUMMARY_FILE,
         {
@@ -222,7 +222,9 @@ def _columns(demo: Demo, poses: np.ndarray, needle: np.ndarray) -> dict[str, np.
     }
 
 
-def _write_episode(folder: Path, content: Mapping[str, list[bytes]], columns: Mapping[str, np.ndarray]) -> None:
+def _write_episode(
+    folder: Path, content: Mapping[str, list[bytes]], columns: Mapping[str, np.ndarray], depth: Sequence[str]
+) -> None:
     """Write one episode as parquet: pictures as LeRobot's (bytes, path) pairs, columns as lists and scalars."""
     arrays: dict[str, pa.Array] = {}
     for key, pictures_ in content.items():
@@ -235,8 +237,8 @@ def _write_episode(folder: Path, content: Mapping[str, list[bytes]], columns: Ma
             arrays[key] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
         else:
             arrays[key] = pa.array(values)
-    # Uncompressed: it is read once, to be assembled.
-    pq.write_table(pa.table(arrays), folder / EPISODE_FILE, compression="none", use_dictionary=False)
+    table = pa.table(arrays)
+    pq.write_table(table, folder / EPISODE_FILE, compression=compression(table.schema, depth), use_dictionary=False)
 
 
 def _renderer() -> str:
@@ -256,5 +258,5 @@ def _camera(env: Any, view: str, size: int, states: np.ndarray) -> dict[str, Any
         poses.append(extrinsics(env.model, env.data, view))
     return {
         "intrinsics": intrinsics(env.model, view, size, size).tolist(),
-        "T_world_camera": poses[0].tolist() if np.array_equal(*poses) else None,
+        "T_world_camera": poses[0].tolist() if np.array_equal(poses[0], poses[1]) else None,
     }

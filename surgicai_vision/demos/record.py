@@ -69,7 +69,7 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert") -> Rollout:
         states.append(env.get_state())
         rows.append((action, phase, reward, info["is_success"], info["contact"]))
         ended = terminated or truncated
-    action, phase, reward, success, contact = (list(column) for column in zip(*rows, strict=True))
+    actions, phase, reward, success, contact = (list(column) for column in zip(*rows, strict=True))
     demo = Demo(
         config=env.config,
         seed=seed,
@@ -77,7 +77,7 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert") -> Rollout:
         scene_hash=env.scene.hash,
         code_version=code_version(),
         state=np.stack(states).astype(np.float64),
-        action=np.stack(action),
+        action=np.stack(actions),
         phase=np.asarray(phase, dtype=np.int8),
         reward=np.asarray(reward, dtype=np.float32),
         success=np.asarray(success, dtype=bool),
@@ -85,7 +85,7 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert") -> Rollout:
     )
     if info["physics_error"]:
         return Rollout(demo, False, "physics error")
-    return Rollout(demo, bool(success[-1]), "" if success[-1] else f"no success in {len(action)} steps")
+    return Rollout(demo, bool(success[-1]), "" if success[-1] else f"no success in {len(actions)} steps")
 
 
 @functools.lru_cache(maxsize=1)

@@ -95,7 +95,7 @@ class _Dtype:
 
     def numpy(self) -> np.dtype:
         """Return the numpy dtype."""
-        return np.dtype(self.code).newbyteorder(self.order if self.order != "|" else "=")
+        return np.dtype((self.order if self.order != "|" else "=") + self.code.lstrip("<>=|"))
 
 
 class _Reconstruct:
@@ -188,15 +188,15 @@ def _inspect(content: bytes) -> None:
     """List the pickle's instructions without running them; refuse what is not `ADMITTED`."""
     strings: list[str] = []
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
-        name = opcode.name
+        name, text = opcode.name, str(argument)
         if name not in _OPCODES:
             if name in ("INST", "PERSID", "BINPERSID"):
-                _refuse(f"it names '{argument}', and only numpy arrays are admitted")
+                _refuse(f"it names '{text}', and only numpy arrays are admitted")
             _refuse(f"it makes objects that are no numpy arrays (instruction {name})")
         if name in _STRINGS:
-            strings = [*strings[-1:], argument]
+            strings = [*strings[-1:], text]
         elif name == "GLOBAL":
-            module, _, attribute = argument.partition(" ")
+            module, _, attribute = text.partition(" ")
             if (module, attribute) not in ADMITTED:
                 _refuse_global(module, attribute)
         elif name == "STACK_GLOBAL" and len(strings) == 2:
@@ -204,7 +204,7 @@ def _inspect(content: bytes) -> None:
             known = {part for pair in ADMITTED for part in pair}
             if not known.issuperset(strings):
                 _refuse_global(*strings)
-        elif name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument) > count:
+        elif name in ("PUT", "BINPUT", "LONG_BINPUT") and int(text) > count:
             _refuse("its memo has numbers beyond its length")
 
 
