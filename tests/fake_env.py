@@ -62,9 +62,6 @@ class FakeExpert:
     def __init__(self, env):
         self.env = env
 
-    def reset(self):
-        pass
-
     def action(self):
         # A start beyond 0.55 is one this expert never reaches.
         goal, position = self.env.state[:2]

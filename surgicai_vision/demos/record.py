@@ -37,10 +37,7 @@ MAX_FAILURES = 3
 
 
 class Actor(Protocol):
-    """What records: an expert that sees the environment itself."""
-
-    def reset(self) -> None:
-        """Forget the last episode."""
+    """What records: an expert that sees the environment itself; made anew for every episode."""
 
     def action(self) -> np.ndarray:
         """Return the action (7,) float32 for the environment's present state."""
@@ -58,7 +55,6 @@ class Rollout:
 def roll(env: Any, actor: Actor, seed: int, source: str = "expert") -> Rollout:
     """Roll one episode of `env` from `seed` and return it with every state on the way."""
     env.reset(seed=seed)
-    actor.reset()
     states, rows = [env.get_state()], []
     info: dict[str, Any] = {}
     ended = False
