@@ -25,9 +25,7 @@ class ExpertAgent:
         """Make an expert for the slot's episode."""
         from surgicai_vision.demos.expert import Expert
 
-        expert = Expert(env)
-        expert.reset()
-        self._experts[slot] = expert
+        self._experts[slot] = Expert(env)
 
     def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
         """Return the experts' actions (n, 7); not a number where the expert knows no way on."""

@@ -306,11 +306,11 @@ def _in_processes(jobs: list[Any], progress: Progress | None, total: int) -> lis
         try:
             while wait(futures, timeout=0.25).not_done:
                 if progress:
-                    progress(sum(counts), total)
+                    progress(sum(counts[:]), total)
                 for future in futures:
                     if future.done():
                         future.result()
-            return [future.result() for future in futures]
+            results = [future.result() for future in futures]
         except BrokenProcessPool:
             raise SurgicaiError(
                 "A process of the evaluation was killed (out of memory?); run it again with --workers 1."
@@ -319,6 +319,9 @@ def _in_processes(jobs: list[Any], progress: Progress | None, total: int) -> lis
             for process in list(pool._processes.values()):
                 process.terminate()
             raise
+    if progress:
+        progress(total, total)
+    return results
 
 
 _counts: Any = None

@@ -17,6 +17,9 @@ PALETTE = np.array(
 )
 """RGB of each of `names.PARTS` in a coloured segmentation."""
 
+BEYOND = 1.0
+"""Depth [m] from which a pixel is background; the scene is 0.2 m deep."""
+
 
 @contextmanager
 def stage(config: TaskConfig, size: int, quality: str = "high") -> Iterator[Any]:
@@ -52,13 +55,17 @@ def coloured(frame: NDArray[Any], modality: str) -> Picture:
 
     near, far = depth_range(frame)
     scaled = np.clip((frame[..., 0] - near) / max(far - near, 1e-6), 0, 1)
-    bgr = cv2.applyColorMap((255 * (1 - scaled)).astype(np.uint8), cv2.COLORMAP_TURBO)
-    return bgr[..., ::-1]
+    rgb = cv2.applyColorMap((255 * (1 - scaled)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    rgb[frame[..., 0] >= BEYOND] = PALETTE[0]
+    return rgb
 
 
 def depth_range(frame: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the 1st and 99th percentile of a depth frame [m], between which colours are spread."""
-    low, high = np.percentile(frame, (1, 99))
+    """Return the 1st and 99th percentile of the depths before `BEYOND` [m], between which colours are spread."""
+    inside = frame[frame < BEYOND]
+    if not inside.size:
+        return 0.0, BEYOND
+    low, high = np.percentile(inside, (1, 99))
     return float(low), float(high)
 
 

@@ -75,14 +75,21 @@ def write_report(folder: Path, out: Path | None = None, progress: Progress | Non
 
 
 def read_results(folder: Path) -> list[Result]:
-    """Read all evaluations below `folder`; references last, trained policies in the order of their names."""
+    """Read all evaluations below `folder`; trained policies first."""
     results = []
     for place in find_evaluations(folder):
         stored = files.read_json(place / MARKER)
         results.append(Result(place, stored["summary"], stored["about"], read_rows(place)))
     if not results:
         raise BadFile(f"{folder} holds no evaluation; run `surgicai-vision evaluate POLICY --out {folder}` first.")
-    return sorted(results, key=lambda result: (not result.trained, result.summary["policy"]))
+    return sorted(results, key=_order)
+
+
+def _order(result: Result) -> tuple[Any, ...]:
+    """Trained policies first, by encoder, views and training seed; then the references."""
+    views = [names.CAMERAS.index(view) for view in result.about.get("views") or ()]
+    seed = result.about.get("checkpoint", {}).get("seed", 0)
+    return (not result.trained, result.about.get("encoder") or result.summary["policy"], len(views), views, seed)
 
 
 def render_page(page: dict[str, Any]) -> str:
@@ -122,11 +129,9 @@ def _headline(results: list[Result]) -> str:
     """The main finding in one sentence."""
     shown = best_trained(results) or results[0]
     summary = shown.summary
-    who = f"{_policy_text(shown)} on {_views_text(shown)}" if shown.about.get("views") else _policy_text(shown)
-    return (
-        f"{who[0].upper()}{who[1:]}: {summary['successes']} of {summary['episodes']} "
-        f"held-out starts of {summary['task']} solved"
-    )
+    who = _policy_text(shown) + (f" on {_views_text(shown)}" if shown.about.get("views") else "")
+    verb = "solves" if summary["successes"] else "solves none:"
+    return f"{who} {verb} {summary['successes']} of {summary['episodes']} held-out starts of {summary['task']}"
 
 
 def _lead(results: list[Result]) -> str:
@@ -138,8 +143,8 @@ def _lead(results: list[Result]) -> str:
         if result is not shown:
             views = f" on {_views_text(result)}" if result.about.get("views") else ""
             count = f"{result.summary['successes']}/{result.summary['episodes']}"
-            parts.append(f"{_policy_text(result)}{views}: {count}.")
-    return " ".join(parts)
+            parts.append(f"{_policy_text(result)}{views} {count}")
+    return parts[0] + (f" Beside it: {'; '.join(parts[1:])}." if parts[1:] else "")
 
 
 def _row(result: Result, best: Result | None) -> dict[str, Any]:
@@ -295,7 +300,7 @@ def _data(content: bytes, kind: str = "jpeg") -> str:
 
 def _policy_text(result: Result) -> str:
     encoder = result.about.get("encoder")
-    seed = result.about.get("seed")
+    seed = result.about.get("checkpoint", {}).get("seed")
     return f"{encoder or result.summary['policy']}" + (f" (seed {seed})" if seed else "")
 
 

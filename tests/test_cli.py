@@ -252,3 +252,12 @@ def test_quiet_console_shows_nothing(capsys):
     with console.stage("a") as progress:
         progress(1, 2)
     assert capsys.readouterr() == ("", "")
+
+
+def test_scene_draws_the_sheet(capsys, tmp_path):
+    arguments = ["scene", "--view", "front,back", "--size", "64", "--quality", "fast", "--sheet", "a/sheet.png"]
+    assert main([*arguments, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert result["views"] == ["front", "back"]
+    assert result["success"] is True
+    assert (tmp_path / "a" / "sheet.png").read_bytes().startswith(b"\x89PNG")

@@ -31,25 +31,27 @@ class Console:
             MofNCompleteColumn,
             Progress,
             TextColumn,
-            TimeElapsedColumn,
             TimeRemainingColumn,
         )
 
         columns = (
-            TextColumn("{task.description:<46}"),
-            BarColumn(bar_width=24),
+            TextColumn("{task.description:<38}"),
+            BarColumn(bar_width=20),
             MofNCompleteColumn(),
             TextColumn("{task.fields[unit]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(compact=True),
+            TimeRemainingColumn(compact=True, elapsed_when_finished=True),
         )
-        with Progress(*columns, console=Rich(stderr=True), refresh_per_second=4) as bars:
-            bar = bars.add_task(title, total=None, unit=unit)
+        bars = Progress(*columns, console=Rich(stderr=True), refresh_per_second=4)
+        bar = bars.add_task(title, total=None, unit=unit)
 
-            def move(done: int, total: int, unit: str = unit) -> None:
-                bars.update(bar, completed=done, total=total, unit=unit)
+        def move(done: int, total: int, unit: str = unit) -> None:
+            bars.start()  # on the first call only: wrong input found before any work shows no bar
+            bars.update(bar, completed=done, total=total, unit=unit)
 
+        try:
             yield move
+        finally:
+            bars.stop()
 
 
 @final

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision import names
+from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import one_of, option
 from surgicai_vision.errors import InputError
@@ -33,4 +34,18 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
     if options.task is None:
         raise InputError(f"import-demos needs --task: the file does not say it; one of {', '.join(names.SUBTASKS)}.")
-    raise NotImplementedError(import_demos, Path, console)
+    out = Path(options.out) if options.out else folders.demos_folder(f"surgicai-{options.task}")
+    folders.check_folder(out, "demos.json")
+    with console.stage(f"importing {options.task}", "episodes") as progress:
+        summary = import_demos(Path(options.file), task=options.task, out=out, progress=progress)
+    console.say(f"{len(summary.paths)} demonstrations of {options.task}, {summary.steps} steps: {out}")
+    if summary.skipped:
+        console.say(f"{len(summary.skipped)} episodes could not be replayed; {out}/demos.json says why.")
+    return {
+        "task": options.task,
+        "episodes": len(summary.paths),
+        "steps": summary.steps,
+        "step": summary.step,
+        "skipped": len(summary.skipped),
+        "demos": str(out),
+    }

@@ -46,8 +46,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     result = run_sweep(grid, out, console.stage, options.workers)
     for line in result.pop("problems"):
         console.say(line)
-    counts = ", ".join(f"{result[name]} {name.replace('_', ' ')}" for name in ("done", "cached", "failed", "not_run"))
-    console.say(f"{result['cells']} cells: {counts}; {out}")
+    told = ", ".join(f"{result[name]} {name.replace('_', ' ')}" for name in ("done", "cached", "failed", "not_run"))
+    console.say(f"{result['cells']} cells: {told}; {out}")
     return {**result, "exit_code": 1 if result["failed"] else 0}
 
 
