@@ -23,16 +23,21 @@ TIP_RADIUS = 0.000155
 SEGMENTS = 16
 MASS = 0.0002
 """[kg]; a steel needle of this size."""
+DRAG = 1e-6
+"""Drag of the free needle [N·s/m and N·m·s/rad]. It slows a fall by half a percent a second, and it takes the
+energy that the explicit integrator would otherwise feed into a fast spin: without it one random episode in
+seventy diverged."""
 HOME = np.array([-0.02079, 0.05620, 0.07171])
 """Needle frame at the centre of the start distribution, lying flat [m, world]."""
 
 CONTACT = {
     "condim": 4,
-    "friction": [1.0, 0.002, 0.0001],
+    "friction": [1.0, 0.01, 0.0001],
     "solref": [0.004, 1.0],
     "solimp": [0.99, 0.999, 0.0001, 0.5, 2.0],
 }
-"""Stiff contact with torsional friction: what lets two flat jaws hold a round needle."""
+"""Stiff contact with strong torsional friction, for the serrated jaws of a needle driver: what lets two flat pads
+hold a round needle. With the default 0.005 m the grip crept 0.8° in ten seconds, 2° at most; with 0.01 m 0.6°."""
 
 
 def point(angle: float) -> np.ndarray:
@@ -70,7 +75,7 @@ def add_needle(spec: mujoco.MjSpec, collision: dict[str, int]) -> mujoco.MjsBody
         collision: `contype` and `conaffinity` of the needle.
     """
     body = spec.worldbody.add_body(name="needle", pos=HOME.tolist())
-    body.add_freejoint(name="needle")
+    body.add_joint(name="needle", type=mujoco.mjtJoint.mjJNT_FREE, damping=DRAG)
     edges = np.linspace(0.0, TIP_ANGLE, SEGMENTS + 1)
     for index, (start, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
         body.add_geom(
