@@ -25,7 +25,7 @@ from surgicai_vision.scene.rotations import matrix_to_rotvec, rotvec_to_matrix
 
 Matrix = NDArray[np.float64]
 
-HOVER, HANDOFF_BACK = 0.010, 0.015
+HOVER, HANDOFF_BACK = 0.010, 0.009
 """Where the jaws wait before they go in: above the needle, before the handoff grasp [m]."""
 OPEN_ABOVE, OPEN_HANDOFF = 0.35, 0.25
 """Jaw angles [rad] wide enough for the needle and narrow enough for its neighbours."""

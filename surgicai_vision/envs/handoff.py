@@ -20,6 +20,9 @@ DRIVEN = (0.0, 0.002)
 OFF_PATH, OFF_TURN = 0.0003, math.radians(2.0)
 """Scatter of the inserted needle about the circle [m, rad], inside the openings' clearance."""
 
+STRAIGHT = math.radians(4.0)
+"""How far the grip may have turned the needle when it closed [rad]."""
+
 
 def inserted_needle(stitch: Stitch, rng: np.random.Generator) -> np.ndarray:
     """Draw T_world_needle (4, 4) of a needle through both holes."""
@@ -38,7 +41,8 @@ class Handoff(Subtask):
         """Hold the inserted needle with PSM2, PSM1 at home."""
         needle_pose = inserted_needle(stitch, rng)
         simulation.memory.passed = 2.0
-        return hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose))
+        held = hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose), STRAIGHT)
+        return held and not simulation.touches_phantom(needle=False)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the jaws' grasp frame and the grasp frame on the needle."""

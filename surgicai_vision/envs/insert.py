@@ -37,7 +37,7 @@ class Insert(Subtask):
             shift = shift - 2 * (shift @ outward) * outward
         needle_pose = about_point(nominal, tip, draw_rotation(rng, START_TURN), shift)
         held = hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose))
-        return held and not simulation.touches_phantom()
+        return held and not simulation.touches_phantom(needle=True)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at 100° and where it ends."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import HANDOFF_ANGLE, Stitch, needle_frame
-from surgicai_vision.envs.handoff import inserted_needle
+from surgicai_vision.envs.handoff import STRAIGHT, inserted_needle
 from surgicai_vision.envs.place import draw_psm2_grasp
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import draw_grasp_error, grasp_pose, hold_needle
@@ -37,7 +37,9 @@ class Pullout(Subtask):
         away[:3, 3] -= RETREAT * away[:3, 2]
         simulation.pose_arm(PSM2, simulation.to_base(PSM2, poses.flat(away)), RELEASED_JAW)
         error = draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
-        return hold_needle(simulation, PSM1, needle_pose, grasp_pose(PSM1, needle_pose, HANDOFF_ANGLE, error))
+        grasp = grasp_pose(PSM1, needle_pose, HANDOFF_ANGLE, error)
+        held = hold_needle(simulation, PSM1, needle_pose, grasp, STRAIGHT)
+        return held and not simulation.touches_phantom(needle=False)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at 105° and where it ends."""

@@ -199,10 +199,13 @@ class Simulation:
         left, right = self.touching(arm)
         return left and right
 
-    def touches_phantom(self) -> bool:
-        """Say whether anything touches the phantom."""
-        body = self.model.geom_bodyid[self.data.contact.geom]
-        return bool((body == self._phantom_id).any())
+    def touches_phantom(self, *, needle: bool) -> bool:
+        """Say whether an instrument, or with `needle` the needle too, touches the phantom."""
+        bodies = self.model.geom_bodyid[self.data.contact.geom]
+        touching = (bodies == self._phantom_id).any(axis=1)
+        if not needle:
+            touching &= ~(bodies == self._needle_id).any(axis=1)
+        return bool(touching.any())
 
     # -- state ----------------------------------------------------------------------------------------------------
 

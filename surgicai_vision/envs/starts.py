@@ -64,7 +64,9 @@ def grasp_pose(arm: str, needle_pose: Matrix, angle: float, error: GraspError | 
     return grasp @ pivot @ turn @ np.linalg.inv(pivot)
 
 
-def hold_needle(simulation: Simulation, arm: str, needle_pose: Matrix, tip: Matrix) -> bool:
+def hold_needle(
+    simulation: Simulation, arm: str, needle_pose: Matrix, tip: Matrix, turn: float = math.radians(8.0)
+) -> bool:
     """Pose the needle and `arm` around it, close, settle; say whether both pads hold it where it was put.
 
     Args:
@@ -72,6 +74,7 @@ def hold_needle(simulation: Simulation, arm: str, needle_pose: Matrix, tip: Matr
         arm: the holding arm.
         needle_pose: T_world_needle (4, 4).
         tip: T_world_tip (4, 4) of the arm.
+        turn: how far the closing jaws may turn the needle [rad].
     """
     simulation.pose_needle(poses.flat(needle_pose))
     try:
@@ -81,7 +84,7 @@ def hold_needle(simulation: Simulation, arm: str, needle_pose: Matrix, tip: Matr
     simulation.settle(SETTLE)
     now = simulation.needle()
     wanted = poses.flat(needle_pose)
-    near = poses.distance(now, wanted) < 0.002 and poses.angle(now, wanted) < math.radians(8.0)
+    near = poses.distance(now, wanted) < 0.002 and poses.angle(now, wanted) < turn
     return near and simulation.holds(arm)
 
 

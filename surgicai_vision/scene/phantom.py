@@ -26,6 +26,9 @@ DENT = 0.0025
 """How far the jaws may dent the tissue [m]."""
 CREST = 0.0012
 """Radius of the ridge's rounded top [m]."""
+BEYOND = 0.006
+"""How far the ridge goes on beyond the first and the last hole pair [m]: short, because the tools come along the
+wound and their wrists stand there."""
 
 CONTACT = {"condim": 3, "friction": [0.4, 0.002, 0.0001], "solref": [0.004, 1.0]}
 
@@ -54,21 +57,21 @@ def add_phantom(spec: mujoco.MjSpec, layout: str, needle: dict[str, int], arm: d
             **bits,
         )
     pairs = PAIRS[layout]
-    edges = _edges(pairs)
+    edges = piece_edges(pairs)
     for index, (pair, start, end) in enumerate(zip(pairs, edges[:-1], edges[1:], strict=True), start=1):
         for side, hole in (("entry", pair.entry), ("exit", pair.exit)):
-            _add_flank(body, f"phantom_{side}{index}", hole, start, end, _rise(pair, hole), both)
+            _add_flank(body, f"phantom_{side}{index}", hole, start, end, flank_height(pair, hole), both)
         _add_crest(body, f"phantom_crest{index}", pair, start, end, both)
 
 
-def _edges(pairs: tuple[HolePair, ...]) -> list[float]:
+def piece_edges(pairs: tuple[HolePair, ...]) -> list[float]:
     """Return the five y [m] that part the ridge into one piece a hole pair, falling."""
     rows = [pair.entry.centre[1] for pair in pairs]
     between = [(first + second) / 2 for first, second in zip(rows[:-1], rows[1:], strict=True)]
-    return [rows[0] + 0.012, *between, rows[-1] - 0.012]
+    return [rows[0] + BEYOND, *between, rows[-1] - BEYOND]
 
 
-def _rise(pair: HolePair, hole: Hole) -> float:
+def flank_height(pair: HolePair, hole: Hole) -> float:
     """Return the length of the flank from the hole's centre up to the crest [m]."""
     return (pair.gap / 2 - CREST * math.sin(abs(hole.tilt))) / math.cos(hole.tilt)
 
@@ -106,7 +109,7 @@ def _add_crest(
 ) -> None:
     """Add the ridge's rounded top, touching the upper ends of both flanks from inside."""
     tilt = abs(pair.entry.tilt)
-    rise = _rise(pair, pair.entry)
+    rise = flank_height(pair, pair.entry)
     x = (pair.entry.centre[0] + pair.exit.centre[0]) / 2
     z = pair.entry.centre[2] + rise * math.sin(tilt) - CREST * math.cos(tilt)
     body.add_geom(
