@@ -37,7 +37,7 @@ from typing import Any
 
 from surgicai_vision.config import digest
 from surgicai_vision.errors import InputError, SurgicaiError, check_name
-from surgicai_vision.files import TEMPORARY, code_version, whole_folder
+from surgicai_vision.files import TEMPORARY, code_version, sync_folder, whole_folder
 
 Progress = Callable[[int, int, str], None]
 """`progress(done, total, unit)`, called after every finished job and once at the start."""
@@ -70,6 +70,9 @@ WORKER_ENVIRONMENT: Mapping[str, str] = MappingProxyType(
 )
 """One worker, one core: llvmpipe's and the BLAS's own threads would fight over it (measured: two
 single-threaded processes scale linearly)."""
+
+LOCK = ".lock"
+"""File in a store that its run holds locked."""
 
 ATTEMPTS = 2
 """How often a job is started whose worker dies."""
@@ -141,7 +144,7 @@ def run(
         check_name("job", job.name, table)
     report = progress or (lambda done, total, unit: None)
     folders = {job.key(table): job for job in jobs}
-    with _owned(store):
+    with claim(store):
         missing = {key: job for key, job in folders.items() if not (store / key).is_dir()}
         total = sum(job.weight for job in folders.values())
         done = total - sum(job.weight for job in missing.values())
@@ -152,18 +155,65 @@ def run(
     return [store / job.key(table) for job in jobs]
 
 
+_claimed: set[Path] = set()
+"""Stores this process holds; a claim inside a claim is the same one."""
+
+
 @contextmanager
-def _owned(store: Path) -> Iterator[None]:
-    """Hold the store alone and clear what a killed run left in it."""
-    store.mkdir(parents=True, exist_ok=True)
-    with open(store / ".lock", "w") as lock:
+def claim(store: Path) -> Iterator[None]:
+    """Hold a store alone, and clear what a killed run left unfinished in it.
+
+    Raises:
+        InputError: another process holds it.
+    """
+    path = store.resolve()
+    if path in _claimed:
+        yield
+        return
+    path.mkdir(parents=True, exist_ok=True)
+    with open(path / LOCK, "w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise InputError(f"Another run is working in {store}; wait for it or stop it first.") from None
-        for left in store.glob(f"{TEMPORARY}*"):
+        for left in path.glob(f"{TEMPORARY}*"):
             shutil.rmtree(left, ignore_errors=True)
-        yield
+        _claimed.add(path)
+        try:
+            yield
+        finally:
+            _claimed.discard(path)
+
+
+def work_folder(out: Path) -> Path:
+    """Return the store in which `out` is built: beside it, on the same file system."""
+    return out.with_name(f"{out.name}.work")
+
+
+@contextmanager
+def building(out: Path) -> Iterator[tuple[Path, Path]]:
+    """Build the folder `out` so that it appears whole, with the store of its jobs beside it.
+
+    Yields the store, for `run`, and a path in it for the result, to be made with `files.whole_folder`. At the end
+    the result becomes `out` by one rename and the store is removed; after an error or a kill the store stays, and
+    the next run goes on with what it holds.
+
+        with building(out) as (store, result):
+            shards = run(jobs, store)
+            with whole_folder(result) as folder: …
+    """
+    store = work_folder(out)
+    try:
+        with claim(store):
+            result = store / "result"
+            shutil.rmtree(result, ignore_errors=True)
+            yield store, result
+            os.rename(result, out)
+            sync_folder(out.parent)
+            shutil.rmtree(store)
+    finally:
+        if store.exists() and all(path.name == LOCK for path in store.iterdir()):
+            shutil.rmtree(store, ignore_errors=True)
 
 
 def _execute(jobs: Mapping[str, Job], store: Path, workers: int, table: Mapping[str, JobKind]) -> Iterator[str]:

@@ -1,5 +1,6 @@
 """The executor: the store is the truth, whatever becomes of the processes."""
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -10,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from surgicai_vision.errors import InputError, SurgicaiError, UnknownName
-from surgicai_vision.executor import JOBS, Job, JobKind, run
+from surgicai_vision.executor import JOBS, Job, JobKind, building, run
+from surgicai_vision.files import whole_folder
 
 TABLE = {
     name: JobKind(f"fake_jobs:{name}", ("names",))
@@ -129,11 +131,37 @@ def test_interrupted_run_continues(tmp_path, signal_number):
 
 
 def test_a_store_serves_one_run_at_a_time(tmp_path):
-    def again(done, total, unit):
+    with open(tmp_path / ".lock", "w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
         with pytest.raises(InputError, match="Another run is working"):
             run(squares([7]), tmp_path, workers=0, table=TABLE)
+    run(squares([7]), tmp_path, workers=0, table=TABLE)
 
-    run(squares([1]), tmp_path, workers=0, table=TABLE, progress=again)
+
+def test_a_built_folder_appears_whole_or_not_at_all(tmp_path):
+    out = tmp_path / "out"
+
+    def build(fail):
+        with building(out) as (store, result):
+            run(squares([3]), store, workers=0, table=TABLE)
+            with whole_folder(result) as folder:
+                (folder / "a.txt").write_text("a")
+                assert not out.exists()
+                if fail:
+                    raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        build(fail=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.work"]
+    build(fail=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+    assert [path.name for path in out.iterdir()] == ["a.txt"]
+
+
+def test_building_nothing_leaves_nothing(tmp_path):
+    with pytest.raises(InputError, match="nothing"), building(tmp_path / "out"):
+        raise InputError("nothing to build")
+    assert not list(tmp_path.iterdir())
 
 
 def test_registered_jobs_name_modules_of_this_package():

@@ -29,7 +29,7 @@ from surgicai_vision.dataset.statistics import PictureStatistics, column_statist
 from surgicai_vision.dataset.writing import EPISODE_FILE, SUMMARY_FILE, assemble, compression
 from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo
 from surgicai_vision.errors import BadFile, InputError, OutputExists, check_name
-from surgicai_vision.executor import Job, Progress, run
+from surgicai_vision.executor import Job, Progress, building, run, work_folder
 from surgicai_vision.files import check_output, code_version, read_json, sha256_file, write_json
 
 SIZES = (16, 1024)
@@ -93,12 +93,11 @@ def render_demos(
         Job("render-episode", {"demo": str(path.resolve()), **options}, (sha256_file(path),), len(demo), ("demo",))
         for path, demo in zip(paths, episodes, strict=True)
     ]
-    work = out.with_name(f"{out.name}.work")
-    shards = run(jobs, work, workers=workers, progress=progress, unit="frames")
-    meta = _meta(request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], episodes)
-    table = layout.features(views, size, depth, segmentation)
-    assemble(shards, out, table, names.TASK_TEXTS[config.task], meta)
-    shutil.rmtree(work)
+    with building(out) as (store, result):
+        shards = run(jobs, store, workers=workers, progress=progress, unit="frames")
+        meta = _meta(request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], episodes)
+        table = layout.features(views, size, depth, segmentation)
+        assemble(shards, result, table, names.TASK_TEXTS[config.task], meta)
     return DatasetSummary(meta["frames"], meta["episodes"], time.monotonic() - started, meta["digest"])
 
 
@@ -110,6 +109,8 @@ def _finished(out: Path, request: Mapping[str, Any], started: float) -> DatasetS
             f"--out {out} holds a dataset of other demonstrations or options (see {out / names.META_FILE}); "
             "give another folder."
         )
+    # Left by a run that was killed after its last step.
+    shutil.rmtree(work_folder(out), ignore_errors=True)
     return DatasetSummary(meta["frames"], meta["episodes"], time.monotonic() - started, meta["digest"])
 
 

@@ -21,7 +21,7 @@ from surgicai_vision.demos.record import finished
 from surgicai_vision.demos.replay import Episode, Replay, grip_error, trimmed
 from surgicai_vision.demos.store import MARKER, list_demos, read_marker, write_demo, write_marker
 from surgicai_vision.errors import BadFile, InputError, UnreachablePose, check_name
-from surgicai_vision.executor import Progress
+from surgicai_vision.executor import Progress, building
 from surgicai_vision.files import check_output, code_version, sha256_file, whole_folder
 
 OPEN_JAW = 0.4
@@ -79,7 +79,7 @@ def import_demos(file: Path, *, task: str, out: Path, progress: Progress | None 
         step, disagreeing = infer_step(episodes)
         limit = max(STEP_LIMIT, *(len(episode.action) for episode in episodes))
         config = TaskConfig(task, step=step, tolerance="released", reward="dense", max_steps=limit)
-        with whole_folder(out) as folder:
+        with building(out) as (_, result), whole_folder(result) as folder:
             notes, skipped = _write(folder, episodes, config, progress or (lambda done, total, unit: None))
             notes.update(step=step, steps=sum(len(e.action) for e in episodes), disagreeing=disagreeing)
             kept = len(episodes) - len(skipped)

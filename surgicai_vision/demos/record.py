@@ -12,7 +12,6 @@ does nothing when it is complete.
 
 import functools
 import importlib
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from surgicai_vision import names
 from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.demos.store import MARKER, Demo, list_demos, read_demo, read_marker, write_demo, write_marker
 from surgicai_vision.errors import InputError, OutputExists, SurgicaiError, check_name
-from surgicai_vision.executor import Job, Progress, run
+from surgicai_vision.executor import Job, Progress, building, run, work_folder
 from surgicai_vision.files import check_output, code_version, read_json, whole_folder, write_json
 
 SOURCES: Mapping[str, str] = MappingProxyType({"expert": "surgicai_vision.demos.expert:Expert"})
@@ -135,15 +134,13 @@ def record(
     check_output(out, may_resume=MARKER)
     if finished(out, request):
         return list_demos(out)
-    work = out.with_name(f"{out.name}.work")
-    kept, skipped = _take(request, work, workers, progress or (lambda done, total, unit: None))
-    with whole_folder(out) as folder:
-        for index, path in enumerate(kept):
-            os.link(path, folder / f"episode_{index:06d}.safetensors")
-        write_marker(
-            folder, config.task, source, request=request, skipped=skipped, episodes=episodes, code=code_version()
-        )
-    shutil.rmtree(work)
+    with building(out) as (store, result):
+        kept, skipped = _take(request, store, workers, progress or (lambda done, total, unit: None))
+        with whole_folder(result) as folder:
+            for index, path in enumerate(kept):
+                shutil.copyfile(path, folder / f"episode_{index:06d}.safetensors")
+            details = {"request": request, "skipped": skipped, "episodes": episodes}
+            write_marker(folder, config.task, source, code=code_version(), **details)
     return list_demos(out)
 
 
@@ -155,6 +152,8 @@ def finished(out: Path, request: Mapping[str, Any]) -> bool:
         raise OutputExists(
             f"--out {out} holds demonstrations of another command (see {out / MARKER}); give another folder."
         )
+    # Left by a run that was killed after its last step.
+    shutil.rmtree(work_folder(out), ignore_errors=True)
     return True
 
 
