@@ -26,7 +26,7 @@ CLOSED_JAW = (needle.BODY_RADIUS - PAD_OFFSET) / GRASP_DEPTH
 """Finger angle [rad] at which the pads touch the needle."""
 GRASP_ANGLES = (math.radians(5.0), math.radians(20.0))
 """Needle angle of PSM2's grasp (released code, Approach)."""
-SAFE_ANGLES = (math.radians(4.0), math.radians(27.0))
+SAFE_ANGLES = (math.radians(6.5), math.radians(27.0))
 """Where a grasp off by its error still has the needle between the pads and passes the entry."""
 
 
