@@ -11,6 +11,7 @@ In the folder of `SURGICAI_VISION_WEIGHTS` a file is looked for as `<encoder>/<f
 `<encoder>.<suffix>` and `<filename>`.
 """
 
+import functools
 import os
 import warnings
 from collections.abc import Mapping
@@ -76,8 +77,8 @@ def _given(card: EncoderCard, path: Path, known: Mapping[str, str]) -> Path:
     """Accept a file named by the caller; say so when it is not a published one."""
     if not path.is_file():
         raise BadFile(f"--weights {path} is not a file; give the weights file of encoder '{card.name}'.")
-    published = {card.sha256, *known.values()} - {None}
-    if published and sha256_file(path) not in published:
+    published = [sha256 for sha256 in (card.sha256, *known.values()) if sha256]
+    if published and not sha256_file(path).startswith(tuple(published)):
         warnings.warn(
             f"{path} is not the published weights file of '{card.name}'; it is used as given and its own "
             "hash is recorded.",
@@ -101,8 +102,8 @@ def _in_folder(card: EncoderCard, wanted: Mapping[str, str | None]) -> Path | No
 
 
 def check_hash(path: Path, sha256: str | None) -> Path:
-    """Return `path` if its hash is `sha256` (or None is known), else refuse it."""
-    if sha256 is not None and (actual := sha256_file(path)) != sha256:
+    """Return `path` if its hash is `sha256` begins so (or None is known), else refuse it."""
+    if sha256 is not None and not (actual := sha256_file(path)).startswith(sha256):
         raise BadFile(f"{path} is damaged or another file: sha256 {actual}, expected {sha256}; replace it.")
     return path
 
@@ -117,18 +118,31 @@ def _in_hub_cache(card: EncoderCard) -> Path | None:
 
 def _downloaded(card: EncoderCard) -> Path | None:
     """Fetch from the hub when it answers at all; the client resumes a broken-off download."""
-    from huggingface_hub import constants, hf_hub_download
-    from huggingface_hub.utils import get_session
+    from huggingface_hub import hf_hub_download
 
-    if constants.is_offline_mode():
+    if not hub_answers():
         return None
     try:
-        get_session().head(constants.ENDPOINT, timeout=PROBE_SECONDS)
         return _check_blob(card, Path(hf_hub_download(card.source, str(card.filename))))
     except BadFile:
         raise
     except Exception:  # whatever the network did, the answer to the user is the same line
         return None
+
+
+@functools.cache
+def hub_answers() -> bool:
+    """Ask the hub once per process whether it is there, without retries."""
+    from huggingface_hub import constants
+    from huggingface_hub.utils import get_session
+
+    if constants.is_offline_mode():
+        return False
+    try:
+        get_session().head(constants.ENDPOINT, timeout=PROBE_SECONDS)
+    except Exception:  # no network, no name server, a proxy that refuses: all mean no
+        return False
+    return True
 
 
 def _check_blob(card: EncoderCard, path: Path) -> Path:

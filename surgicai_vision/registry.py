@@ -2,7 +2,7 @@
 
 Interface:
 
-* `encoder_names()`, `encoder_card(name)`, `offline_encoders()`.
+* `encoder_names()`, `check_encoder_name(name)`, `encoder_card(name)`, `find_weights(name, …)`.
 * `load_encoder(name, weights=None, pool="global", accept_licence=False) -> encoders.base.Encoder`: a
   callable from (batch, height, width, 3) uint8 RGB to (batch, dimension) float32.
 * `load_recipe(policy, recipe, changes) -> recipe object`: the frozen settings of a policy from
@@ -30,9 +30,18 @@ ENCODERS: Mapping[str, str] = MappingProxyType(
         "r3m": "encoders.r3m:R3M",
         "r3m-34": "encoders.r3m:R3M_34",
         "r3m-18": "encoders.r3m:R3M_18",
+        "clip": "encoders.clip:CLIP",
+        "clip-rn50": "encoders.clip:CLIP_RN50",
+        "imagenet": "encoders.imagenet:IMAGENET",
+        "dinov2": "encoders.timm_models:DINOV2",
+        "siglip2": "encoders.timm_models:SIGLIP2",
+        "vc1": "encoders.vc1:VC1",
     }
 )
 """Encoder name → "module:attribute" of its `encoders.base.Plugin`."""
+
+OPEN_ENCODERS: Mapping[str, str] = MappingProxyType({"timm:": "encoders.timm_models:plugin_for"})
+"""Prefix of open names → "module:function" that makes the plug-in of such a name."""
 
 OFFLINE_ENCODERS = ("imagenet-lite", "random")
 """Encoders that never download; a test compares this with their cards."""
@@ -48,9 +57,18 @@ def encoder_names() -> tuple[str, ...]:
 
 def encoder_plugin(name: str) -> Any:
     """Import the plug-in of `name`; `UnknownName` lists what exists."""
-    if name not in ENCODERS:
-        raise UnknownName("encoder", name, ENCODERS)
+    check_encoder_name(name)
+    for prefix, target in OPEN_ENCODERS.items():
+        if name.startswith(prefix):
+            return resolve(target)(name)
     return resolve(ENCODERS[name])
+
+
+def check_encoder_name(name: str) -> str:
+    """Return `name` if an encoder may be called so; imports nothing."""
+    if not name.startswith(tuple(OPEN_ENCODERS)):
+        check_name("encoder", name, (*ENCODERS, *(f"{prefix}<name>" for prefix in OPEN_ENCODERS)))
+    return name
 
 
 def encoder_card(name: str) -> Any:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from photographs import hopper
 
 from encoders.base import Encoder
 from encoders.card import EncoderCard
@@ -33,15 +34,6 @@ def pictures(count: int = 3, size: int = 224) -> np.ndarray:
 
 def plain(colour: tuple[int, int, int]) -> np.ndarray:
     return np.broadcast_to(np.array(colour, np.uint8), (1, 224, 224, 3))
-
-
-def hopper() -> np.ndarray:
-    """The photograph of Grace Hopper that matplotlib ships, its upper square."""
-    import cv2
-    import matplotlib.cbook
-
-    picture = cv2.imread(str(matplotlib.cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)))
-    return cv2.resize(picture[:512, :512, ::-1], (224, 224), interpolation=cv2.INTER_AREA)[None]
 
 
 def test_feature_is_as_declared(encoder: Encoder) -> None:
@@ -196,3 +188,19 @@ def test_weights_file_that_is_not_there(tmp_path: Path) -> None:
     (tmp_path / "some.bin").write_bytes(b"x")
     with pytest.raises(InputError, match="leave --weights out"):
         load_encoder("random", weights=tmp_path / "some.bin")
+
+
+GOLDEN = (0.15637, 0.0, 0.07037, 0.09735, 0.0)
+"""First features of `imagenet-lite` on the photograph, in float32. Regenerate (from tests/): print
+`Encoder(*IMAGENET_LITE.build(IMAGENET_LITE.card, None), dtype=torch.float32)(hopper())[0, :5]`."""
+
+
+def test_golden_features_in_float32_and_near_them_in_bfloat16() -> None:
+    from encoders.imagenet_lite import IMAGENET_LITE
+
+    exact, rounded = (
+        Encoder(*IMAGENET_LITE.build(IMAGENET_LITE.card, None), dtype=dtype)(hopper())[0]
+        for dtype in (torch.float32, torch.bfloat16)
+    )
+    np.testing.assert_allclose(exact[:5], GOLDEN, atol=2e-3)
+    assert np.linalg.norm(exact - rounded) < 0.08 * np.linalg.norm(exact)  # 4 % measured

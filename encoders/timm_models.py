@@ -1,0 +1,126 @@
+"""`dinov2`, `siglip2` and `timm:<name>`: any network of timm with its own weights and statistics.
+
+`timm:<name>` takes the card from timm's own table, the licence included; the feature is timm's pooled
+output without a classifier.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from encoders.card import EncoderCard, Plugin
+from surgicai_vision.errors import BadFile, UnknownName
+from surgicai_vision.files import sha256_file
+
+if TYPE_CHECKING:
+    from torch import nn
+
+PREFIX = "timm:"
+
+DINOV2_CARD = EncoderCard(
+    name="dinov2",
+    architecture="timm vit_small_patch14_dinov2.lvd142m",
+    source="timm/vit_small_patch14_dinov2.lvd142m",
+    revision="main",
+    filename="model.safetensors",
+    sha256=None,
+    licence="Apache-2.0",
+    offline=False,
+    input_size=224,
+    input_range=(0.0, 1.0),
+    mean=(0.485, 0.456, 0.406),
+    std=(0.229, 0.224, 0.225),
+    interpolation="bicubic",
+    dim=384,
+    paper="Oquab et al., DINOv2, TMLR 2024",
+    note="Position embeddings are resampled from 518 px to 224 px; the feature is the class token.",
+)
+SIGLIP2_CARD = replace(
+    DINOV2_CARD,
+    name="siglip2",
+    architecture="timm vit_base_patch16_siglip_224.v2_webli",
+    source="timm/vit_base_patch16_siglip_224.v2_webli",
+    mean=(0.5, 0.5, 0.5),
+    std=(0.5, 0.5, 0.5),
+    dim=768,
+    paper="Tschannen et al., SigLIP 2, 2025",
+    note="The feature is the attention-pooled embedding.",
+)
+
+
+def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
+    """Build the network by timm's own loader, which reads torch files with `weights_only`."""
+    import timm
+    import torch
+
+    from encoders.base import DAMAGED
+
+    if path is None:
+        raise BadFile(f"Encoder '{card.name}' needs a weights file.")
+    name = card.architecture.removeprefix("timm ")
+    # A size other than the one trained at has to be told to networks with position embeddings, and only them.
+    resized = {} if card.input_size == _trained_size(name) else {"img_size": card.input_size}
+    with torch.random.fork_rng(devices=[]):
+        try:
+            network = timm.create_model(
+                name, pretrained=True, pretrained_cfg_overlay={"file": str(path)}, num_classes=0, **resized
+            )
+        except DAMAGED as error:
+            reason = " ".join(str(error).split())[:160]
+            raise BadFile(f"{path} does not hold the weights of timm's {name} ({reason}).") from None
+    return replace(card, sha256=sha256_file(path)), network
+
+
+def _trained_size(name: str) -> int:
+    """Side of the pictures a timm network was trained on [px]."""
+    import timm
+
+    return int(timm.get_pretrained_cfg(name).input_size[-1])
+
+
+def plugin_for(name: str) -> Plugin:
+    """Return the plug-in of `timm:<name>`, its card made from timm's table.
+
+    Raises:
+        UnknownName: a network timm has no pretrained weights for.
+    """
+    import timm
+
+    model = name.removeprefix(PREFIX)
+    known = timm.list_pretrained()
+    if model not in known and model not in timm.list_models(pretrained=True):
+        near = [other for other in known if other.startswith(model[:6])][:20] or ["resnet18.a1_in1k"]
+        raise UnknownName("timm network (a few of timm.list_pretrained() follow)", model, near)
+    config = timm.get_pretrained_cfg(model)
+    with_tag = f"{config.architecture}.{config.tag}" if config.tag else config.architecture
+    card = EncoderCard(
+        name=name,
+        architecture=f"timm {with_tag}",
+        source=str(config.hf_hub_id),
+        revision="main",
+        filename=config.hf_hub_filename or "model.safetensors",
+        sha256=None,
+        licence=config.license or "unknown",
+        offline=False,
+        input_size=int(config.input_size[-1]),
+        input_range=(0.0, 1.0),
+        mean=tuple(config.mean),
+        std=tuple(config.std),
+        interpolation="bilinear" if config.interpolation == "bilinear" else "bicubic",
+        dim=_dim(with_tag),
+        paper=config.paper_name or config.paper_ids or f"timm {with_tag}",
+    )
+    return Plugin(card, build)
+
+
+def _dim(name: str) -> int:
+    """Length of a timm network's pooled feature, from its structure alone."""
+    import timm
+    import torch
+
+    with torch.device("meta"):
+        return int(timm.create_model(name, num_classes=0).num_features)
+
+
+DINOV2 = Plugin(DINOV2_CARD, build)
+SIGLIP2 = Plugin(SIGLIP2_CARD, build)
