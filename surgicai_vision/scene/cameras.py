@@ -4,9 +4,9 @@ Pixels and camera frames follow OpenCV: x right, y down, z forward; the centre o
 the principal point of a W × H picture is ((W - 1) / 2, (H - 1) / 2). A point p of the world has the pixel
 `K (R p + t)` divided by its third component, with `K = intrinsics(…)` and `[R t] = inverse(extrinsics(…))`.
 
-Sources: "front" is the left endoscope of SurgicAI's scene, "front_right" the right one (4 mm beside it, toed in
-by 2.3° each), "back" the camera opposite to them. The surgical robotics challenge also puts a camera on each
-insertion link; there it looks along the shaft and sees little else, so ours stand off it and aim at the jaws.
+Sources: "front" is the left endoscope of SurgicAI's scene, moved as `ENDOSCOPE` says; "front_right" the right one;
+"back" the camera opposite to them. The surgical robotics challenge also puts a camera on each insertion link; there it
+looks along the shaft and sees little else, so ours stand off it and aim at the jaws.
 """
 
 import math
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.errors import UnknownName
-from surgicai_vision.names import ARMS
+from surgicai_vision.names import ARMS, PSM1, PSM2
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.rotations import matrix_to_quaternion
 
@@ -43,30 +43,60 @@ class CameraPose:
     fovy: float
 
 
+ENDOSCOPE = (-0.008, 0.100, 0.160)
+ENDOSCOPE_DIRECTION = (0.040, -0.451, -0.892)
+ENDOSCOPE_FOVY = 0.9
+"""The endoscope's middle [m], its direction, and the vertical field of view [rad] of both its cameras.
+
+SurgicAI's stands at (0, 114.2, 148.8) mm, looks along (0, -0.642, -0.765) and sees 1.2 rad at 640 × 480. There, at
+224 × 224, the needle covers 31 pixels at the end of a handoff even with both arms taken away; and PSM2 holds it along
+the wound, which is the line of sight, so that placing ends with 5 to 15 pixels in view. 8 mm to PSM2's side, 14 mm
+forwards, 11 mm up and 0.9 rad bring it above 25 at the end of grasp, place, insert and handoff, with both arms still
+in view at the start (`tests/test_visibility.py`).
+"""
+BASELINE, TOE_IN = 0.004, 0.040
+"""Between the endoscope's two cameras [m]; x of each one's direction, 2.3° (SurgicAI)."""
+
+
+def _endoscope(side: float) -> CameraPose:
+    """Return the left (side = 1) or the right (-1) camera: left is +x, for the endoscope looks along -y."""
+    x, y, z = ENDOSCOPE
+    across, forward, down = ENDOSCOPE_DIRECTION
+    return CameraPose(
+        position=(x + side * BASELINE / 2, y, z),
+        direction=(across - side * TOE_IN, forward, down),
+        up=(0.0, down, -forward),
+        fovy=ENDOSCOPE_FOVY,
+    )
+
+
 WORLD_CAMERAS = MappingProxyType(
     {
-        "front": CameraPose((0.0020, 0.1142, 0.1488), (-0.040, -0.642, -0.765), (0.0, -0.766, 0.643), 1.2),
-        "front_right": CameraPose((-0.0020, 0.1142, 0.1488), (0.040, -0.642, -0.765), (0.0, -0.766, 0.643), 1.2),
+        "front": _endoscope(1.0),
+        "front_right": _endoscope(-1.0),
         "back": CameraPose((0.0, -0.0359, 0.1659), (0.0, 0.707, -0.707), (0.0, 0.707, 0.707), 0.8),
     }
 )
-"""Camera → pose in world (SurgicAI's scene)."""
+"""Camera → pose in world; "back" stands where SurgicAI's does."""
 
-WRIST_OFFSET = (-0.022, 0.0, -0.040)
-"""From the wrist's pitch axis to the wrist camera, along the axes of the insertion link [m]: beside the shaft on the
-side away from the arm's base, and 40 mm up it. Free of the tissue for every insertion, and not behind the shaft."""
+WRIST_ASIDE, WRIST_BACK = 0.030, 0.030
+"""From the wrist's pitch axis to the wrist camera: beside the shaft and up along it [m]. So the view meets the shaft
+at 33°: far enough to look past it at the jaws, and clear of the tissue in every grasp of the five subtasks."""
+WRIST_SIDE = MappingProxyType({PSM1: (-math.sqrt(0.5), -math.sqrt(0.5)), PSM2: (-math.sqrt(0.5), math.sqrt(0.5))})
+"""Arm → side of the shaft on which its camera stands, in x and y of the insertion link: above and outside, where of
+eight sides tried the jaws, the needle and the holes were seen best at the ends of all subtasks."""
 WRIST_TARGET = 0.017
 """Point beyond the wrist's pitch axis at which the wrist camera aims [m]: 2 mm short of the jaws' grasp point."""
-WRIST_FOVY = 0.9
-"""Vertical field of view of the wrist cameras [rad]: about 56 mm of the scene at the jaws, more than a needle."""
+WRIST_FOVY = 0.8
+"""Vertical field of view of the wrist cameras [rad]: about 47 mm of the scene at the jaws, more than two needles."""
 
 
-def wrist_camera(instrument: str) -> CameraPose:
-    """Return the wrist camera's pose on the insertion link, whose z axis is the shaft."""
-    x, y, z = WRIST_OFFSET
+def wrist_camera(arm: str, instrument: str) -> CameraPose:
+    """Return the wrist camera's pose on the arm's insertion link, whose z axis is the shaft."""
+    x, y = (WRIST_ASIDE * side for side in WRIST_SIDE[arm])
     return CameraPose(
-        position=(x, y, INSTRUMENTS[instrument].tool + z),
-        direction=(-x, -y, WRIST_TARGET - z),
+        position=(x, y, INSTRUMENTS[instrument].tool - WRIST_BACK),
+        direction=(-x, -y, WRIST_TARGET + WRIST_BACK),
         up=(-x, -y, 0.0),
         fovy=WRIST_FOVY,
     )
@@ -84,7 +114,7 @@ def add_wrist_camera(spec: mujoco.MjSpec, arm: str, instrument: str = "400006", 
     found = spec.body(carrier)
     if found is None:
         raise UnknownName("body", carrier, [item.name for item in spec.bodies])
-    _add(found, f"wrist_{arm}", wrist_camera(instrument))
+    _add(found, f"wrist_{arm}", wrist_camera(arm, instrument))
 
 
 def add_cameras(spec: mujoco.MjSpec, instrument: str = "400006") -> None:

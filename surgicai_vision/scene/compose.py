@@ -123,7 +123,7 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     thread.add_thread(spec, body, needle.point(0.0).tolist(), config.thread, {"contype": THREAD, "conaffinity": 0})
     for name in names.ARMS:
         _add_arm(spec, config, name)
-    look.dress(spec)
+    look.dress(spec, config.layout, config.instrument)
     add_world_cameras(spec)
     return spec
 
