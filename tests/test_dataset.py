@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pyarrow as pa
@@ -13,7 +15,7 @@ from surgicai_vision import names
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.dataset import check_dataset, layout, metadata, open_dataset, pictures, render_demos, rendering
 from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
-from surgicai_vision.demos.record import roll
+from surgicai_vision.demos.record import record, roll
 from surgicai_vision.demos.store import list_demos, read_demo, write_demo, write_marker
 from surgicai_vision.errors import BadFile, InputError, OutputExists, UnknownName
 
@@ -171,6 +173,7 @@ def test_lerobot_opens_it_offline(tmp_path, fake, demos, monkeypatch):
         depth = item[names.depth_key("front")].numpy()[0]
         np.testing.assert_array_equal(depth, ours.depth("front", index, index + 1)[0, ..., 0])
         np.testing.assert_array_equal(item[names.ACTION].numpy(), ours.columns()[names.ACTION][index])
+    _edit(theirs, tmp_path)
     statistics = theirs.meta.stats[names.ACTION]
     np.testing.assert_allclose(statistics["mean"], ours.columns()[names.ACTION].mean(0), atol=1e-6)
     np.testing.assert_allclose(statistics["std"], ours.columns()[names.ACTION].std(0), atol=1e-6)
@@ -199,6 +202,19 @@ def test_statistics_equal_lerobots(fake):
     for name in ("min", "max", "mean", "std"):
         np.testing.assert_allclose(ours[name], theirs[name], atol=1e-9)
     np.testing.assert_allclose(ours["q50"], theirs["q50"], atol=0.1)
+
+
+def _edit(dataset, folder):
+    """Split, delete and merge with LeRobot's own tools; frames and depth must survive."""
+    from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
+
+    parts = split_dataset(dataset, {"a": [0], "b": [1, 2]}, output_dir=folder / "split")
+    merged = merge_datasets([parts["a"], parts["b"]], "local/merged", folder / "merged")
+    shorter = delete_episodes(merged, [1], folder / "shorter", "local/shorter")
+    assert (merged.num_frames, shorter.num_episodes) == (dataset.num_frames, 2)
+    for key in (names.image_key("front"), names.depth_key("back"), names.ACTION, names.SEED):
+        assert merged[-1][key].equal(dataset[-1][key]) or "depth" in key
+        assert shorter[0][key].equal(merged[0][key])
 
 
 def test_metadata_equals_lerobots(tmp_path, fake, demos):
@@ -350,3 +366,93 @@ def test_check_finds_damaged_metadata(tmp_path, fake, demos):
     assert "meta/info.json: its counts are not those of the data." in check_dataset(tmp_path / "set").problems
     (tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").write_bytes(b"")
     assert any("LeRobot's metadata cannot be read" in line for line in check_dataset(tmp_path / "set").problems)
+
+
+# -- the real environment ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Two demonstrations of the expert, recorded by two worker processes."""
+    out = tmp_path_factory.mktemp("real") / "demos"
+    record(TaskConfig("place"), episodes=2, out=out, workers=2)
+    return out
+
+
+def test_recording_does_not_depend_on_the_workers(tmp_path, recorded):
+    again = record(TaskConfig("place"), episodes=2, out=tmp_path / "demos", workers=0)
+    assert [path.read_bytes() for path in again] == [path.read_bytes() for path in list_demos(recorded)]
+
+
+def test_rendering_does_not_depend_on_the_workers_and_equals_what_was_seen_live(tmp_path, recorded):
+    import surgicai_vision.envs as envs
+
+    options = {"size": 64, "depth": True, "segmentation": True}
+    spawned = render_demos(recorded, tmp_path / "spawned", workers=2, **options)
+    inline = render_demos(recorded, tmp_path / "inline", workers=0, **options)
+    dataset = open_dataset(tmp_path / "spawned")
+    assert (spawned.frames, spawned.digest) == (inline.frames, inline.digest)
+    assert dataset.fingerprint == open_dataset(tmp_path / "inline").fingerprint
+    assert check_dataset(tmp_path / "spawned").problems == ()
+    # Live: the same seed and the recorded actions, looked at on the way.
+    demo = read_demo(list_demos(recorded)[1])
+    shown = {"obs_type": "pixels_agent_pos", "image_size": 64, "depth": True, "segmentation": True}
+    env = envs.make(demo.config, **shown)
+    observation, _ = env.reset(seed=demo.seed)
+    row = int(np.flatnonzero(dataset.episode_index == 1)[0])
+    columns = dataset.columns()
+    for step, action in enumerate(demo.action):
+        for view in ("front", "back"):
+            frame = row + step
+            np.testing.assert_array_equal(dataset.frames(view, frame, frame + 1)[0], observation["pixels"][view])
+            np.testing.assert_array_equal(dataset.depth(view, frame, frame + 1)[0], observation["depth"][view])
+            parts = dataset.segmentation(view, frame, frame + 1)[0]
+            np.testing.assert_array_equal(parts, observation["segmentation"][view])
+        np.testing.assert_array_equal(columns[names.STATE][row + step], observation["agent_pos"])
+        observation, reward, *_, info = env.step(action)
+        assert columns[names.REWARD][row + step] == np.float32(reward)
+        assert columns[names.SUCCESS][row + step] == info["is_success"]
+    env.close()
+
+
+def test_cameras_stand_in_the_metadata(tmp_path, recorded):
+    render_demos(recorded, tmp_path / "set", views=("back", "wrist_psm2"), size=32, workers=0)
+    dataset = open_dataset(tmp_path / "set")
+    cameras = dataset.meta["cameras"]
+    assert list(cameras) == ["back", "wrist_psm2"] == list(dataset.views)
+    # Vertical field of view 0.8 rad on 32 pixels.
+    np.testing.assert_allclose(cameras["back"]["intrinsics"][1][1], 16 / np.tan(0.4), rtol=1e-3)
+    np.testing.assert_allclose(np.array(cameras["back"]["T_world_camera"])[:3, 3], [0, -0.0359, 0.1659], atol=1e-6)
+    assert cameras["wrist_psm2"]["T_world_camera"] is None, "it moves with the arm"
+    assert dataset.meta["renderers"][0]
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from surgicai_vision.dataset import render_demos
+if __name__ == "__main__":
+    demos, out = map(Path, sys.argv[1:])
+    render_demos(demos, out, size=64, workers=1, progress=lambda *row: print(*row, flush=True))
+"""
+
+
+@pytest.mark.parametrize("moment", ["first episode", "between", "assembling"])
+def test_killed_rendering_continues_to_the_same_dataset(tmp_path, recorded, moment):
+    """SIGKILL while rendering and at the end; `benchmarks/kill.py` does it at random moments."""
+    script = tmp_path / "script.py"
+    script.write_text(KILLED)
+    process = subprocess.Popen([sys.executable, script, recorded, tmp_path / "set"], stdout=subprocess.PIPE, text=True)
+    lines = {"first episode": 1, "between": 2, "assembling": 3}[moment]
+    for _ in range(lines):
+        process.stdout.readline()
+    process.kill()
+    process.wait(10)
+    assert not (tmp_path / "set").exists()
+    seen = []
+    options = {"size": 64, "workers": 0, "progress": lambda *row: seen.append(row[0])}
+    again = render_demos(recorded, tmp_path / "set", **options)
+    assert bool(seen[0]) == (lines > 1), "what was finished is not done again"
+    assert again.digest == render_demos(recorded, tmp_path / "whole", size=64, workers=0).digest
+    assert open_dataset(tmp_path / "set").fingerprint == open_dataset(tmp_path / "whole").fingerprint
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["script.py", "set", "whole"]
