@@ -20,6 +20,7 @@ from surgicai_vision.envs.place import Place
 from surgicai_vision.envs.pullout import Pullout
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.envs.suture import Suture
+from surgicai_vision.errors import InputError
 
 __all__ = ["SUBTASKS", "SuturingEnv", "make", "make_task"]
 
@@ -40,6 +41,8 @@ def make(
 ) -> SuturingEnv:
     """Return the unwrapped env of a task; see `observation` for what the arguments choose."""
     size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+    if len(size) != 2:
+        raise InputError(f"image_size is {size}; it must be one side or (height, width) [pixel].")
     view = ObservationConfig(obs_type, tuple(cameras), size, depth, segmentation)
     if config.task == names.SUTURE:
         return Suture(config, tuple(SUBTASKS.values()), view, render_mode)

@@ -121,7 +121,6 @@ class Stitch:
         pose[:3, 3] = np.asarray(self.pair.exit.centre) + PULLOUT_SHIFT - pose[:3, :3] @ needle.point(HANDOFF_ANGLE)
         return pose
 
-
     @functools.cached_property
     def place_tip(self) -> Pose:
         """Return the goal of `place` for the needle's frame at its tip."""

@@ -60,4 +60,9 @@ class Memory:
     @classmethod
     def unpack(cls, values: list[float]) -> "Memory":
         """Return the record that `pack` wrote at the start of `values`."""
-        return cls(*values[:15], hold=tuple(values[15:27]), goal=tuple(values[27:39]))
+        record, start = cls(), 0
+        for item in fields(cls):
+            length = len(item.default) if isinstance(item.default, tuple) else 0
+            setattr(record, item.name, tuple(values[start : start + length]) if length else values[start])
+            start += length or 1
+        return record

@@ -22,7 +22,7 @@ from gymnasium import spaces
 from surgicai_vision import names
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.scene.kinematics import STARTS, Pose
-from surgicai_vision.scene.rotations import matrix_to_rpy_flat, matrix_to_rotvec_flat, multiply_flat
+from surgicai_vision.scene.rotations import matrix_to_rotvec_flat, matrix_to_rpy_flat, multiply_flat
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def is_out(simulation: Simulation, pair: HolePair) -> bool:
 def _passes(before: Point, now: Point, hole: Hole, inward: bool) -> bool:
     """Say whether the way from `before` to `now` crosses the hole's plane inside the opening."""
     cosine, sine = math.cos(hole.tilt), math.sin(hole.tilt)
-    x, y, z = hole.centre
+    x, _, z = hole.centre
     start, end = sine * (before[0] - x) + cosine * (before[2] - z), sine * (now[0] - x) + cosine * (now[2] - z)
     if not (start > 0.0 >= end if inward else start <= 0.0 < end):
         return False

@@ -8,6 +8,7 @@ the new surgical robotics challenge (0.98 × 0.86 mm) and SurgicAI's (0.725 mm),
 Contact numbers were measured by `benchmarks/grip.py`.
 """
 
+import itertools
 import math
 
 import mujoco
@@ -77,7 +78,7 @@ def add_needle(spec: mujoco.MjSpec, collision: dict[str, int]) -> mujoco.MjsBody
     body = spec.worldbody.add_body(name="needle", pos=HOME.tolist())
     body.add_joint(name="needle", type=mujoco.mjtJoint.mjJNT_FREE, damping=DRAG)
     edges = np.linspace(0.0, TIP_ANGLE, SEGMENTS + 1)
-    for index, (start, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for index, (start, end) in enumerate(itertools.pairwise(edges)):
         body.add_geom(
             name=f"needle_{index}",
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,

@@ -9,6 +9,7 @@ a hundred times lighter, lies on its surface. Without it no jaw whose pads reach
 take a needle that lies flat.
 """
 
+import itertools
 import math
 
 import mujoco
@@ -67,7 +68,7 @@ def add_phantom(spec: mujoco.MjSpec, layout: str, needle: dict[str, int], arm: d
 def piece_edges(pairs: tuple[HolePair, ...]) -> list[float]:
     """Return the five y [m] that part the ridge into one piece a hole pair, falling."""
     rows = [pair.entry.centre[1] for pair in pairs]
-    between = [(first + second) / 2 for first, second in zip(rows[:-1], rows[1:], strict=True)]
+    between = [(first + second) / 2 for first, second in itertools.pairwise(rows)]
     return [rows[0] + BEYOND, *between, rows[-1] - BEYOND]
 
 
