@@ -137,6 +137,7 @@ class _Target:
     def draw(self, data: mujoco.MjData, view: mujoco.MjvCamera, wanted: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         """Return the wanted modalities from at most two passes."""
         opengl.make_current()
+        # Another target may have drawn since; without this its buffer would be drawn over and read.
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self.model, data, self.option, None, view, everything, self.scene)
