@@ -11,6 +11,7 @@ Start: random, seeded by `reset(seed=…)`; covers the end states of the subtask
 Termination: success, or a physics error (`info["physics_error"]`, never a success). Truncation: `max_steps`.
 """
 
+from math import isfinite
 from typing import Any, ClassVar
 
 import gymnasium
@@ -27,6 +28,7 @@ from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.errors import InputError, PhysicsError
 from surgicai_vision.scene import build_scene
+from surgicai_vision.scene.kinematics import Pose
 
 START_DRAWS = 60
 """Draws of a start state before giving up."""
@@ -34,6 +36,7 @@ RENDER_CAMERA, RENDER_SIZE = "front", (480, 640)
 
 Observation = NDArray[np.float32] | dict[str, Any]
 Info = dict[str, Any]
+Target = tuple[Pose, Pose]
 
 
 class SuturingEnv(gymnasium.Env):
@@ -46,10 +49,17 @@ class SuturingEnv(gymnasium.Env):
         render_mode: None or "rgb_array".
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": names.FPS}
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # gymnasium declares no ClassVar
+        "render_modes": ["rgb_array"],
+        "render_fps": names.FPS,
+    }
 
     def __init__(
-        self, config: TaskConfig, subtasks: tuple[Subtask, ...], view: ObservationConfig, render_mode: str | None = None
+        self,
+        config: TaskConfig,
+        subtasks: tuple[Subtask, ...],
+        view: ObservationConfig,
+        render_mode: str | None = None,
     ):
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"render_mode is '{render_mode}'; allowed: None, rgb_array.")
@@ -90,11 +100,13 @@ class SuturingEnv(gymnasium.Env):
         memory.steps += 1.0
         self._add_path()
         passage.watch(simulation, memory, self.stitch.pair)
-        info = self.measure()
-        self._progress(info)
+        target = self._target()
+        info = self._measure(target)
+        if self._progress(info):
+            target = self._target()
         terminated = bool(info["is_success"] or info["physics_error"])
-        reward = self.reward(info)
-        return self.observe(), reward, terminated, memory.steps >= self.config.max_steps, info
+        truncated = memory.steps >= self.config.max_steps
+        return self._observe(target), self.reward(info), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the front camera's picture, (480, 640, 3) uint8, when `render_mode` is "rgb_array"."""
@@ -180,9 +192,16 @@ class SuturingEnv(gymnasium.Env):
 
     def measure(self) -> Info:
         """Return the info dict of the present, measured state."""
-        simulation, memory, subtask = self.simulation, self.simulation.memory, self.subtask
-        achieved, desired = subtask.target(simulation, self.stitch)
-        contact = simulation.holds(subtask.arm)
+        return self._measure(self._target())
+
+    def _target(self) -> Target:
+        """Return the measured frame that success is judged by, and its goal, in world."""
+        return self.subtask.target(self.simulation, self.stitch)
+
+    def _measure(self, target: Target) -> Info:
+        simulation, memory = self.simulation, self.simulation.memory
+        achieved, desired = target
+        contact = simulation.holds(self.subtask.arm)
         distance, turn = poses.distance(achieved, desired), poses.angle(achieved, desired)
         diverged = memory.diverged > 0.0
         return {
@@ -216,12 +235,12 @@ class SuturingEnv(gymnasium.Env):
         if not contact:
             memory.held = 0.0
             return np.zeros(2)
-        in_jaws = poses.compose(poses.invert(simulation.grasp(self.subtask.arm)), simulation.needle())
+        in_jaws = poses.relative(simulation.grasp(self.subtask.arm), simulation.needle())
         if memory.held == 0.0:
             memory.held, memory.hold = 1.0, in_jaws
             return np.zeros(2)
-        moved = poses.compose(in_jaws, poses.invert(memory.hold))
-        return np.array([poses.distance(moved, poses.IDENTITY), poses.angle(moved, poses.IDENTITY)])
+        grasped = poses.inverse_origin(memory.hold)
+        return np.array([poses.reach(in_jaws, grasped), poses.angle(in_jaws, memory.hold)])
 
     def reward(self, info: Info) -> float:
         """Return the reward of a measurement."""
@@ -251,10 +270,13 @@ class SuturingEnv(gymnasium.Env):
 
     def observe(self) -> Observation:
         """Return the observation of the present state."""
+        return self._observe(self._target())
+
+    def _observe(self, target: Target) -> Observation:
+        achieved, desired = target
         if self.view.obs_type == "state":
-            return self._state_vector()
+            return self._state_vector(target)
         if self.view.obs_type == "goal":
-            achieved, desired = self.subtask.target(self.simulation, self.stitch)
             jaw = self.simulation.jaw(self.subtask.arm)
             return {
                 "observation": self.agent_pos(),
@@ -263,11 +285,11 @@ class SuturingEnv(gymnasium.Env):
             }
         return self._look()
 
-    def _state_vector(self) -> NDArray[np.float32]:
+    def _state_vector(self, target: Target) -> NDArray[np.float32]:
         simulation, arm = self.simulation, self.subtask.arm
-        achieved, desired = self.subtask.target(simulation, self.stitch)
+        achieved, desired = target
         tip = simulation.tip(arm)
-        goal = poses.compose(poses.compose(desired, poses.invert(achieved)), tip)
+        goal = poses.compose(desired, poses.relative(achieved, tip))
         now, wanted = simulation.to_base(arm, tip), simulation.to_base(arm, goal)
         return observation.state_vector(arm, now, wanted, simulation.jaw(arm))
 
@@ -299,10 +321,10 @@ class SuturingEnv(gymnasium.Env):
 
     def _checked(self, action: NDArray[np.float32]) -> list[float]:
         """Return the action as seven floats in [-1, 1]."""
-        values = np.asarray(action, dtype=np.float64).ravel().tolist()
-        if len(values) != 7 or not all(value == value for value in values):
+        values = np.asarray(action).ravel().tolist()
+        if len(values) != 7 or not isfinite(sum(values)):
             raise InputError(f"The action must be 7 finite numbers in [-1, 1]; got {values}.")
-        return [min(max(value, -1.0), 1.0) for value in values]
+        return [-1.0 if value < -1.0 else 1.0 if value > 1.0 else value for value in values]
 
     def _remember_tool(self) -> None:
         memory = self.simulation.memory
@@ -314,5 +336,6 @@ class SuturingEnv(gymnasium.Env):
         memory.tip_path += ((x - memory.tool_x) ** 2 + (y - memory.tool_y) ** 2 + (z - memory.tool_z) ** 2) ** 0.5
         memory.tool_x, memory.tool_y, memory.tool_z = x, y, z
 
-    def _progress(self, info: Info) -> None:
-        """Move on to the next subtask, where a task has several; here there is none."""
+    def _progress(self, info: Info) -> bool:
+        """Move on to the next subtask and say so, where a task has several; here there is none."""
+        return False

@@ -1,5 +1,6 @@
 """Grasp (SurgicAI: Approach): PSM2 takes the needle that lies at a random pose on the tissue."""
 
+import functools
 import math
 from types import MappingProxyType
 
@@ -24,7 +25,7 @@ def lying_needle(rng: np.random.Generator) -> np.ndarray:
     """Draw T_world_needle (4, 4) of a needle that lies on the tissue."""
     pose = np.eye(4)
     pose[:3, :3] = rpy_to_matrix(0.0, 0.0, rng.uniform(-SPREAD_TURN, SPREAD_TURN))
-    pose[:3, 3] = needle.HOME + [rng.uniform(-SPREAD_X, SPREAD_X), rng.uniform(-SPREAD_Y, SPREAD_Y), 0.0]
+    pose[:3, 3] = needle.HOME + np.array([rng.uniform(-SPREAD_X, SPREAD_X), rng.uniform(-SPREAD_Y, SPREAD_Y), 0.0])
     return pose
 
 
@@ -52,6 +53,7 @@ def grasp_goal(simulation: Simulation, arm: str, angle: float) -> Pose:
     return poses.compose(simulation.needle(), _grasp_frame(arm, angle))
 
 
+@functools.lru_cache(maxsize=64)
 def _grasp_frame(arm: str, angle: float) -> Pose:
     """Return T_needle_grasp: `grasp_in_needle` with the jaws' grasp point for its origin."""
     shift = np.eye(4)

@@ -43,6 +43,32 @@ def invert(a: Pose) -> Pose:
     )  # fmt: skip
 
 
+def relative(a: Pose, b: Pose) -> Pose:
+    """Return `b` in the frame of `a`: the product invert(a) · b."""
+    x, y, z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    _, _, _, r0, r1, r2, r3, r4, r5, r6, r7, r8 = a
+    return (
+        r0 * x + r3 * y + r6 * z,
+        r1 * x + r4 * y + r7 * z,
+        r2 * x + r5 * y + r8 * z,
+        *multiply_flat((r0, r3, r6, r1, r4, r7, r2, r5, r8), b[3:]),
+    )
+
+
+def inverse_origin(a: Pose) -> tuple[float, float, float]:
+    """Return where the parent's origin lies in the frame of `a`."""
+    x, y, z, r0, r1, r2, r3, r4, r5, r6, r7, r8 = a
+    return -(r0 * x + r3 * y + r6 * z), -(r1 * x + r4 * y + r7 * z), -(r2 * x + r5 * y + r8 * z)
+
+
+def reach(a: Pose, point: tuple[float, float, float]) -> float:
+    """Return how far `a` puts a point of its frame from the parent's origin [m]."""
+    x, y, z = point
+    u, v, w, r0, r1, r2, r3, r4, r5, r6, r7, r8 = a
+    u, v, w = u + r0 * x + r1 * y + r2 * z, v + r3 * x + r4 * y + r5 * z, w + r6 * x + r7 * y + r8 * z
+    return (u * u + v * v + w * w) ** 0.5
+
+
 def distance(a: Pose, b: Pose) -> float:
     """Return the distance between two origins [m]."""
     return ((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2) ** 0.5

@@ -43,6 +43,7 @@ class Simulation:
         self.data = mujoco.MjData(scene.model)
         self.memory = Memory()
         self.commands: dict[str, Command] = {}
+        self._read: dict[int, Pose] = {}
         self.bases = {arm: poses.flat(kinematics.base_in_world(arm)) for arm in names.ARMS}
         self._from_world = {arm: poses.invert(base) for arm, base in self.bases.items()}
         self._needle_id = self.model.body("needle").id
@@ -50,6 +51,7 @@ class Simulation:
         self._pads = {arm: scene.arms[arm].pads for arm in names.ARMS}
         self._needle_geoms = (scene.needle_geoms.start, scene.needle_geoms.stop)
         self._ctrl = self.data.ctrl
+        self._control_time = SUBSTEPS * float(self.model.opt.timestep)
         self._xpos, self._xmat = self.data.xpos, self.data.xmat
         self._tip_ids = {arm: scene.arms[arm].tip_body for arm in names.ARMS}
         self.reset()
@@ -65,6 +67,7 @@ class Simulation:
     def refresh(self) -> None:
         """Recompute positions, velocities and contacts of the present state."""
         mujoco.mj_step1(self.model, self.data)
+        self._read.clear()
 
     # -- setting --------------------------------------------------------------------------------------------------
 
@@ -130,10 +133,11 @@ class Simulation:
         if self.memory.release > 0:
             self._let_go()
         data = self.data
-        due = data.time + SUBSTEPS * self.model.opt.timestep
+        due = data.time + self._control_time
         mujoco.mj_step2(self.model, data)
         mujoco.mj_step(self.model, data, SUBSTEPS - 1)
         mujoco.mj_step1(self.model, data)
+        self._read.clear()
         return abs(data.time - due) < 1e-9
 
     def _let_go(self) -> None:
@@ -151,7 +155,7 @@ class Simulation:
     # -- measuring ------------------------------------------------------------------------------------------------
 
     def _body(self, index: int) -> Pose:
-        return (*self._xpos[index].tolist(), *self._xmat[index].tolist())
+        return (*self._xpos[index].tolist(), *self._xmat[index].tolist())  # type: ignore[return-value]  # 3 + 9
 
     def tip(self, arm: str) -> Pose:
         """Return T_world_tip of an arm, measured."""

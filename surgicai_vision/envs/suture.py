@@ -16,8 +16,8 @@ PULLOUT_PHASE = 4
 class Suture(SuturingEnv):
     """All five subtasks in a row; `is_success` is the whole procedure's."""
 
-    def _progress(self, info: Info) -> None:
-        """Begin the next subtask when the present one's success has held."""
+    def _progress(self, info: Info) -> bool:
+        """Begin the next subtask, and say so, when the present one's success has held."""
         memory = self.simulation.memory
         info["subtask_success"] = info["is_success"]
         memory.dwell = memory.dwell + 1.0 if info["is_success"] else 0.0
@@ -25,9 +25,10 @@ class Suture(SuturingEnv):
         info["progress"] = int(memory.phase) + int(last and info["is_success"])
         info["is_success"] = bool(last and info["is_success"])
         if last or memory.dwell < DWELL:
-            return
+            return False
         memory.phase += 1.0
         memory.dwell = memory.held = 0.0
         if int(memory.phase) == PULLOUT_PHASE:
             memory.release = float(RELEASE_STEPS)
         self._remember_tool()
+        return True
