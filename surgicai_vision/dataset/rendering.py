@@ -16,7 +16,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -87,15 +87,15 @@ def render_demos(
     request = {**options, "demos": demos_digest(paths)}
     if (out / names.META_FILE).exists():
         return _finished(out, request, started)
-    episodes = [read_demo(path) for path in paths]
-    config = _same_config(episodes, demos)
+    origins = [_Origin.of(read_demo(path)) for path in paths]
+    config = _same_config(origins, demos)
     jobs = [
-        Job("render-episode", {"demo": str(path.resolve()), **options}, (sha256_file(path),), len(demo), ("demo",))
-        for path, demo in zip(paths, episodes, strict=True)
+        Job("render-episode", {"demo": str(path.resolve()), **options}, (sha256_file(path),), row.length, ("demo",))
+        for path, row in zip(paths, origins, strict=True)
     ]
     with building(out) as (store, result):
         shards = run(jobs, store, workers=workers, progress=progress, unit="frames")
-        meta = _meta(request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], episodes)
+        meta = _meta(request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins)
         table = layout.features(views, size, depth, segmentation)
         assemble(shards, result, table, names.TASK_TEXTS[config.task], meta)
     return DatasetSummary(meta["frames"], meta["episodes"], time.monotonic() - started, meta["digest"])
@@ -114,17 +114,32 @@ def _finished(out: Path, request: Mapping[str, Any], started: float) -> DatasetS
     return DatasetSummary(meta["frames"], meta["episodes"], time.monotonic() - started, meta["digest"])
 
 
-def _same_config(episodes: Sequence[Demo], where: Path) -> TaskConfig:
+class _Origin(NamedTuple):
+    """What is kept of a demonstration while its pictures are made elsewhere."""
+
+    length: int
+    config: TaskConfig
+    scene_hash: str
+    source: str
+    code_version: str
+
+    @classmethod
+    def of(cls, demo: Demo) -> "_Origin":
+        """Return a demonstration's origin."""
+        return cls(len(demo), demo.config, demo.scene_hash, demo.source, demo.code_version)
+
+
+def _same_config(origins: Sequence[_Origin], where: Path) -> TaskConfig:
     """Return the one configuration of all episodes."""
-    first = episodes[0]
-    for index, demo in enumerate(episodes):
-        if demo.config != first.config or demo.scene_hash != first.scene_hash:
+    first = origins[0]
+    for index, origin in enumerate(origins):
+        if origin.config != first.config or origin.scene_hash != first.scene_hash:
             raise BadFile(f"{where}: episode {index} was made with another task or scene than episode 0.")
     return first.config
 
 
 def _meta(
-    request: Mapping[str, Any], config: TaskConfig, summaries: Sequence[Mapping[str, Any]], episodes: Sequence[Demo]
+    request: Mapping[str, Any], config: TaskConfig, summaries: Sequence[Mapping[str, Any]], origins: Sequence[_Origin]
 ) -> dict[str, Any]:
     """Return the content of `meta/surgicai.json`."""
     return {
@@ -140,10 +155,10 @@ def _meta(
         "parts": list(names.PARTS),
         "fps": names.FPS,
         "renderers": sorted({summary["renderer"] for summary in summaries}),
-        "scene_hash": episodes[0].scene_hash,
-        "sources": sorted({demo.source for demo in episodes}),
+        "scene_hash": origins[0].scene_hash,
+        "sources": sorted({origin.source for origin in origins}),
         "demos_digest": request["demos"],
-        "demos_code_versions": sorted({demo.code_version for demo in episodes}),
+        "demos_code_versions": sorted({origin.code_version for origin in origins}),
         "code_version": code_version(),
         "frames": sum(summary["frames"] for summary in summaries),
         "episodes": len(summaries),
