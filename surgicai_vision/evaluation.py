@@ -26,7 +26,7 @@ from surgicai_vision.statistics import clopper_pearson, mean_and_std
 BATCH = 8
 """Slots of a process: enough for the encoder to gain from batches."""
 
-FILM_FRAMES = 9
+FILM_FRAMES = 10
 """States kept of each episode, evenly spaced from the first to the last."""
 
 KINDS = ("time", "missed", "dropped", "error")

@@ -61,11 +61,11 @@ def coloured(frame: NDArray[Any], modality: str) -> Picture:
 
 
 def depth_range(frame: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the 1st and 99th percentile of the depths before `BEYOND` [m], between which colours are spread."""
+    """Return the 2nd and 90th percentile of the depths before `BEYOND` [m], between which colours are spread."""
     inside = frame[frame < BEYOND]
     if not inside.size:
         return 0.0, BEYOND
-    low, high = np.percentile(inside, (1, 99))
+    low, high = np.percentile(inside, (2, 90))
     return float(low), float(high)
 
 

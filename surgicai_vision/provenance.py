@@ -32,7 +32,9 @@ def command_line() -> str:
     """Return the command this process was started with, as a user would type it."""
     import shlex
 
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    program = Path(sys.argv[0])
+    started = "python -m surgicai_vision" if program.name == "__main__.py" else program.name
+    return f"{started} {shlex.join(sys.argv[1:])}".strip()
 
 
 def _version(package: str) -> str | None:

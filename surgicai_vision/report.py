@@ -20,7 +20,7 @@ from surgicai_vision.errors import BadFile, SurgicaiError
 from surgicai_vision.results import MARKER, find_evaluations, read_film, read_rows
 
 RUN_FILE = "run.json"
-PICTURE_SIZE = 224
+PICTURE_SIZE, STRIP_COLUMNS = 224, 5
 FLOW = ("demos", "dataset", "features", "policy", "evaluation")
 REFERENCES = ("expert", "random", "zero")
 """Policies that were not trained: what the trained ones stand beside."""
@@ -130,15 +130,16 @@ def _headline(results: list[Result]) -> str:
     shown = best_trained(results) or results[0]
     summary = shown.summary
     who = _policy_text(shown) + (f" on {_views_text(shown)}" if shown.about.get("views") else "")
-    verb = "solves" if summary["successes"] else "solves none:"
-    return f"{who} {verb} {summary['successes']} of {summary['episodes']} held-out starts of {summary['task']}"
+    if shown.trained and not summary["successes"]:
+        return f"No trained policy solves any of {summary['episodes']} held-out starts of {summary['task']}"
+    return f"{who} solves {summary['successes']} of {summary['episodes']} held-out starts of {summary['task']}"
 
 
 def _lead(results: list[Result]) -> str:
     """What the headline stands beside."""
-    best, parts = best_trained(results), []
-    shown = best or results[0]
-    parts.append(f"That is {_percent(shown.summary['success_rate'])}, 95 % interval {_interval(shown.summary)}.")
+    shown = best_trained(results) or results[0]
+    first = f"{_percent(shown.summary['success_rate'])}, 95 % interval {_interval(shown.summary)}."
+    parts = [f"That is {first}" if shown.summary["successes"] or not shown.trained else f"The best: {first}"]
     for result in results:
         if result is not shown:
             views = f" on {_views_text(result)}" if result.about.get("views") else ""
@@ -201,7 +202,7 @@ def _origin(results: list[Result], run: dict[str, Any]) -> dict[str, Any]:
         "facts": [(name, value) for name, value in facts if value],
         "weights": [_weights_row(result) for result in results if result.about.get("checkpoint")],
         "not_run": run.get("not_run", []),
-        "footer": f"Written on {datetime.date.today().isoformat()} from {len(results)} evaluations.",
+        "footer": f"Written on {datetime.date.today().isoformat()} from {len(results)} stored evaluations.",
     }
 
 
@@ -209,7 +210,7 @@ def _weights_row(result: Result) -> dict[str, Any]:
     checkpoint = result.about["checkpoint"]
     return {
         "policy": _policy_text(result) + (f" · {_views_text(result)}" if result.about.get("views") else ""),
-        "encoder": checkpoint.get("encoder") or "–",
+        "encoder": result.about["encoder"],
         "sha256": (checkpoint.get("weights_sha256") or "–")[:16],
         "seed": checkpoint.get("seed", "–"),
         "dataset": (checkpoint.get("dataset") or "–")[:16],
@@ -220,7 +221,12 @@ def _pictures(results: list[Result]) -> dict[str, Any]:
     """Views and film strips, or the reason why there are none."""
     colours = ["#" + bytes(colour).hex() for colour in pictures.PALETTE]
     parts = [{"name": name, "colour": colour} for name, colour in zip(names.PARTS, colours, strict=True)]
-    page: dict[str, Any] = {"picture_size": PICTURE_SIZE, "strip_columns": 9, "parts": parts, "no_pictures": ""}
+    page: dict[str, Any] = {
+        "picture_size": PICTURE_SIZE,
+        "strip_columns": STRIP_COLUMNS,
+        "parts": parts,
+        "no_pictures": "",
+    }
     success, failure = _choose(results, success=True), _choose(results, success=False)
     try:
         page["strips"] = [_strip(success, "success"), _strip(failure, "failure")]

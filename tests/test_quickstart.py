@@ -82,7 +82,7 @@ def test_a_checkpoint_is_not_evaluated_on_another_task(folder, monkeypatch, caps
 def test_quickstart_refuses_the_folder_of_another_plan(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main(["quickstart", "--config", "tiny.yaml", "--out", "out", "--episodes", "3"]) == 2
-    assert "another run" in capsys.readouterr().err
+    assert "other options" in capsys.readouterr().err
 
 
 def test_sweep_runs_reports_and_resumes(folder, monkeypatch, capsys):

@@ -137,7 +137,7 @@ def test_without_a_success_or_a_failure_the_page_says_so(tmp_path, painted):
     store(tmp_path, "zero", 0)
     text = report.write_report(tmp_path).read_text()
     assert "No episode of any policy was a success." in text
-    assert "0 of 20 held-out starts" in text
+    assert "zero solves 0 of 20 held-out starts" in text
     store(tmp_path, "zero", 20)
     assert "No episode of any policy was a failure." in report.write_report(tmp_path).read_text()
 
