@@ -202,7 +202,10 @@ class Encoder:
         """Return the network's answer as `pool` asks: vector, feature map or tokens."""
         if self.pool == "global":
             return self._network(pictures)
-        features = self._network.forward_features(pictures)  # type: ignore[operator]
+        take = getattr(self._network, "forward_features", None)
+        if take is None:
+            raise InputError(f"Encoder '{self.card.name}' offers its global feature only; use pool 'global'.")
+        features = take(pictures)
         if self.pool == "spatial":
             if features.ndim != 4:
                 raise InputError(f"Encoder '{self.card.name}' has tokens, no feature map; use pool 'tokens'.")

@@ -14,6 +14,7 @@ float32, which hides the order in which a matrix product was summed.
 
 import abc
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, final
@@ -34,11 +35,12 @@ class Inputs:
     """What a policy is fed.
 
     Attributes:
-        visual: length of each view's feature row, in the order of the views; empty without pictures.
+        visual: shape of each view's feature, in the order of the views: (dim,), (C, h, w) or (N, C);
+            rows are flattened; empty without pictures.
         proprioception: True when the active arm's tip pose and jaw (7) are fed too.
     """
 
-    visual: tuple[int, ...]
+    visual: tuple[tuple[int, ...], ...]
     proprioception: bool = True
 
     def __post_init__(self) -> None:
@@ -46,9 +48,14 @@ class Inputs:
             raise InputError("A policy needs at least one view or proprioception; this one would be blind.")
 
     @property
+    def features(self) -> int:
+        """Length of the views' rows side by side."""
+        return sum(math.prod(shape) for shape in self.visual)
+
+    @property
     def dim(self) -> int:
         """Length of the concatenated input."""
-        return sum(self.visual) + STATES * self.proprioception
+        return self.features + STATES * self.proprioception
 
 
 @dataclass(frozen=True)
@@ -58,12 +65,12 @@ class Plugin:
     Attributes:
         name: the name users give.
         recipe: frozen dataclass of its settings.
-        make: (recipe, length of each view's feature row) → untrained policy.
+        make: (recipe, shape of each view's feature) → untrained policy.
     """
 
     name: str
     recipe: type
-    make: Callable[[Any, tuple[int, ...]], "Policy"]
+    make: Callable[[Any, tuple[tuple[int, ...], ...]], "Policy"]
 
 
 class Policy(nn.Module, abc.ABC):
@@ -103,7 +110,7 @@ class Policy(nn.Module, abc.ABC):
         """Return actions for a batch of observations.
 
         Args:
-            features: (B, sum of `inputs.visual`) float32, the views' rows side by side; None without views.
+            features: (B, `inputs.features`) float32, the views' rows side by side; None without views.
             agent_pos: (B, 7) float32, x y z [m] roll pitch yaw [rad] jaw [rad] of the active tip in its base.
 
         Returns:
@@ -132,7 +139,7 @@ class Policy(nn.Module, abc.ABC):
         agent_pos = np.asarray(agent_pos)
         parts = [] if features is None else [np.asarray(features)]
         width = parts[0].shape[1:] if parts else (0,)
-        if width != (sum(self.inputs.visual),):
+        if width != (self.inputs.features,):
             raise InputError(f"The policy was trained on features of {self.inputs.visual}, got {width}.")
         if agent_pos.ndim != 2 or agent_pos.shape[1] != STATES or (parts and len(parts[0]) != len(agent_pos)):
             raise InputError(f"agent_pos must be (batch, {STATES}) with one row a picture, got {agent_pos.shape}.")

@@ -39,7 +39,7 @@ class EncoderRecord:
         weights_sha256: hash of its weights and buffers.
         pool: what was taken from it.
         fingerprint: hash of all its features depend on, compute type included.
-        dim: length of one view's feature row.
+        shape: shape of one feature before it is flattened.
     """
 
     name: str
@@ -47,7 +47,7 @@ class EncoderRecord:
     weights_sha256: str
     pool: str
     fingerprint: str
-    dim: int
+    shape: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,9 @@ class Checkpoint:
         return f"{self.policy}-{seen}"
 
     @property
-    def visual(self) -> tuple[int, ...]:
-        """Length of each view's feature row."""
-        return (self.encoder.dim,) * len(self.views) if self.encoder else ()
+    def visual(self) -> tuple[tuple[int, ...], ...]:
+        """Shape of each view's feature."""
+        return (self.encoder.shape,) * len(self.views) if self.encoder else ()
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint, tensors: Mapping[str, torch.Tensor]) -> Checkpoint:

@@ -91,6 +91,11 @@ class Features:
         return self.manifest["view"]
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one feature before it was flattened: (dim,), (C, h, w) or (N, C)."""
+        return tuple(self.manifest["shape"])
+
+    @property
     def dim(self) -> int:
         """Length of one row."""
         return self.rows.shape[1]

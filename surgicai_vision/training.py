@@ -204,7 +204,7 @@ class _Training:
         if len(self.rows) < 2:
             raise InputError(f"There are {len(self.rows)} frames to train on; at least 2 are needed.")
         torch.manual_seed(task.seed)
-        self.policy = task.policy.make(task.recipe, tuple(entry.dim for entry in task.features))
+        self.policy = task.policy.make(task.recipe, tuple(entry.shape for entry in task.features))
         if start is None:
             self._measure()
         else:
@@ -359,5 +359,5 @@ def _record(entry: Features) -> EncoderRecord:
         weights_sha256=manifest["weights_sha256"],
         pool=manifest["pool"],
         fingerprint=manifest["encoder_fingerprint"],
-        dim=manifest["dim"],
+        shape=entry.shape,
     )

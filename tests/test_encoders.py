@@ -163,6 +163,17 @@ def test_imagenet_lite_classifies() -> None:
     assert int(logits.argmax()) == 652, "not 'military uniform'"
 
 
+@pytest.mark.parametrize(("pool", "shape"), [("spatial", (2048, 7, 7)), ("tokens", (49, 2048))])
+def test_maps_and_tokens_average_to_the_global_feature(pool: str, shape: tuple[int, ...]) -> None:
+    encoder = load_encoder("random", pool=pool)
+    assert encoder.shape == shape and encoder.dim == 49 * 2048
+    features = encoder(hopper()).reshape(shape)
+    mean = features.mean(axis=(1, 2) if pool == "spatial" else 0)
+    whole = load_encoder("random")
+    np.testing.assert_allclose(mean, whole(hopper())[0], rtol=0.02, atol=0.05)
+    assert whole.fingerprint != encoder.fingerprint
+
+
 def test_unknown_encoder_suggests() -> None:
     with pytest.raises(UnknownName, match="Did you mean 'imagenet-lite'"):
         load_encoder("imagnet-lite")

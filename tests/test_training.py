@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from policies.bc import BC, BCRecipe
+from policies.bc import BC, BCRecipe, SpatialSoftmax
 from surgicai_vision import names
 from surgicai_vision.checkpoint import CARD, WEIGHTS, check_encoder, check_task, read_checkpoint
 from surgicai_vision.config import TaskConfig
@@ -54,6 +54,7 @@ def features_of(fake: FakeDataset, view: str = "back", **changes: object) -> Fea
         "encoder_fingerprint": "f",
         "weights_sha256": "w",
         "dim": DIM,
+        "shape": [DIM],
         **changes,
     }
     return Features(Path("."), manifest, fake.rows)
@@ -90,7 +91,7 @@ def test_recipes_refuse_unknown_keys_and_values(tmp_path: Path) -> None:
 
 
 def test_network_is_three_layers_each_preceded_by_batch_norm() -> None:
-    kinds = [type(layer).__name__ for layer in BC.make(BCRecipe(), (2048,)).layers]
+    kinds = [type(layer).__name__ for layer in BC.make(BCRecipe(), ((2048,),)).layers]
     assert kinds == ["BatchNorm1d", "Linear", "ReLU"] * 3 + ["Linear", "Tanh"]
 
 
@@ -182,9 +183,27 @@ def test_proprioception_alone_and_several_views(tmp_path: Path) -> None:
     assert load_policy(tmp_path / "none").act(None, state).shape == (4, 7)
     views = [features_of(dataset, "front"), features_of(dataset, "back")]
     checkpoint = train(dataset, views, BC, QUICK, out=tmp_path / "two")
-    assert checkpoint.views == ("front", "back") and checkpoint.visual == (DIM, DIM)
+    assert checkpoint.views == ("front", "back") and checkpoint.visual == ((DIM,), (DIM,))
     both = np.tile(dataset.rows[:4].astype(np.float32), 2)
     assert load_policy(tmp_path / "two").act(both, state).shape == (4, 7)
+
+
+@pytest.mark.parametrize(("shape", "width"), [([3, 2, 2], 64), ([4, 3], 3), ([12], 12)])
+def test_maps_and_tokens_pass_a_trained_layer(tmp_path: Path, shape: list[int], width: int) -> None:
+    dataset = FakeDataset()
+    checkpoint = train(dataset, [features_of(dataset, shape=shape)], BC, QUICK, out=tmp_path / "a")
+    policy = load_policy(tmp_path / "a")
+    assert checkpoint.visual == (tuple(shape),) and policy.heads[0].dim == width
+    state = dataset.columns()[names.STATE][:4]
+    assert policy.act(dataset.rows[:4].astype(np.float32), state).shape == (4, 7)
+
+
+def test_spatial_softmax_finds_the_bright_place() -> None:
+    head = SpatialSoftmax(1, 5, 5)
+    torch.nn.init.constant_(head.patterns.weight, 50.0)
+    picture = torch.zeros(1, 1, 5, 5)
+    picture[0, 0, 4, 0] = 1.0
+    np.testing.assert_allclose(head(picture.flatten(1)).detach()[0, :2], [-1, 1], atol=1e-5)
 
 
 def test_epoch_checkpoints_and_fine_tuning(tmp_path: Path) -> None:
@@ -214,7 +233,7 @@ def test_wrong_inputs_are_refused(tmp_path: Path) -> None:
 
 
 def test_policy_refuses_wrong_observations(tmp_path: Path) -> None:
-    policy = BC.make(QUICK, (DIM,))
+    policy = BC.make(QUICK, ((DIM,),))
     policy.eval()
     good, state = np.zeros((2, DIM), np.float32), np.zeros((2, 7), np.float32)
     for features, pose in ((None, state), (good[:, 1:], state), (good, state[:1]), (good, state[:, 1:])):
