@@ -210,7 +210,7 @@ class SuturingEnv(gymnasium.Env):
             "d_angle": turn,
             "contact": contact,
             "phase": int(memory.phase),
-            "holes_passed": int(memory.passed),
+            "holes_passed": min(int(memory.passed), 2),
             "needle_slip": self._slip(contact),
             "physics_error": diverged,
             "tip_path": memory.tip_path,
@@ -227,7 +227,7 @@ class SuturingEnv(gymnasium.Env):
         passed = self.simulation.memory.passed
         if demands.holes and not (passed >= demands.holes and passage.in_both(self.simulation, self.stitch.pair)):
             return False
-        return not demands.out or (passed == 2.0 and passage.is_out(self.simulation, self.stitch.pair))
+        return not demands.out or (passed == passage.OUT and passage.is_out(self.simulation, self.stitch.pair))
 
     def _slip(self, contact: bool) -> NDArray[np.float64]:
         """Return how far the needle moved in the active jaws since they first held it, (2,) [m, rad]."""

@@ -18,7 +18,7 @@ class Memory:
         phase: index of the present subtask in `names.SUBTASKS`.
         steps: control steps taken.
         tip_path: length of the active tip's way so far [m].
-        passed: hole planes passed by the tip in travel direction, 0..2.
+        passed: hole planes passed by the tip in travel direction, 0..2; 3 when the base is out as well.
         grasp_angle: needle angle of this episode's grasp goal [rad].
         held: 1 when `hold` is set.
         dwell: control steps the present subtask's success has held (whole procedure).

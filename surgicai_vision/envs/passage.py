@@ -1,8 +1,9 @@
 """Passage: did the needle go through both holes, in travel direction, through the openings?
 
-Two tests that must agree, so that tunnelling or teleporting never counts. In time: the tip crosses the entry's
-plane inwards, then the exit's plane outwards, each inside the opening, and never moves further than `JUMP` in
-one control step. In space: the needle's polyline crosses both planes inside the openings now.
+Tests that must agree, so that tunnelling or teleporting never counts. In time: the tip crosses the entry's plane
+inwards, then the exit's plane outwards, each inside the opening; from then on the needle stays in the exit's
+opening until the whole of it is beyond; and the tip never moves further than `JUMP` in one control step. In space:
+the needle's polyline crosses both planes inside the openings now.
 """
 
 import math
@@ -15,6 +16,8 @@ from surgicai_vision.scene.holes import OPENING, Hole, HolePair, crossing, insid
 
 JUMP = 0.004
 """Furthest the tip can move in one control step [m]: eight times the default step size."""
+OUT = 3.0
+"""`Memory.passed` of a needle whose base has left the exit too."""
 
 Point = tuple[float, float, float]
 
@@ -25,16 +28,19 @@ def watch(simulation: Simulation, memory: Memory, pair: HolePair) -> None:
     before = (memory.tip_x, memory.tip_y, memory.tip_z)
     memory.tip_x, memory.tip_y, memory.tip_z = now
     if math.dist(now, before) > JUMP:
-        return
-    if memory.passed == 0.0 and _passes(before, now, pair.entry, inward=True):
+        memory.passed = memory.passed if memory.passed == OUT else 0.0
+    elif memory.passed == 0.0 and _passes(before, now, pair.entry, inward=True):
         memory.passed = 1.0
     elif memory.passed == 1.0:
         if _passes(before, now, pair.exit, inward=False):
             memory.passed = 2.0
         elif _passes(before, now, pair.entry, inward=False):
             memory.passed = 0.0
-    elif memory.passed == 2.0 and _passes(before, now, pair.exit, inward=True):
-        memory.passed = 1.0
+    elif memory.passed >= 2.0:
+        if _passes(before, now, pair.exit, inward=True):
+            memory.passed = 1.0
+        elif memory.passed == 2.0 and not leaves(simulation, pair.exit):
+            memory.passed = OUT if is_out(simulation, pair) else 0.0
 
 
 def remember_tip(simulation: Simulation, memory: Memory) -> None:
@@ -47,6 +53,26 @@ def in_both(simulation: Simulation, pair: HolePair) -> bool:
     pose = poses.square(simulation.needle())
     line = needle.polyline() @ pose[:3, :3].T + pose[:3, 3]
     return inside(crossing(line, pair.entry, inward=True)) and inside(crossing(line, pair.exit, inward=False))
+
+
+def leaves(simulation: Simulation, hole: Hole) -> bool:
+    """Say whether the needle crosses the hole's plane outwards inside the opening now.
+
+    The same as `crossing` on a fine polyline, in closed form for every control step: along the arc the height over
+    the plane is a + R (c sin θ - b cos θ), and it rises through 0 at one angle only.
+    """
+    cosine, sine = math.cos(hole.tilt), math.sin(hole.tilt)
+    x, y, z = hole.centre
+    px, _, pz, r0, r1, _, _, _, _, r6, r7, _ = simulation.needle()
+    a, b, c = sine * (px - x) + cosine * (pz - z), sine * r0 + cosine * r6, sine * r1 + cosine * r7
+    reach = needle.RADIUS * math.hypot(b, c)
+    if abs(a) >= reach:
+        return False
+    angle = math.remainder(math.atan2(b, c) - math.asin(a / reach), 2 * math.pi)
+    if not 0.0 <= angle <= needle.TIP_ANGLE:
+        return False
+    qx, qy, qz = simulation.needle_point(angle)
+    return abs(cosine * (qx - x) - sine * (qz - z)) < OPENING / 2 and abs(qy - y) < OPENING / 2
 
 
 def is_out(simulation: Simulation, pair: HolePair) -> bool:

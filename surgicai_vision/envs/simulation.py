@@ -30,6 +30,8 @@ from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
 
 SUBSTEPS = 10
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+CLOCK_START = 1.0
+"""Time at the start of an episode [s]: not 0, so that MuJoCo's own reset to 0 shows in the first step too."""
 RELEASE_STEPS, RELEASE_JAW, RELEASE_SHIFT = 40, 0.1, 0.001
 """How PSM2 lets go after the handoff: jaw opened by 0.1 rad a step to 0.5, then drawn back 1 mm a step."""
 
@@ -59,6 +61,7 @@ class Simulation:
     def reset(self) -> None:
         """Put everything at home: both arms at their start, the needle flat at its home."""
         mujoco.mj_resetData(self.model, self.data)
+        self.data.time = CLOCK_START
         self.memory = Memory()
         for arm in names.ARMS:
             self.pose_arm(arm, poses.flat(kinematics.start_in_base(arm)), kinematics.STARTS[arm][6])
@@ -115,7 +118,7 @@ class Simulation:
         """Let the physics run under the present commands for `steps` physics steps."""
         if steps:
             mujoco.mj_step(self.model, self.data, steps)
-        self.data.time = 0.0
+        self.data.time = CLOCK_START
         self.refresh()
 
     # -- moving ---------------------------------------------------------------------------------------------------
