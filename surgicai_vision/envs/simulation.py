@@ -158,7 +158,7 @@ class Simulation:
     # -- measuring ------------------------------------------------------------------------------------------------
 
     def _body(self, index: int) -> Pose:
-        return (*self._xpos[index].tolist(), *self._xmat[index].tolist())  # type: ignore[return-value]  # 3 + 9
+        return (*self._xpos[index].tolist(), *self._xmat[index].tolist())
 
     def tip(self, arm: str) -> Pose:
         """Return T_world_tip of an arm, measured."""
@@ -166,12 +166,12 @@ class Simulation:
 
     def grasp(self, arm: str) -> Pose:
         """Return T_world_grasp: the tip's frame shifted to the jaws' grasp point."""
-        x, y, z, *rotation = self.tip(arm)
+        tip = self.tip(arm)
         return (
-            x + GRASP_DEPTH * rotation[2],
-            y + GRASP_DEPTH * rotation[5],
-            z + GRASP_DEPTH * rotation[8],
-            *rotation,
+            tip[0] + GRASP_DEPTH * tip[5],
+            tip[1] + GRASP_DEPTH * tip[8],
+            tip[2] + GRASP_DEPTH * tip[11],
+            *tip[3:],
         )
 
     def needle(self) -> Pose:
