@@ -9,6 +9,7 @@ assembled and renamed whole to `out`. Killed anywhere, the same command continue
 Frames and their order do not depend on the number of workers.
 """
 
+import atexit
 import functools
 import json
 import shutil
@@ -171,6 +172,8 @@ def _env(config: str, views: tuple[str, ...], size: int, depth: bool, segmentati
     """Return this process's environment; the one before is closed with its GL context."""
     import surgicai_vision.envs as envs
 
+    # The GL context must go before the interpreter does.
+    atexit.register(_env.cache_clear)
     return envs.make(
         from_mapping(TaskConfig, json.loads(config)),
         obs_type="pixels_agent_pos",
