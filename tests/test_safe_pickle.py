@@ -159,7 +159,9 @@ def test_bombs_are_refused():
     deep = b"\x80\x04" + b"]" * 10_000 + b"a" * 9_999 + b"."
     with pytest.raises(BadFile, match="nested deeper"):
         unpickle(deep, "x")
-    doubled = assembled(b"]\x94", b"".join(b"]\x94(" + b"h" + bytes([i]) + b"h" + bytes([i]) + b"e" for i in range(60)))
+    doubled = assembled(
+        b"]\x94", b"".join(b"]\x94(" + b"h" + bytes([i]) + b"h" + bytes([i]) + b"e" for i in range(60))
+    )
     with pytest.raises(BadFile, match="nested deeper"):
         unpickle(doubled, "x")
     itself = b"\x80\x04]\x94h\x00a."
