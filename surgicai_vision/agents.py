@@ -101,11 +101,14 @@ class PolicyAgent:
         """Return the policy's actions (n, 7)."""
         with one_thread():
             poses = np.stack([_agent_pos(o, env) for o, env in zip(observations, envs, strict=True)])
-            if self.cameras:
-                views = [np.stack([o["pixels"][view] for o in observations]) for view in self.cameras]
-                features = np.concatenate([self._encoder(frames) for frames in views], axis=1)
-                return self._actions(features, poses)
-            return self._actions(None, poses)
+            return self._actions(self._features(observations), poses)
+
+    def _features(self, observations: Sequence[Any]) -> NDArray[np.float32] | None:
+        """Encode all views of all slots in one call, (n, views · dim): an encoder computes whole batches."""
+        if not self.cameras:
+            return None
+        frames = np.stack([o["pixels"][view] for o in observations for view in self.cameras])
+        return np.asarray(self._encoder(frames), np.float32).reshape(len(observations), -1)
 
     def _actions(self, features: NDArray[np.float32] | None, poses: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.asarray(self._policy.act(features, poses), np.float32)

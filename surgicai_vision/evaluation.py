@@ -24,7 +24,7 @@ from surgicai_vision.errors import InputError, PhysicsError, SurgicaiError
 from surgicai_vision.statistics import clopper_pearson, mean_and_std
 
 BATCH = 8
-"""Slots of a process: enough for the encoder to gain from batches."""
+"""Slots of a process: what an encoder computes at once (`encoders.base`)."""
 
 FILM_FRAMES = 10
 """States kept of each episode, evenly spaced from the first to the last."""

@@ -158,7 +158,7 @@ class Sample:
 
     episodes: int = option(5, "episodes", check=positive)
     view: tuple[str, ...] = option(("back",), "views", check=many_of("view", names.CAMERAS))
-    scene: SceneConfig | None = config_only()  # noqa: RUF009 (declares a field)
+    scene: SceneConfig | None = config_only()
 
 
 def write(path, text):
