@@ -22,6 +22,8 @@ Matrix = NDArray[np.float64]
 
 SETTLE = 60
 """Physics steps (2 ms) a start state settles."""
+REST_SPEED, REST_TURN = 0.010, 1.0
+"""A held needle faster than this [m/s, rad/s] is slipping out: one closing of the jaws in 150 does that."""
 CLOSED_JAW = (needle.BODY_RADIUS - PAD_OFFSET) / GRASP_DEPTH
 """Finger angle [rad] at which the pads touch the needle."""
 GRASP_ANGLES = (math.radians(5.0), math.radians(20.0))
@@ -85,7 +87,14 @@ def hold_needle(
     now = simulation.needle()
     wanted = poses.flat(needle_pose)
     near = poses.distance(now, wanted) < 0.002 and poses.angle(now, wanted) < turn
-    return near and simulation.holds(arm)
+    return near and simulation.holds(arm) and _at_rest(simulation)
+
+
+def _at_rest(simulation: Simulation) -> bool:
+    """Say whether the needle has stopped, not slipping out of the jaws."""
+    first = simulation.model.joint("needle").dofadr[0]
+    velocity = simulation.data.qvel[first : first + 6]
+    return bool(np.linalg.norm(velocity[:3]) < REST_SPEED and np.linalg.norm(velocity[3:]) < REST_TURN)
 
 
 def draw_rotation(rng: np.random.Generator, angle: float) -> Matrix:
