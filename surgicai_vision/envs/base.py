@@ -20,23 +20,22 @@ from numpy.typing import NDArray
 
 from surgicai_vision import names
 from surgicai_vision.config import TaskConfig
-from surgicai_vision.envs import observation, passage, poses
+from surgicai_vision.envs import observation, passage
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.observation import ObservationConfig
+from surgicai_vision.envs.pictures import Pictures
 from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
 from surgicai_vision.envs.subtask import Subtask
+from surgicai_vision.envs.success import Info, Target, measure
 from surgicai_vision.errors import InputError, PhysicsError
 from surgicai_vision.scene import build_scene
-from surgicai_vision.scene.kinematics import Pose
 
 START_DRAWS = 60
 """Draws of a start state before giving up."""
 RENDER_CAMERA, RENDER_SIZE = "front", (480, 640)
 
 Observation = NDArray[np.float32] | dict[str, Any]
-Info = dict[str, Any]
-Target = tuple[Pose, Pose]
 
 
 class SuturingEnv(gymnasium.Env):
@@ -71,7 +70,7 @@ class SuturingEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
         self._subtasks = subtasks
         self._step_size = StepSize.of(config.step)
-        self._renderer: Any = None
+        self._pictures = Pictures(self.simulation.model)
 
     # -- gymnasium ------------------------------------------------------------------------------------------------
 
@@ -93,32 +92,31 @@ class SuturingEnv(gymnasium.Env):
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
         """Take one control step of 20 ms."""
-        simulation, memory = self.simulation, self.simulation.memory
-        values = self._checked(action)
-        if not simulation.advance(self.subtask.arm, values, self._step_size):
+        simulation, memory, subtask = self.simulation, self.simulation.memory, self.subtask
+        if not simulation.advance(subtask.arm, self._checked(action), self._step_size):
             memory.diverged = 1.0
+        simulation.keep_reads()
         memory.steps += 1.0
-        self._add_path()
+        self._add_path(subtask.arm)
         passage.watch(simulation, memory, self.stitch.pair)
-        target = self._target()
-        info = self._measure(target)
+        target = subtask.target(simulation, self.stitch)
+        info = measure(simulation, subtask, self.stitch, self.config.tolerance, target)
         if self._progress(info):
             target = self._target()
-        terminated = bool(info["is_success"] or info["physics_error"])
-        truncated = memory.steps >= self.config.max_steps
-        return self._observe(target), self.reward(info), terminated, truncated, info
+        terminated = info["is_success"] or info["physics_error"]
+        seen = self._observe(target)
+        simulation.forget_reads()
+        return seen, self.reward(info), terminated, memory.steps >= self.config.max_steps, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the front camera's picture, (480, 640, 3) uint8, when `render_mode` is "rgb_array"."""
         if self.render_mode is None:
             return None
-        return self._pictures(RENDER_SIZE).render(self.data, RENDER_CAMERA, names.RGB)
+        return self._pictures.picture(self.data, RENDER_CAMERA, RENDER_SIZE)
 
     def close(self) -> None:
         """Free the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._pictures.close()
 
     # -- what it is -----------------------------------------------------------------------------------------------
 
@@ -192,55 +190,10 @@ class SuturingEnv(gymnasium.Env):
 
     def measure(self) -> Info:
         """Return the info dict of the present, measured state."""
-        return self._measure(self._target())
+        return measure(self.simulation, self.subtask, self.stitch, self.config.tolerance, self._target())
 
     def _target(self) -> Target:
-        """Return the measured frame that success is judged by, and its goal, in world."""
         return self.subtask.target(self.simulation, self.stitch)
-
-    def _measure(self, target: Target) -> Info:
-        simulation, memory = self.simulation, self.simulation.memory
-        achieved, desired = target
-        contact = simulation.holds(self.subtask.arm)
-        distance, turn = poses.distance(achieved, desired), poses.angle(achieved, desired)
-        diverged = memory.diverged > 0.0
-        return {
-            "is_success": not diverged and self._meets(distance, turn, contact),
-            "d_trans": distance,
-            "d_angle": turn,
-            "contact": contact,
-            "phase": int(memory.phase),
-            "holes_passed": min(int(memory.passed), 2),
-            "needle_slip": self._slip(contact),
-            "physics_error": diverged,
-            "tip_path": memory.tip_path,
-        }
-
-    def _meets(self, distance: float, turn: float, contact: bool) -> bool:
-        """Say whether the present subtask's success conditions hold."""
-        preset = self.config.tolerance
-        tolerance, demands = self.subtask.tolerances[preset], self.subtask.demands[preset]
-        if distance > tolerance.distance or turn > tolerance.angle:
-            return False
-        if demands.contact and not contact:
-            return False
-        passed = self.simulation.memory.passed
-        if demands.holes and not (passed >= demands.holes and passage.in_both(self.simulation, self.stitch.pair)):
-            return False
-        return not demands.out or (passed == passage.OUT and passage.is_out(self.simulation, self.stitch.pair))
-
-    def _slip(self, contact: bool) -> NDArray[np.float64]:
-        """Return how far the needle moved in the active jaws since they first held it, (2,) [m, rad]."""
-        simulation, memory = self.simulation, self.simulation.memory
-        if not contact:
-            memory.held = 0.0
-            return np.zeros(2)
-        in_jaws = poses.relative(simulation.grasp(self.subtask.arm), simulation.needle())
-        if memory.held == 0.0:
-            memory.held, memory.hold = 1.0, in_jaws
-            return np.zeros(2)
-        grasped = poses.inverse_origin(memory.hold)
-        return np.array([poses.reach(in_jaws, grasped), poses.angle(in_jaws, memory.hold)])
 
     def reward(self, info: Info) -> float:
         """Return the reward of a measurement."""
@@ -283,39 +236,15 @@ class SuturingEnv(gymnasium.Env):
                 "achieved_goal": observation.goal_vector(achieved, jaw),
                 "desired_goal": observation.goal_vector(desired, 0.0),
             }
-        return self._look()
-
-    def _state_vector(self, target: Target) -> NDArray[np.float32]:
-        simulation, arm = self.simulation, self.subtask.arm
-        achieved, desired = target
-        tip = simulation.tip(arm)
-        goal = poses.compose(desired, poses.relative(achieved, tip))
-        now, wanted = simulation.to_base(arm, tip), simulation.to_base(arm, goal)
-        return observation.state_vector(arm, now, wanted, simulation.jaw(arm))
-
-    def _look(self) -> dict[str, Any]:
-        view, pictures = self.view, self._pictures(self.view.image_size)
-        groups = {"pixels": names.RGB}
-        if view.depth:
-            groups["depth"] = names.DEPTH
-        if view.segmentation:
-            groups["segmentation"] = names.SEGMENTATION
-        seen: dict[str, Any] = {
-            group: {camera: pictures.render(self.data, camera, modality) for camera in view.cameras}
-            for group, modality in groups.items()
-        }
-        if view.obs_type == "pixels_agent_pos":
+        seen = self._pictures.look(self.data, self.view)
+        if self.view.obs_type == "pixels_agent_pos":
             seen["agent_pos"] = self.agent_pos()
         return seen
 
-    def _pictures(self, size: tuple[int, int]) -> Any:
-        """Return the renderer of this process for `size`; made on first use, in the worker."""
-        from surgicai_vision.scene.rendering import FrameRenderer
-
-        if self._renderer is None or (self._renderer.height, self._renderer.width) != size:
-            self.close()
-            self._renderer = FrameRenderer(self.model, *size)
-        return self._renderer
+    def _state_vector(self, target: Target) -> NDArray[np.float32]:
+        simulation, arm = self.simulation, self.subtask.arm
+        tip, jaw = simulation.tip(arm), simulation.jaw(arm)
+        return observation.state_vector_in_world(arm, simulation.bases[arm], tip, *target, jaw)
 
     # -- progress -------------------------------------------------------------------------------------------------
 
@@ -330,9 +259,9 @@ class SuturingEnv(gymnasium.Env):
         memory = self.simulation.memory
         memory.tool_x, memory.tool_y, memory.tool_z = self.simulation.tip(self.subtask.arm)[:3]
 
-    def _add_path(self) -> None:
+    def _add_path(self, arm: str) -> None:
         memory = self.simulation.memory
-        x, y, z = self.simulation.tip(self.subtask.arm)[:3]
+        x, y, z = self.simulation.tip(arm)[:3]
         memory.tip_path += ((x - memory.tool_x) ** 2 + (y - memory.tool_y) ** 2 + (z - memory.tool_z) ** 2) ** 0.5
         memory.tool_x, memory.tool_y, memory.tool_z = x, y, z
 

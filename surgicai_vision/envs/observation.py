@@ -18,11 +18,14 @@ from math import pi
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from surgicai_vision import names
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.scene.kinematics import STARTS, Pose
 from surgicai_vision.scene.rotations import matrix_to_rotvec_flat, matrix_to_rpy_flat, multiply_flat
+
+Rotation = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,57 @@ def state_vector(arm: str, now: Pose, goal: Pose, jaw: float) -> np.ndarray:
     turn = multiply_flat(goal[3:], (r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
     error = [b - a for a, b in zip(current[:3], wanted[:3], strict=True)]
     return np.array([*current, *wanted, *error, *matrix_to_rotvec_flat(turn), -jaw], dtype=np.float32)
+
+
+def state_vector_in_world(
+    arm: str, base: Pose, tip: Pose, achieved: Pose, desired: Pose, jaw: float
+) -> NDArray[np.float32]:
+    """Return what `state_vector` does, from poses in world and with a third of the multiplications.
+
+    Args:
+        arm: the active arm.
+        base: T_world_base.
+        tip: T_world_tip; the goal is where the tip is when `achieved`, moving with it, is at `desired`.
+        achieved: the frame that success is judged by.
+        desired: where it should be.
+        jaw: [rad].
+    """
+    b0, b1, b2, b3, b4, b5, b6, b7, b8 = base[3:]
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = achieved[3:]
+    d0, d1, d2, d3, d4, d5, d6, d7, d8 = turn = multiply_flat(desired[3:], (a0, a3, a6, a1, a4, a7, a2, a5, a8))
+    tx, ty, tz = tip[:3]
+    x, y, z = tx - base[0], ty - base[1], tz - base[2]
+    px, py, pz = b0 * x + b3 * y + b6 * z, b1 * x + b4 * y + b7 * z, b2 * x + b5 * y + b8 * z
+    x, y, z = tx - achieved[0], ty - achieved[1], tz - achieved[2]
+    ex = desired[0] + d0 * x + d1 * y + d2 * z - tx
+    ey = desired[1] + d3 * x + d4 * y + d5 * z - ty
+    ez = desired[2] + d6 * x + d7 * y + d8 * z - tz
+    ex, ey, ez = b0 * ex + b3 * ey + b6 * ez, b1 * ex + b4 * ey + b7 * ez, b2 * ex + b5 * ey + b8 * ez
+    vx, vy, vz = matrix_to_rotvec_flat(turn)
+    home = STARTS[arm][5] - pi
+    roll, pitch, yaw = _rpy_in_base(base, tip[3:])
+    goal_roll, goal_pitch, goal_yaw = _rpy_in_base(base, multiply_flat(turn, tip[3:]))
+    values = (
+        px * 100.0, py * 100.0, pz * 100.0, roll, pitch, home + (yaw - home) % (2 * pi), jaw,
+        (px + ex) * 100.0, (py + ey) * 100.0, (pz + ez) * 100.0,
+        goal_roll, goal_pitch, home + (goal_yaw - home) % (2 * pi), 0.0,
+        ex * 100.0, ey * 100.0, ez * 100.0,
+        b0 * vx + b3 * vy + b6 * vz, b1 * vx + b4 * vy + b7 * vz, b2 * vx + b5 * vy + b8 * vz, -jaw,
+    )  # fmt: skip
+    return np.array(values, dtype=np.float32)
+
+
+def _rpy_in_base(base: Pose, rotation: Rotation) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw of a rotation in world as seen from the base."""
+    _, _, _, b0, b1, b2, b3, b4, b5, b6, b7, b8 = base
+    r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation
+    return matrix_to_rpy_flat(
+        (
+            b0 * r0 + b3 * r3 + b6 * r6, 0.0, 0.0,
+            b1 * r0 + b4 * r3 + b7 * r6, b1 * r1 + b4 * r4 + b7 * r7, b1 * r2 + b4 * r5 + b7 * r8,
+            b2 * r0 + b5 * r3 + b8 * r6, b2 * r1 + b5 * r4 + b8 * r7, b2 * r2 + b5 * r5 + b8 * r8,
+        )
+    )  # fmt: skip
 
 
 def goal_vector(pose: Pose, jaw: float) -> np.ndarray:

@@ -54,15 +54,11 @@ class Subtask(ABC):
     demands: ClassVar[Mapping[str, Demands]]
     """Preset → what else success needs."""
 
-    @property
-    def arm(self) -> str:
-        """Return the arm that moves."""
-        return names.ACTIVE_ARM[self.name]
-
-    @property
-    def phase(self) -> int:
-        """Return the subtask's index in the procedure."""
-        return names.SUBTASKS.index(self.name)
+    def __init__(self) -> None:
+        self.arm = names.ACTIVE_ARM[self.name]
+        """The arm that moves."""
+        self.phase = names.SUBTASKS.index(self.name)
+        """The subtask's index in the procedure."""
 
     @abstractmethod
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
