@@ -60,7 +60,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
 def _subject(options: Options) -> Any:
     """Say who acts in which task: a baseline, or a checkpoint in the task it was trained for."""
-    from surgicai_vision import cells
+    from surgicai_vision import cells, lerobot_agent
 
     folder = Path(options.policy)
     if options.policy in cells.BASELINES:
@@ -68,7 +68,11 @@ def _subject(options: Options) -> Any:
         return cells.baseline_subject(options.policy, config)
     if not folder.exists() and folder.parent == Path():
         raise UnknownName("policy or checkpoint folder", options.policy, cells.BASELINES)
-    subject = cells.checkpoint_subject(folder, options.weights)
+    lerobot = lerobot_agent.find(folder)
+    if lerobot:
+        subject = lerobot_agent.subject(lerobot, options.task, options.weights)
+    else:
+        subject = cells.checkpoint_subject(folder, options.weights)
     trained_for = subject.config.task
     if options.task not in (None, trained_for):
         raise InputError(f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out.")

@@ -1,0 +1,118 @@
+"""`surgicai_bc`: behaviour cloning on frozen features, as a LeRobot policy: its settings."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import FeatureType, NormalizationMode
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.optim import AdamConfig
+from lerobot.utils.constants import OBS_STATE
+
+from surgicai_vision import names, registry
+from surgicai_vision.errors import InputError, check_name
+
+
+@PreTrainedConfig.register_subclass("surgicai_bc")
+@dataclass
+class SurgicaiBcConfig(PreTrainedConfig):
+    """Settings of `surgicai_bc`; the defaults are the recipe "paper" (configs/recipes/paper.yaml).
+
+    Attributes:
+        encoder: frozen encoder of the pictures; null sees no picture.
+        encoder_weights: file with its pretrained weights, where it needs one that is not at hand.
+        encoder_pool: "global", "spatial" or "tokens".
+        encoder_sha256: hash of the encoder's weights; written in training, verified afterwards.
+        encoder_identity: hash of weights, preprocessing and pool; written in training, verified afterwards.
+        views: cameras; empty takes all the dataset has.
+        hidden: width of each hidden layer.
+        batch_norm: put BatchNorm before each hidden layer.
+        proprioception: feed the tip's pose and the jaw too.
+        learning_rate: Adam's.
+        push_to_hub: push the trained policy; off, unlike LeRobot's own policies.
+    """
+
+    encoder: str | None = "imagenet-lite"
+    encoder_weights: str | None = None
+    encoder_pool: str = "global"
+    encoder_sha256: str = ""
+    encoder_identity: str = ""
+    views: list[str] = field(default_factory=list)
+    hidden: list[int] = field(default_factory=lambda: [256, 256, 256])
+    batch_norm: bool = True
+    proprioception: bool = True
+    learning_rate: float = 1e-3
+    push_to_hub: bool = False
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            # The encoder normalises pictures, BatchNorm the features; actions are within [-1, 1] already.
+            "VISUAL": NormalizationMode.IDENTITY,
+            "ENV": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.MEAN_STD,
+            "ACTION": NormalizationMode.IDENTITY,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.encoder:
+            registry.check_encoder_name(self.encoder)
+        for view in self.views:
+            check_name("view", view, names.CAMERAS)
+        self.recipe()
+
+    def recipe(self) -> Any:
+        """Return the same settings as a recipe of `bc`."""
+        changes = {
+            "hidden": self.hidden,
+            "batch_norm": self.batch_norm,
+            "proprioception": self.proprioception,
+            "learning_rate": self.learning_rate,
+        }
+        return registry.load_recipe("bc", "paper", changes)
+
+    def validate_features(self) -> None:
+        """Keep the inputs this policy takes and drop the rest (depth, segmentation, other views).
+
+        Raises:
+            InputError: the dataset or env lacks one of them, or acts otherwise than we do.
+        """
+        given = self.input_features or {}
+        kept = {key: given[key] for key in self._wanted(given) if key in given}
+        missing = [key for key in self._wanted(given) if key not in given]
+        if missing or not kept:
+            raise InputError(f"surgicai_bc needs {', '.join(missing) or 'a view'}; given: {', '.join(given)}.")
+        action = self.action_feature
+        if action is None or tuple(action.shape) != (len(names.ACTION_NAMES),):
+            raise InputError(f"surgicai_bc acts in {len(names.ACTION_NAMES)} values; given: {action}.")
+        self.input_features = kept
+
+    def _wanted(self, given: dict[str, Any]) -> list[str]:
+        """Return the keys of the inputs, pictures first."""
+        state = [OBS_STATE] if self.proprioception else []
+        if not self.encoder:
+            return state
+        if not self.views:
+            visual = [key for key, feature in given.items() if feature.type is FeatureType.VISUAL]
+            self.views = [view for view in names.CAMERAS if names.image_key(view) in visual]
+            if not self.views:
+                raise InputError(f"surgicai_bc found no view of {', '.join(names.CAMERAS)} in {', '.join(given)}.")
+        return [*map(names.image_key, self.views), *state]
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """Return None: the present observation alone."""
+
+    @property
+    def action_delta_indices(self) -> None:
+        """Return None: one action."""
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """Return None: no rewards."""
+
+    def get_optimizer_preset(self) -> AdamConfig:
+        """Return the paper's Adam, without clipping."""
+        return AdamConfig(lr=self.learning_rate, grad_clip_norm=0.0)
+
+    def get_scheduler_preset(self) -> None:
+        """Return None: the rate is constant."""

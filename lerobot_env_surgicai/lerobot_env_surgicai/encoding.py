@@ -1,0 +1,48 @@
+"""EncodeViews: the step between env and policy that turns pictures into frozen features."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
+from lerobot.utils.constants import OBS_ENV_STATE
+
+from lerobot_env_surgicai.pictures import check_identity, encode, load_encoder
+from surgicai_vision import names
+
+
+@ProcessorStepRegistry.register("surgicai_encode_views")
+@dataclass
+class EncodeViews(ObservationProcessorStep):
+    """Replace the views' pictures by their features, `observation.environment_state` (B, views × dim).
+
+    Attributes:
+        encoder: the encoder's name.
+        views: cameras, in the order of the features.
+        weights: file with its pretrained weights.
+        sha256: hash its weights must have; empty for any.
+    """
+
+    encoder: str
+    views: tuple[str, ...]
+    weights: str | None = None
+    sha256: str = ""
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Return the observation with features in place of pictures."""
+        encoder = load_encoder(self.encoder, self.weights, "global")
+        check_identity(encoder, self.sha256, "", "The policy")
+        features = torch.from_numpy(encode(encoder, observation, self.views))
+        pictures = {names.image_key(view) for view in self.views}
+        return {**{key: value for key, value in observation.items() if key not in pictures}, OBS_ENV_STATE: features}
+
+    def get_config(self) -> dict[str, Any]:
+        """Return the arguments of this step."""
+        return {"encoder": self.encoder, "views": self.views, "weights": self.weights, "sha256": self.sha256}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        """Return the features as they are: the env's table lists what comes out."""
+        return features

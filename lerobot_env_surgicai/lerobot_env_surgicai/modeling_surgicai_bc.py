@@ -1,0 +1,119 @@
+"""`surgicai_bc`: behaviour cloning on frozen features, as a LeRobot policy.
+
+The network is the `bc` of surgicai-vision. The encoder is no part of the module: it is never saved, trained or put
+into training mode; its name and hashes stand in config.json and are verified whenever the policy is loaded.
+"""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_STATE
+from safetensors import SafetensorError
+from torch import Tensor
+
+from lerobot_env_surgicai.configuration_surgicai_bc import SurgicaiBcConfig
+from lerobot_env_surgicai.pictures import check_identity, encode, identity, load_encoder
+from surgicai_vision import names, registry
+from surgicai_vision.errors import BadFile, InputError
+
+
+class SurgicaiBcPolicy(PreTrainedPolicy):
+    """Behaviour cloning: frozen features and the tip's pose in, one action out.
+
+    Attributes:
+        memoryless: True: an action depends on the present observation alone, so episodes may share a batch.
+    """
+
+    config_class = SurgicaiBcConfig
+    name = "surgicai_bc"
+    memoryless = True
+
+    def __init__(self, config: SurgicaiBcConfig, **_: Any):
+        super().__init__(config)
+        config.validate_features()
+        self._encoder: Any = None
+        visual: tuple[tuple[int, ...], ...] = ()
+        if config.encoder:
+            self._encoder = load_encoder(config.encoder, config.encoder_weights, config.encoder_pool)
+            check_identity(self._encoder, config.encoder_sha256, config.encoder_identity, "surgicai_bc")
+            config.encoder_sha256, config.encoder_identity = self._encoder.weights_sha256, identity(self._encoder)
+            visual = (self._encoder.shape,) * len(config.views)
+        self.network = registry.policy_plugin("bc").make(config.recipe(), visual)
+        self._acting: Any = None
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, *, strict: bool = True, **arguments: Any) -> Any:
+        """Load a policy; unlike LeRobot's own, a tensor that is missing or unexpected is an error.
+
+        Raises:
+            BadFile: the weights are damaged or of another network.
+            InputError: the encoder at hand is not the one it was trained on.
+        """
+        try:
+            return super().from_pretrained(pretrained_name_or_path, strict=strict, **arguments)
+        except (RuntimeError, SafetensorError) as error:
+            reason = (str(error).splitlines() or [""])[0]
+            raise BadFile(f"{pretrained_name_or_path} holds no whole weights of surgicai_bc ({reason}).") from None
+
+    def get_optim_params(self) -> Any:
+        """Return the parameters that are trained: the network's."""
+        return self.network.parameters()
+
+    def reset(self) -> None:
+        """Forget nothing: there is no memory."""
+
+    def train(self, mode: bool = True) -> "SurgicaiBcPolicy":
+        """Switch to training or evaluation; the encoder stays as it is."""
+        self._acting = None
+        super().train(mode)
+        return self
+
+    def load_state_dict(self, *arguments: Any, **options: Any) -> Any:
+        """Load weights."""
+        self._acting = None
+        return super().load_state_dict(*arguments, **options)
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Return the mean squared error of the actions, and the same as a number."""
+        parts = [batch[OBS_STATE]] if self.config.proprioception else []
+        features = self._features(batch)
+        if features is not None:
+            parts.insert(0, torch.from_numpy(features).to(batch[ACTION].device))
+        observed = torch.cat(parts, dim=1)
+        # An epoch may end in a batch of one, of which BatchNorm can take no variance.
+        training = self.network.training
+        self.network.train(training and len(observed) > 1)
+        loss = self.network.loss(observed, batch[ACTION])
+        self.network.train(training)
+        return loss, {"mse": loss.item()}
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
+        """Return a chunk of one action, (B, 1, 7)."""
+        return self.select_action(batch)[:, None]
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
+        """Return the action (B, 7); it does not depend on what else is in the batch."""
+        if self._acting is None:
+            # `act` computes in float64 on the CPU, and so may not have its weights moved or trained under it.
+            self._acting = copy.deepcopy(self.network).cpu().eval()
+        poses = batch[OBS_STATE].float().cpu().numpy()
+        return torch.from_numpy(self._acting.act(self._features(batch), poses)).to(batch[OBS_STATE].device)
+
+    def _features(self, batch: dict[str, Tensor]) -> np.ndarray | None:
+        """Return the views' features side by side (B, F) float32; None without pictures."""
+        if self._encoder is None:
+            return None
+        for view in self.config.views:
+            trained, given = self.config.input_features[names.image_key(view)].shape, batch[names.image_key(view)]
+            if tuple(given.shape[1:]) != tuple(trained):
+                raise InputError(
+                    f"surgicai_bc was trained on pictures of {tuple(trained)}, got {tuple(given.shape[1:])}; "
+                    f"give --env.image_size={trained[-1]}."
+                )
+        return encode(self._encoder, batch, self.config.views)

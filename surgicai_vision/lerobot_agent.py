@@ -1,0 +1,236 @@
+"""LeRobot's policies in our evaluation: a checkpoint of `lerobot-train` becomes the subject of `evaluate`.
+
+Interface:
+
+* `find(folder) -> Path | None`: the folder with config.json and model.safetensors, looked for in a training's
+  output, in one of its checkpoints, or in `pretrained_model` itself.
+* `subject(folder, task, weights) -> cells.Subject`.
+
+The policy runs through LeRobot's own pipeline, as in `lerobot-eval`. So that a result depends neither on the
+batch nor on the processes, every slot has a policy of its own (sharing weights) with its own random numbers,
+drawn from the episode's seed; a policy that declares itself `memoryless` gets all slots in one batch. Importing
+LeRobot takes ten seconds and happens in the worker alone.
+"""
+
+import copy
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision import names
+from surgicai_vision.agents import one_thread
+from surgicai_vision.cells import Subject
+from surgicai_vision.config import SceneConfig, TaskConfig, from_mapping
+from surgicai_vision.errors import BadFile, InputError, SurgicaiError, check_name
+from surgicai_vision.files import read_json, sha256_file
+
+CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
+PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")
+"""Where a checkpoint lies in a folder the user names."""
+ENV_TYPE = "surgicai"
+FEATURES = "observation.environment_state"
+VISUAL = "VISUAL"
+
+
+def find(folder: Path) -> Path | None:
+    """Return the folder of LeRobot's checkpoint in `folder`, or None where there is none."""
+    for place in PLACES:
+        candidate = folder / place
+        if (candidate / CONFIG).is_file() and (candidate / WEIGHTS).is_file():
+            return candidate
+    return None
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the policy sees.
+
+    Attributes:
+        cameras: views.
+        image_size: height and width of their pictures [px].
+        encoder: encoder whose features it sees in place of pictures; None for pictures.
+        sha256: hash of that encoder's weights; empty where unknown.
+    """
+
+    cameras: tuple[str, ...]
+    image_size: int
+    encoder: str | None = None
+    sha256: str = ""
+
+
+def subject(folder: Path, task: str | None = None, weights: str | None = None) -> Subject:
+    """Return the subject of a checkpoint folder of `find`.
+
+    Args:
+        folder: holds config.json and model.safetensors.
+        task: the task, where the checkpoint does not say it.
+        weights: file with the encoder's pretrained weights.
+
+    Raises:
+        BadFile: a checkpoint that is damaged.
+        InputError: a policy that sees what our envs do not show.
+    """
+    policy = _table(folder / CONFIG)
+    training = _table(folder / TRAINING) if (folder / TRAINING).is_file() else {}
+    config, sight = _circumstances(training, folder, task, policy)
+    name = f"{policy['type']}-{'+'.join(sight.cameras)}"
+    about = {
+        "checkpoint": {"policy_sha256": sha256_file(folder / WEIGHTS), "policy": policy["type"]},
+        "folder": str(folder),
+        "views": list(sight.cameras),
+        "encoder": sight.encoder or policy.get("encoder") or "own",
+    }
+    return Subject(name, config, functools.partial(LeRobotAgent, name, folder, sight, weights), about)
+
+
+def _circumstances(
+    training: Mapping[str, Any], folder: Path, task: str | None, policy: Mapping[str, Any]
+) -> tuple[TaskConfig, Sight]:
+    """Return the task the policy was trained for and what it sees, from its env, its dataset or `task`."""
+    env, root = training.get("env") or {}, (training.get("dataset") or {}).get("root")
+    features: Mapping[str, Any] = {}
+    if env.get("type") == ENV_TYPE:
+        keys = ("task", "step", "tolerance", "reward", "max_steps", "scene")
+        config = from_mapping(TaskConfig, {key: env[key] for key in keys if key in env}, str(folder / TRAINING))
+        if env.get("encoder"):
+            views, sha256 = env["cameras"], env.get("encoder_sha256", "")
+            features = {"encoder": env["encoder"], "views": views, "weights_sha256": sha256, "size": env["image_size"]}
+    elif root and (Path(root) / names.META_FILE).is_file():
+        meta = read_json(Path(root) / names.META_FILE)
+        config = from_mapping(TaskConfig, meta["task_config"], str(Path(root) / names.META_FILE))
+        features = {**meta["features"], "size": meta["image_size"]} if meta.get("features") else {}
+    elif task:
+        config = TaskConfig(task=task, scene=SceneConfig())
+    else:
+        raise InputError(f"{folder} does not say what it was trained for; give --task.")
+    return config, _sight(folder, policy.get("input_features") or {}, features)
+
+
+def _sight(folder: Path, inputs: Mapping[str, Any], features: Mapping[str, Any]) -> Sight:
+    """Return what a policy with these inputs sees."""
+    if FEATURES in inputs:
+        if not features:
+            raise InputError(f"{folder} sees {FEATURES}, and neither its env nor its dataset says of which encoder.")
+        return Sight(tuple(features["views"]), features["size"], features["encoder"], features["weights_sha256"])
+    shapes = {key: value["shape"] for key, value in inputs.items() if value["type"] == VISUAL}
+    known = {names.image_key(view): view for view in names.CAMERAS}
+    for key in shapes:
+        check_name(f"picture of {folder}", key, known)
+    sizes = {tuple(shape[1:]) for shape in shapes.values()}
+    if len(sizes) > 1 or any(height != width for height, width in sizes):
+        raise InputError(f"{folder} sees pictures of {sorted(sizes)}; our envs show square ones of one size.")
+    return Sight(tuple(known[key] for key in shapes), next(iter(sizes))[0] if sizes else 224)
+
+
+def _table(path: Path) -> dict[str, Any]:
+    """Return a JSON table."""
+    content = read_json(path)
+    if not isinstance(content, dict) or (path.name == CONFIG and "type" not in content):
+        raise BadFile(f"{path} is no configuration of LeRobot.")
+    return content
+
+
+@final
+class LeRobotAgent:
+    """A policy of LeRobot.
+
+    Args:
+        name: how tables call it.
+        folder: its checkpoint.
+        sight: what it sees.
+        weights: file with the encoder's pretrained weights.
+    """
+
+    def __init__(self, name: str, folder: Path, sight: Sight, weights: str | None = None):
+        self.name, self.cameras, self.image_size = name, sight.cameras, sight.image_size
+        self._policy, self._before, self._after = _load(folder, weights)
+        self._together = bool(getattr(self._policy, "memoryless", False))
+        self._encoder = _encoder(sight, weights) if sight.encoder else None
+        self._slots: dict[int, tuple[Any, Any]] = {}
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Give the slot a policy that remembers nothing, and the random numbers of its seed."""
+        import torch
+
+        policy = self._policy
+        if not self._together:
+            tensors = itertools.chain(policy.parameters(), policy.buffers())
+            policy = copy.deepcopy(policy, {id(tensor): tensor for tensor in tensors})
+        policy.reset()
+        self._slots[slot] = policy, torch.Generator().manual_seed(seed).get_state()
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the policy's actions (n, 7)."""
+        import torch
+
+        with one_thread(), torch.inference_mode(), torch.random.fork_rng(devices=[]):
+            if self._together:
+                return self._act(self._policy, envs, observations)
+            actions = []
+            for slot, env, observation in zip(slots, envs, observations, strict=True):
+                policy, state = self._slots[slot]
+                torch.set_rng_state(state)
+                actions.append(self._act(policy, [env], [observation]))
+                self._slots[slot] = policy, torch.get_rng_state()
+            return np.concatenate(actions)
+
+    def _act(self, policy: Any, envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Ask one policy for the actions of a batch, through LeRobot's pipeline."""
+        import torch
+        from lerobot.envs.utils import preprocess_observation
+
+        poses = [
+            o["agent_pos"] if isinstance(o, dict) else e.agent_pos() for o, e in zip(observations, envs, strict=True)
+        ]
+        raw: dict[str, Any] = {"agent_pos": np.stack(poses)}
+        if self._encoder is None:
+            raw["pixels"] = {view: np.stack([o["pixels"][view] for o in observations]) for view in self.cameras}
+        else:
+            views = [self._encoder(np.stack([o["pixels"][view] for o in observations])) for view in self.cameras]
+            raw["environment_state"] = np.concatenate(views, axis=1)
+        batch = {**preprocess_observation(raw), "task": [env.task_description for env in envs]}
+        action = self._after(policy.select_action(self._before(batch)))
+        return action.to("cpu", torch.float32).numpy()
+
+
+def _load(folder: Path, weights: str | None) -> tuple[Any, Any, Any]:
+    """Return policy, pre- and post-processor; plug-ins are found as LeRobot's own commands find them."""
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    try:
+        config = PreTrainedConfig.from_pretrained(folder)
+        # The checkpoint holds the backbone; LeRobot would download it first, only to overwrite it.
+        if getattr(config, "pretrained_backbone_weights", None):
+            config.pretrained_backbone_weights = None  # type: ignore[attr-defined]
+        if weights and hasattr(config, "encoder_weights"):
+            config.encoder_weights = weights
+        policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+        overrides = {"device_processor": {"device": config.device}}
+        before, after = make_pre_post_processors(config, str(folder), preprocessor_overrides=overrides)
+    except SurgicaiError:
+        raise
+    except Exception as error:
+        raise BadFile(f"LeRobot cannot load {folder} ({(str(error).splitlines() or [''])[0]}).") from error
+    return policy.eval(), before, after
+
+
+def _encoder(sight: Sight, weights: str | None) -> Any:
+    """Load the encoder whose features the policy sees, verified."""
+    from surgicai_vision import registry
+
+    encoder = registry.load_encoder(str(sight.encoder), weights)
+    if sight.sha256 and encoder.weights_sha256 != sight.sha256:
+        raise InputError(
+            f"The policy was trained on encoder '{sight.encoder}' with weights sha256 {sight.sha256}, got "
+            f"{encoder.weights_sha256}; hand over the same with --weights."
+        )
+    return encoder
