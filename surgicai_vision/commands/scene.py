@@ -12,6 +12,7 @@ from surgicai_vision.errors import InputError
 
 EXAMPLE = "surgicai-vision scene --task grasp --seed 0 --sheet sheet.png"
 QUALITIES = ("fast", "high")
+FILM_FRAMES = 6
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,9 @@ class Options:
     size: int = option(336, "height and width of each picture [px]", check=positive, metavar="PX")
     quality: str = option("high", "fast (as datasets are rendered) or high", check=one_of("quality", QUALITIES))
     sheet: str | None = option(None, "where to write it", metavar="FILE.png", default_text="outputs/scene-<task>.png")
+    film: str | None = option(
+        None, "draw a film strip of the expert in every subtask instead, in the first view", metavar="FILE.png"
+    )
     env: Env | None = config_only()
 
 
@@ -35,6 +39,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     from surgicai_vision.evaluation import evaluate
     from surgicai_vision.provenance import provenance
 
+    if options.film:
+        return _film(options, console)
     config = (options.env or Env()).task_config(options.task)
     path = Path(options.sheet) if options.sheet else folders.OUTPUTS / f"scene-{options.task}.png"
     if not options.view:
@@ -63,3 +69,27 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         "steps": episode.row.steps,
         "renderer": provenance()["renderer"],
     }
+
+
+def _film(options: Options, console: Console) -> dict[str, Any]:
+    """Draw a row of moments for every subtask: the expert's episode from the seed, as the first view sees it."""
+    from surgicai_vision import cells, pictures
+    from surgicai_vision.evaluation import evaluate
+
+    path, rows, outcomes = Path(options.film or ""), [], {}
+    folders.check_file(path, "--film", (".png", ".jpg", ".pdf", ".svg"))
+    with console.stage("filming", "subtasks") as progress:
+        for done, subtask in enumerate(names.SUBTASKS):
+            config = (options.env or Env()).task_config(subtask)
+            episode = evaluate(cells.expert, config, [options.seed], workers=1)[0]
+            last = len(episode.film.states) - 1
+            moments = [episode.film.states[round(last * share / (FILM_FRAMES - 1))] for share in range(FILM_FRAMES)]
+            with pictures.stage(config, options.size, options.quality) as see:
+                rows.append((subtask, [see(state, options.view[0], names.RGB) for state in moments]))
+            outcomes[subtask] = {"success": episode.row.success, "steps": episode.row.steps}
+            progress(done + 1, len(names.SUBTASKS))
+    columns = [f"{share / (FILM_FRAMES - 1):.0%} of the episode" for share in range(FILM_FRAMES)]
+    figure = pictures.sheet(rows, columns, f"the scripted expert, seed {options.seed}, seen by {options.view[0]}")
+    figure.savefig(path, dpi=110)
+    console.say(f"film: {path}")
+    return {"film": str(path), "view": options.view[0], "seed": options.seed, "subtasks": outcomes}
