@@ -54,6 +54,65 @@ class SceneConfig:
             raise InputError(f"thread is {self.thread!r} segments; allowed: 0, 10, 20, 40.")
 
 
+LATENCY_LIMIT = 5
+"""Longest latency [control steps]: 100 ms."""
+RANDOMISATION_LIMITS: Mapping[str, float] = types.MappingProxyType(
+    {
+        "light": 0.9,
+        "colour": 0.9,
+        "camera_shift": 20.0,
+        "camera_turn": 20.0,
+        "camera_fovy": 15.0,
+        "needle_thickness": 0.3,
+        "friction": 0.5,
+        "phantom_shift": 5.0,
+        "kinematic_error": 1.0,
+        "latency": LATENCY_LIMIT,
+    }
+)
+"""Axis → largest magnitude: beyond it cameras lose the scene, or the procedure is no longer possible."""
+
+
+@dataclass(frozen=True)
+class RandomisationConfig:
+    """How much of each thing differs from episode to episode; 0 is off. Each axis is drawn uniformly from ± its value.
+
+    Attributes:
+        light: brightness of each light, as a fraction of it.
+        colour: tint of the tissue and of what surrounds it, as a fraction of each colour channel.
+        camera_shift: place of each camera along each axis [mm]; the endoscope's two move as one.
+        camera_turn: rotation of each camera about each axis [deg].
+        camera_fovy: vertical field of view of each camera [deg].
+        needle_thickness: fraction of the needle's thickness.
+        friction: fraction of every friction coefficient.
+        phantom_shift: place of the phantom, its holes and goals, in x and y [mm].
+        kinematic_error: offset of each arm's first three joints that the arm does not know of; 1 is ±5°, ±5°, ±5 mm,
+            the joint errors of the surgical robotics challenge.
+        latency: an action takes effect this many control steps later; the same in every episode.
+    """
+
+    light: float = 0.0
+    colour: float = 0.0
+    camera_shift: float = 0.0
+    camera_turn: float = 0.0
+    camera_fovy: float = 0.0
+    needle_thickness: float = 0.0
+    friction: float = 0.0
+    phantom_shift: float = 0.0
+    kinematic_error: float = 0.0
+    latency: int = 0
+
+    def __post_init__(self) -> None:
+        for axis, limit in RANDOMISATION_LIMITS.items():
+            if not 0 <= getattr(self, axis) <= limit:
+                raise InputError(f"randomisation: {axis} is {getattr(self, axis)}; allowed: 0 to {limit}.")
+
+    @property
+    def on(self) -> tuple[str, ...]:
+        """Return the axes that are not 0."""
+        return tuple(axis for axis in RANDOMISATION_LIMITS if getattr(self, axis))
+
+
 @dataclass(frozen=True)
 class TaskConfig:
     """One task in one scene: everything that decides what an episode is.
@@ -65,6 +124,7 @@ class TaskConfig:
         tolerance: "paper" or "released" success tolerances.
         reward: "sparse" (0 on success, else -1) or "dense".
         max_steps: episode limit [control steps].
+        randomisation: what differs from episode to episode besides the start; nothing by default.
     """
 
     task: str = "grasp"
@@ -73,6 +133,7 @@ class TaskConfig:
     tolerance: str = "paper"
     reward: str = "sparse"
     max_steps: int = 200
+    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
     def __post_init__(self) -> None:
         check_name("task", self.task, names.TASKS)

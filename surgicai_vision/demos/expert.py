@@ -77,8 +77,9 @@ class _Sight:
         self.base = poses.square(simulation.bases[self.arm])
         self.needle = poses.square(simulation.needle())
         self.tip = poses.square(simulation.tip(self.arm))
-        self.command = self.base @ poses.square(simulation.commands[self.arm].pose)
-        self.command_jaw = simulation.commands[self.arm].jaw
+        command = simulation.pending(self.arm, self.step)
+        self.command = self.base @ poses.square(simulation.true_pose(self.arm, command))
+        self.command_jaw = command.jaw
         self.holds = simulation.holds(self.arm)
 
     def carrying(self, needle_pose: Matrix) -> Matrix:

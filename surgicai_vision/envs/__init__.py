@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 
 from surgicai_vision import names
-from surgicai_vision.config import SceneConfig, TaskConfig, from_mapping
+from surgicai_vision.config import RandomisationConfig, SceneConfig, TaskConfig, from_mapping
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.grasp import Grasp
 from surgicai_vision.envs.handoff import Handoff
@@ -57,7 +57,14 @@ def make_task(task: str, scene: SceneConfig | dict[str, Any] | None = None, **ar
         scene: a `SceneConfig`, its fields, or None for the default scene.
         **arguments: fields of `TaskConfig` and arguments of `make`.
     """
-    fields = {key: arguments.pop(key) for key in ("step", "tolerance", "reward", "max_steps") if key in arguments}
+    fields: dict[str, Any] = {
+        key: arguments.pop(key) for key in ("step", "tolerance", "reward", "max_steps") if key in arguments
+    }
+    if "randomisation" in arguments:
+        axes = arguments.pop("randomisation")
+        fields["randomisation"] = (
+            from_mapping(RandomisationConfig, axes, "randomisation") if isinstance(axes, dict) else axes
+        )
     chosen = from_mapping(SceneConfig, scene, "scene") if isinstance(scene, dict) else scene or SceneConfig()
     return make(TaskConfig(task=task, scene=chosen, **fields), **arguments)
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision import names
 from surgicai_vision.config import TaskConfig
-from surgicai_vision.envs import observation, passage
+from surgicai_vision.envs import observation, passage, poses, randomisation
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.observation import ObservationConfig
@@ -64,7 +64,8 @@ class SuturingEnv(gymnasium.Env):
             raise InputError(f"render_mode is '{render_mode}'; allowed: None, rgb_array.")
         self.config, self.view, self.render_mode = config, view, render_mode
         self.scene = build_scene(config.scene)
-        self.simulation = Simulation(self.scene)
+        axes = config.randomisation
+        self.simulation = Simulation(self.scene, own_model=bool(axes.on), latency=axes.latency)
         self.stitch = Stitch.of(self.scene.pair)
         self.observation_space = view.space()
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
@@ -78,6 +79,10 @@ class SuturingEnv(gymnasium.Env):
         """Draw a start state; `seed` makes it reproducible."""
         super().reset(seed=seed)
         simulation, first = self.simulation, self._subtasks[0]
+        axes = self.config.randomisation
+        if axes.on:
+            simulation.randomise(randomisation.draw(axes, self.np_random))
+            self._meet_draws()
         for _ in range(START_DRAWS):
             simulation.reset()
             simulation.memory.phase = float(first.phase)
@@ -88,6 +93,8 @@ class SuturingEnv(gymnasium.Env):
         passage.remember_tip(simulation, simulation.memory)
         self._remember_tool()
         info = self.measure()
+        if axes.on:
+            info["randomisation"] = randomisation.report(axes, simulation.draws)
         return self.observe(), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
@@ -174,7 +181,10 @@ class SuturingEnv(gymnasium.Env):
 
     def set_state_vector(self, state: NDArray[np.float64]) -> None:
         """Restore a state of `get_state`: what follows is what followed then."""
+        before = self.simulation.draws
         self.simulation.set_state(state)
+        if self.simulation.draws is not before:
+            self._meet_draws()
 
     def set_state(self, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
         """Set positions and velocities, as gymnasium's MujocoEnv does; commands stay as they are."""
@@ -214,8 +224,7 @@ class SuturingEnv(gymnasium.Env):
     def agent_pos(self) -> NDArray[np.float32]:
         """Return x y z [m], roll pitch yaw, jaw [rad] of the active arm's measured tip in its base, (7,)."""
         simulation, arm = self.simulation, self.subtask.arm
-        tip = simulation.to_base(arm, simulation.tip(arm))
-        return np.array(observation.seven(arm, tip, simulation.jaw(arm)), dtype=np.float32)
+        return np.array(observation.seven(arm, simulation.tip_in_base(arm), simulation.jaw(arm)), dtype=np.float32)
 
     def needle_pose(self) -> NDArray[np.float32]:
         """Return the needle's position [m] and quaternion (w, x, y, z) in world, (7,)."""
@@ -244,6 +253,10 @@ class SuturingEnv(gymnasium.Env):
     def _state_vector(self, target: Target) -> NDArray[np.float32]:
         simulation, arm = self.simulation, self.subtask.arm
         tip, jaw = simulation.tip(arm), simulation.jaw(arm)
+        if simulation.offsets:
+            achieved, desired = target
+            goal = simulation.to_base(arm, poses.compose(desired, poses.relative(achieved, tip)))
+            return observation.state_vector(arm, simulation.tip_in_base(arm), goal, jaw)
         return observation.state_vector_in_world(arm, simulation.bases[arm], tip, *target, jaw)
 
     # -- progress -------------------------------------------------------------------------------------------------
@@ -254,6 +267,12 @@ class SuturingEnv(gymnasium.Env):
         if len(values) != 7 or not isfinite(sum(values)):
             raise InputError(f"The action must be 7 finite numbers in [-1, 1]; got {values}.")
         return [-1.0 if value < -1.0 else 1.0 if value > 1.0 else value for value in values]
+
+    def _meet_draws(self) -> None:
+        """Follow a new randomisation: goals stand on the phantom, and a renderer keeps the needle's shape."""
+        self.stitch = Stitch.of(randomisation.shifted(self.scene.pair, self.simulation.draws))
+        if self.config.randomisation.needle_thickness:
+            self._pictures.close()
 
     def _remember_tool(self) -> None:
         memory = self.simulation.memory

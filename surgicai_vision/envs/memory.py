@@ -48,6 +48,7 @@ class Memory:
     goal: Pose = IDENTITY
 
     SIZE: ClassVar[int] = 15 + 2 * 12
+    """Numbers of a record; what else is in MuJoCo's user data follows it: see `simulation`."""
 
     def pack(self) -> list[float]:
         """Return all fields as `SIZE` floats."""

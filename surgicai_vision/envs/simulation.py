@@ -12,6 +12,7 @@ A control step is ten physics steps of 2 ms, cut so that it *ends* with MuJoCo's
 gives the same ones, bit for bit. MuJoCo resets itself on divergence; the clock shows it.
 """
 
+import copy
 import math
 import struct
 
@@ -20,7 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision import names
-from surgicai_vision.envs import control, poses
+from surgicai_vision.config import LATENCY_LIMIT
+from surgicai_vision.envs import attach, control, poses, randomisation
+from surgicai_vision.envs.attach import Welds
 from surgicai_vision.envs.control import Command, StepSize
 from surgicai_vision.envs.memory import Memory
 from surgicai_vision.errors import InputError, UnreachablePose
@@ -39,13 +42,34 @@ RELEASE_STEPS, RELEASE_JAW, RELEASE_SHIFT = 40, 0.1, 0.001
 """How PSM2 lets go after the handoff: jaw opened by 0.1 rad a step to 0.5, then drawn back 1 mm a step."""
 
 
-class Simulation:
-    """One scene in motion; see the module's docstring."""
+COMMAND_SIZE = 12 + 1 + 6
+"""Numbers of an arm's command: pose, jaw, joints."""
+_COMMANDS = Memory.SIZE
+_DRAWS = _COMMANDS + COMMAND_SIZE * len(names.ARMS)
+_WELDS = _DRAWS + randomisation.SIZE
+_QUEUE = _WELDS + attach.SIZE
+USED = _QUEUE + 7 * LATENCY_LIMIT
+"""What the user data hold, in this order: memory, commands, an episode's randomisation, welds, waiting actions."""
 
-    def __init__(self, scene: Scene):
-        self.scene = scene
-        self.model = scene.model
-        self.data = mujoco.MjData(scene.model)
+
+class Simulation:
+    """One scene in motion; see the module's docstring.
+
+    Args:
+        scene: the compiled scene.
+        own_model: keep a copy of its model, to be randomised; scenes of grasp level "attach" always have one.
+        latency: control steps an action waits.
+    """
+
+    def __init__(self, scene: Scene, *, own_model: bool = False, latency: int = 0):
+        self.scene, self.latency = scene, latency
+        welded = scene.config.grasp == "attach"
+        self.model = copy.copy(scene.model) if own_model or welded else scene.model
+        self.data = mujoco.MjData(self.model)
+        self.draws = randomisation.NOTHING
+        self.offsets: dict[str, tuple[float, ...]] = {}
+        self._welds = Welds(self.model, self.data) if welded else None
+        self._own = own_model
         self.memory = Memory()
         self.commands: dict[str, Command] = {}
         self._read: dict[str, Pose] | None = None
@@ -68,7 +92,22 @@ class Simulation:
         self.memory = Memory()
         for arm in names.ARMS:
             self.pose_arm(arm, poses.flat(kinematics.start_in_base(arm)), kinematics.STARTS[arm][6])
+        if self._own:
+            self.data.userdata[_DRAWS:_WELDS] = self.draws
+        if self._welds:
+            self._welds.unpack([0.0] * attach.SIZE)
         self.refresh()
+
+    def randomise(self, draws: randomisation.Draws) -> None:
+        """Apply one episode's randomisation to the model; `reset` or `refresh` must follow.
+
+        Raises:
+            InputError: the model is shared with other envs.
+        """
+        if not self._own:
+            raise InputError("The state is of a randomised episode; make the env with its randomisation.")
+        randomisation.apply(self.scene, self.model, draws)
+        self.draws, self.offsets = draws, randomisation.joint_offsets(draws)
 
     def refresh(self) -> None:
         """Recompute positions, velocities and contacts of the present state."""
@@ -78,7 +117,7 @@ class Simulation:
     # -- setting --------------------------------------------------------------------------------------------------
 
     def pose_arm(self, arm: str, pose: Pose, jaw: float, measured_jaw: float | None = None) -> None:
-        """Put an arm's joints at a tip pose in its base, at rest, and command it to stay.
+        """Put an arm's joints at a true tip pose in its base, at rest, and command it to stay.
 
         Args:
             arm: "psm1" or "psm2".
@@ -98,13 +137,16 @@ class Simulation:
         self.data.qpos[ids.qpos] = joints
         finger = jaw if measured_jaw is None else measured_jaw
         self.data.qpos[ids.finger_qpos : ids.finger_qpos + 2] = finger
+        if arm in self.offsets:
+            joints = self._without_error(arm, joints)
+            pose = kinematics.forward_flat(joints, self.scene.config.instrument)
         self.command(arm, Command(pose, jaw, joints))
 
     def command(self, arm: str, command: Command) -> None:
         """Make `command` the arm's present command."""
         self.commands[arm] = command
         ids = self.scene.arms[arm]
-        self._ctrl[ids.actuators] = command.joints
+        self._ctrl[ids.actuators] = self._with_error(arm, command.joints) if self.offsets else command.joints
         self._ctrl[ids.jaw_actuator] = control.jaw_servo(command.jaw)
 
     def pose_needle(self, pose: Pose) -> None:
@@ -123,6 +165,8 @@ class Simulation:
             mujoco.mj_step(self.model, self.data, steps)
         self.data.time = CLOCK_START
         self.refresh()
+        if self._welds:
+            self._attach(self._welds)
 
     # -- moving ---------------------------------------------------------------------------------------------------
 
@@ -134,6 +178,8 @@ class Simulation:
             action: seven floats in [-1, 1].
             step: size of an action of 1.
         """
+        if self.latency:
+            action = self._delayed(action)
         instrument = self.scene.config.instrument
         self.command(arm, control.follow(self.commands[arm], action, step, self.bases[arm], instrument))
         if self.memory.release > 0:
@@ -144,7 +190,38 @@ class Simulation:
         mujoco.mj_step(self.model, data, SUBSTEPS - 1)
         mujoco.mj_step1(self.model, data)
         self._read = None
+        if self._welds:
+            self._attach(self._welds)
         return abs(data.time - due) < 1e-9
+
+    def _delayed(self, action: list[float]) -> list[float]:
+        """Queue an action and return the one whose time has come."""
+        waiting = self.data.userdata[_QUEUE : _QUEUE + 7 * self.latency].tolist()
+        self.data.userdata[_QUEUE : _QUEUE + 7 * self.latency] = waiting[7:] + action
+        return list(waiting[:7])
+
+    def drop_waiting(self) -> None:
+        """Forget the actions that wait: another arm is active now."""
+        self.data.userdata[_QUEUE:USED] = 0.0
+
+    def pending(self, arm: str, step: StepSize) -> Command:
+        """Return an arm's command once all waiting actions have taken effect."""
+        command = self.commands[arm]
+        for index in range(self.latency):
+            action = self.data.userdata[_QUEUE + 7 * index : _QUEUE + 7 * index + 7].tolist()
+            command = control.follow(command, action, step, self.bases[arm], self.scene.config.instrument)
+        return command
+
+    def _attach(self, welds: Welds) -> None:
+        """Attach the needle to closed jaws that touch it, let it go from open ones."""
+        changed = False
+        for arm in names.ARMS:
+            closed = self.commands[arm].jaw < attach.CLOSED
+            touching = closed and any(self.touching(arm))
+            tip, needle = self.tip(arm), self.needle()
+            changed |= welds.update(arm, closed=closed, touching=touching, tip=tip, needle=needle)
+        if changed:
+            self.refresh()
 
     def _let_go(self) -> None:
         """Open PSM2's jaw, then draw the tool back along its axis."""
@@ -196,6 +273,29 @@ class Simulation:
         """Return T_world_needle, measured."""
         return self._body("needle")
 
+    def tip_in_base(self, arm: str) -> Pose:
+        """Return T_base_tip as the arm reports it: its kinematics do not know of an error of its joints."""
+        if not self.offsets:
+            return self.to_base(arm, self.tip(arm))
+        joints = tuple(self.data.qpos[self.scene.arms[arm].qpos].tolist())
+        return kinematics.forward_flat(self._without_error(arm, joints), self.scene.config.instrument)
+
+    def true_pose(self, arm: str, command: Command) -> Pose:
+        """Return where a command really brings the tip, in the arm's base."""
+        if not self.offsets:
+            return command.pose
+        return kinematics.forward_flat(self._with_error(arm, command.joints), self.scene.config.instrument)
+
+    def _with_error(self, arm: str, joints: kinematics.Joints) -> kinematics.Joints:
+        a, b, c, d, e, f = joints
+        x, y, z = self.offsets[arm][:3]
+        return a + x, b + y, c + z, d, e, f
+
+    def _without_error(self, arm: str, joints: kinematics.Joints) -> kinematics.Joints:
+        a, b, c, d, e, f = joints
+        x, y, z = self.offsets[arm][:3]
+        return a - x, b - y, c - z, d, e, f
+
     def jaw(self, arm: str) -> float:
         """Return the measured angle of the left finger [rad]."""
         return float(self.data.qpos[self.scene.arms[arm].finger_qpos])
@@ -220,7 +320,9 @@ class Simulation:
         return found_left, found_right
 
     def holds(self, arm: str) -> bool:
-        """Say whether both jaw pads of an arm touch the needle."""
+        """Say whether both jaw pads of an arm touch the needle, or, at grasp level "attach", it is attached."""
+        if self._welds:
+            return self._welds.active(arm)
         left, right = self.touching(arm)
         return left and right
 
@@ -238,8 +340,10 @@ class Simulation:
         """Return everything as one vector: MuJoCo's integration state, commands and memory inside its user data."""
         values = [*self.memory.pack()]
         for arm in names.ARMS:
-            values += [*self.commands[arm].pose, self.commands[arm].jaw]
+            values += [*self.commands[arm].pose, self.commands[arm].jaw, *self.commands[arm].joints]
         self.data.userdata[: len(values)] = values
+        if self._welds:
+            self.data.userdata[_WELDS:_QUEUE] = self._welds.pack()
         state = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, self.data, state, STATE)
         return state
@@ -248,7 +352,7 @@ class Simulation:
         """Restore a vector of `get_state`.
 
         Raises:
-            InputError: of another length, or not finite.
+            InputError: of another length, not finite, or of a randomised episode where this env has no randomisation.
         """
         vector = np.ascontiguousarray(state, dtype=np.float64)
         size = mujoco.mj_stateSize(self.model, STATE)
@@ -260,7 +364,12 @@ class Simulation:
         values = self.data.userdata.tolist()
         self.memory = Memory.unpack(values)
         for index, arm in enumerate(names.ARMS):
-            start = Memory.SIZE + 13 * index
-            joints = tuple(self.data.ctrl[self.scene.arms[arm].actuators].tolist())
-            self.commands[arm] = Command(tuple(values[start : start + 12]), values[start + 12], joints)
+            start = _COMMANDS + COMMAND_SIZE * index
+            pose, joints = tuple(values[start : start + 12]), tuple(values[start + 13 : start + COMMAND_SIZE])
+            self.commands[arm] = Command(pose, values[start + 12], joints)
+        draws = tuple(values[_DRAWS:_WELDS])
+        if draws != self.draws:
+            self.randomise(draws)
+        if self._welds:
+            self._welds.unpack(values[_WELDS:_QUEUE])
         self.refresh()

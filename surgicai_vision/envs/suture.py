@@ -28,6 +28,8 @@ class Suture(SuturingEnv):
             return False
         memory.phase += 1.0
         memory.dwell = memory.held = 0.0
+        if self.config.randomisation.latency:
+            self.simulation.drop_waiting()
         if int(memory.phase) == PULLOUT_PHASE:
             memory.release = float(RELEASE_STEPS)
         self._remember_tool()

@@ -150,3 +150,11 @@ def _couple_fingers(spec: mujoco.MjSpec, arm: str) -> None:
     actuator.set_to_position(kp=JAW_GAIN, kv=2 * math.sqrt(2 * JAW_GAIN * JAW_ARMATURE))
     actuator.forcelimited = True
     actuator.forcerange = [-JAW_TORQUE, JAW_TORQUE]
+
+
+def add_weld(spec: mujoco.MjSpec, arm: str) -> None:
+    """Add the weld between an arm's tip and the needle, inactive, for grasp level "attach"."""
+    weld = spec.add_equality(name=f"{arm}_attach", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
+    weld.name1, weld.name2, weld.active = f"{arm}_tip", "needle", False
+    weld.data[10] = 1.0  # torque scale
+    weld.solref, weld.solimp = [0.004, 1.0], [0.99, 0.999, 0.0001, 0.5, 2.0]

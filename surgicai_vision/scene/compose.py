@@ -23,7 +23,7 @@ from surgicai_vision.scene import arm, holes, kinematics, look, needle, phantom,
 from surgicai_vision.scene.cameras import add_world_cameras, add_wrist_camera
 
 TIMESTEP = 0.002
-USER_DATA = 96
+USER_DATA = 176
 """Numbers the envs keep inside MuJoCo's state (goal, progress), so that one vector is the whole state."""
 
 SURFACES, GRIP, FIRM, ARMS, THREAD = 1, 2, 4, 8, 16
@@ -123,6 +123,9 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     thread.add_thread(spec, body, needle.point(0.0).tolist(), config.thread, {"contype": THREAD, "conaffinity": 0})
     for name in names.ARMS:
         _add_arm(spec, config, name)
+    if config.grasp == "attach":
+        for name in names.ARMS:
+            arm.add_weld(spec, name)
     look.dress(spec, config.layout, config.instrument)
     add_world_cameras(spec)
     return spec

@@ -1,0 +1,145 @@
+"""Randomisation: what differs from episode to episode besides the start, by `config.RandomisationConfig`.
+
+`draw` gives one episode's numbers, `apply` writes them into an env's own copy of the model. The numbers are part of
+the whole state, so a restored state looks and moves as it did. All axes are drawn whichever are on: turning one on
+leaves the others as they were.
+"""
+
+import dataclasses
+import math
+from itertools import accumulate, pairwise
+from types import MappingProxyType
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision import names
+from surgicai_vision.config import RandomisationConfig
+from surgicai_vision.scene import Scene, needle
+from surgicai_vision.scene.holes import Hole, HolePair
+from surgicai_vision.scene.rotations import matrix_to_quaternion, quaternion_to_matrix, rotvec_to_matrix
+
+Array = NDArray[np.float64]
+Draws = tuple[float, ...]
+
+RIGS = (("front", "front_right"), ("back",), ("wrist_psm1",), ("wrist_psm2",))
+"""Cameras that move as one, about the first."""
+TISSUE, SURROUNDINGS = ("tissue", "flesh"), ("drape", "tray")
+"""Materials of one tint."""
+JOINT_ERROR = (math.radians(5.0), math.radians(5.0), 0.005)
+"""Largest error of an arm's first three joints [rad, rad, m] (surgical robotics challenge)."""
+
+UNITS = MappingProxyType(
+    {
+        "light": (1.0,) * 3,
+        "colour": (1.0,) * 6,
+        "camera_shift": (1e-3,) * 3 * len(RIGS),
+        "camera_turn": (math.radians(1.0),) * 3 * len(RIGS),
+        "camera_fovy": (1.0,) * len(RIGS),
+        "needle_thickness": (1.0,),
+        "friction": (1.0,),
+        "phantom_shift": (1e-3,) * 2,
+        "kinematic_error": JOINT_ERROR * len(names.ARMS),
+    }
+)
+"""Axis → what a magnitude of 1 is in each of its numbers (fractions, m, rad; the field of view in degrees)."""
+_EDGES = tuple(accumulate((len(unit) for unit in UNITS.values()), initial=0))
+_PLACES = {axis: slice(start, end) for axis, (start, end) in zip(UNITS, pairwise(_EDGES), strict=True)}
+SIZE = _EDGES[-1]
+"""Numbers of one episode."""
+NOTHING: Draws = (0.0,) * SIZE
+
+
+def draw(config: RandomisationConfig, rng: np.random.Generator) -> Draws:
+    """Draw one episode's numbers, `SIZE` of them."""
+    values: list[float] = []
+    for axis, unit in UNITS.items():
+        values += (rng.uniform(-1.0, 1.0, len(unit)) * unit * getattr(config, axis)).tolist()
+    return tuple(value + 0.0 for value in values)  # no -0.0
+
+
+def report(config: RandomisationConfig, draws: Draws) -> dict[str, Any]:
+    """Return axis → drawn numbers of the axes that are on, for `info["randomisation"]`."""
+    drawn: dict[str, Any] = {axis: np.array(draws[_PLACES[axis]]) for axis in config.on if axis in UNITS}
+    return drawn | ({"latency": config.latency} if config.latency else {})
+
+
+def joint_offsets(draws: Draws) -> dict[str, Draws]:
+    """Return arm → error of its six joints, empty where there is none."""
+    values = draws[_PLACES["kinematic_error"]]
+    if not any(values):
+        return {}
+    return {arm: (*values[3 * index : 3 * index + 3], 0.0, 0.0, 0.0) for index, arm in enumerate(names.ARMS)}
+
+
+def shifted(pair: HolePair, draws: Draws) -> HolePair:
+    """Return where a hole pair is when the phantom is shifted."""
+    x, y = draws[_PLACES["phantom_shift"]]
+
+    def moved(hole: Hole) -> Hole:
+        return dataclasses.replace(hole, centre=(hole.centre[0] + x, hole.centre[1] + y, hole.centre[2]))
+
+    return HolePair(moved(pair.entry), moved(pair.exit))
+
+
+def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
+    """Write one episode's numbers into `model`, a copy of the scene's own, which is only read."""
+    source, numbers = scene.model, {axis: np.array(draws[place]) for axis, place in _PLACES.items()}
+    _light(source, model, 1.0 + numbers["light"])
+    _tint(source, model, 1.0 + numbers["colour"].reshape(2, 3))
+    shifts, turns = numbers["camera_shift"].reshape(-1, 3), numbers["camera_turn"].reshape(-1, 3)
+    for cameras, shift, turn, fovy in zip(RIGS, shifts, turns, numbers["camera_fovy"], strict=True):
+        _aim(source, model, cameras, shift, turn, fovy)
+    _thicken(source, model, scene.needle_geoms, 1.0 + float(numbers["needle_thickness"][0]))
+    model.geom_friction[:] = source.geom_friction * (1.0 + float(numbers["friction"][0]))
+    phantom = source.body("phantom").id
+    model.body_pos[phantom] = source.body_pos[phantom] + [*numbers["phantom_shift"], 0.0]
+
+
+def _light(source: mujoco.MjModel, model: mujoco.MjModel, factors: Array) -> None:
+    """Scale the head light and the two lamps."""
+    for kind in ("ambient", "diffuse", "specular"):
+        getattr(model.vis.headlight, kind)[:] = getattr(source.vis.headlight, kind) * factors[0]
+        getattr(model, f"light_{kind}")[:] = getattr(source, f"light_{kind}") * factors[1:, None]
+
+
+def _tint(source: mujoco.MjModel, model: mujoco.MjModel, factors: Array) -> None:
+    """Scale the colours of the tissue and of its surroundings."""
+    for materials, factor in zip((TISSUE, SURROUNDINGS), factors, strict=True):
+        for name in materials:
+            index = source.material(name).id
+            model.mat_rgba[index, :3] = np.clip(source.mat_rgba[index, :3] * factor, 0.0, 1.0)
+
+
+def _aim(
+    source: mujoco.MjModel, model: mujoco.MjModel, cameras: tuple[str, ...], shift: Array, turn: Array, fovy: float
+) -> None:
+    """Shift a rig [m], turn it about its first camera [rad], both in its carrier's axes; widen its view [deg]."""
+    rotation, pivot = rotvec_to_matrix(turn), source.cam_pos[source.camera(cameras[0]).id]
+    for name in cameras:
+        index = source.camera(name).id
+        model.cam_pos[index] = pivot + rotation @ (source.cam_pos[index] - pivot) + shift
+        model.cam_quat[index] = matrix_to_quaternion(rotation @ quaternion_to_matrix(source.cam_quat[index]))
+        model.cam_fovy[index] = source.cam_fovy[index] + fovy
+
+
+def _thicken(source: mujoco.MjModel, model: mujoco.MjModel, geoms: range, factor: float) -> None:
+    """Scale the needle's thickness: what collides, the bounds that find collisions, and what is drawn."""
+    of = slice(geoms.start, geoms.stop)
+    radius, half = source.geom_size[of, 0] * factor, source.geom_size[of, 1]
+    model.geom_size[of, 0] = radius
+    model.geom_rbound[of] = radius + half
+    model.geom_aabb[of, 3:] = np.stack([radius, radius, radius + half], axis=1)
+    body = source.body("needle").id
+    tree = slice(source.body_bvhadr[body], source.body_bvhadr[body] + source.body_bvhnum[body])
+    grown = max(0.0, float((radius - source.geom_size[of, 0]).max()))
+    model.bvh_aabb[tree, 3:] = source.bvh_aabb[tree, 3:] + grown
+    mesh = source.mesh("needle").id
+    of = slice(source.mesh_vertadr[mesh], source.mesh_vertadr[mesh] + source.mesh_vertnum[mesh])
+    turn, origin = quaternion_to_matrix(source.mesh_quat[mesh]), source.mesh_pos[mesh]
+    points = source.mesh_vert[of] @ turn.T + origin
+    angles = np.clip(np.arctan2(points[:, 1], -points[:, 0]), 0.0, needle.TIP_ANGLE)
+    line = np.stack([-needle.RADIUS * np.cos(angles), needle.RADIUS * np.sin(angles), np.zeros_like(angles)], axis=1)
+    model.mesh_vert[of] = (line + (points - line) * factor - origin) @ turn
