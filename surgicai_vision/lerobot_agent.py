@@ -13,6 +13,7 @@ LeRobot takes ten seconds and happens in the worker alone.
 """
 
 import copy
+import dataclasses
 import functools
 import itertools
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from surgicai_vision import names
 from surgicai_vision.agents import one_thread
 from surgicai_vision.cells import Subject
-from surgicai_vision.config import SceneConfig, TaskConfig, from_mapping
+from surgicai_vision.config import TaskConfig, from_mapping
 from surgicai_vision.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.files import read_json, sha256_file
 
@@ -34,7 +35,6 @@ CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.js
 PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")
 """Where a checkpoint lies in a folder the user names."""
 ENV_TYPE = "surgicai"
-FEATURES = "observation.environment_state"
 VISUAL = "VISUAL"
 
 
@@ -96,8 +96,8 @@ def _circumstances(
     env, root = training.get("env") or {}, (training.get("dataset") or {}).get("root")
     features: Mapping[str, Any] = {}
     if env.get("type") == ENV_TYPE:
-        keys = ("task", "step", "tolerance", "reward", "max_steps", "scene")
-        config = from_mapping(TaskConfig, {key: env[key] for key in keys if key in env}, str(folder / TRAINING))
+        fields = {field.name: env[field.name] for field in dataclasses.fields(TaskConfig) if field.name in env}
+        config = from_mapping(TaskConfig, fields, str(folder / TRAINING))
         if env.get("encoder"):
             views, sha256 = env["cameras"], env.get("encoder_sha256", "")
             features = {"encoder": env["encoder"], "views": views, "weights_sha256": sha256, "size": env["image_size"]}
@@ -106,7 +106,7 @@ def _circumstances(
         config = from_mapping(TaskConfig, meta["task_config"], str(Path(root) / names.META_FILE))
         features = {**meta["features"], "size": meta["image_size"]} if meta.get("features") else {}
     elif task:
-        config = TaskConfig(task=task, scene=SceneConfig())
+        config = TaskConfig(task=task)
     else:
         raise InputError(f"{folder} does not say what it was trained for; give --task.")
     return config, _sight(folder, policy.get("input_features") or {}, features)
@@ -114,9 +114,11 @@ def _circumstances(
 
 def _sight(folder: Path, inputs: Mapping[str, Any], features: Mapping[str, Any]) -> Sight:
     """Return what a policy with these inputs sees."""
-    if FEATURES in inputs:
+    if names.ENVIRONMENT_STATE in inputs:
         if not features:
-            raise InputError(f"{folder} sees {FEATURES}, and neither its env nor its dataset says of which encoder.")
+            raise InputError(
+                f"{folder} sees {names.ENVIRONMENT_STATE}, and neither its env nor its dataset says of which encoder."
+            )
         return Sight(tuple(features["views"]), features["size"], features["encoder"], features["weights_sha256"])
     shapes = {key: value["shape"] for key, value in inputs.items() if value["type"] == VISUAL}
     known = {names.image_key(view): view for view in names.CAMERAS}

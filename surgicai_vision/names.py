@@ -46,6 +46,7 @@ STATE_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "jaw")
 
 # LeRobot keys.
 STATE = "observation.state"
+ENVIRONMENT_STATE = "observation.environment_state"
 ACTION = "action"
 REWARD = "next.reward"
 DONE = "next.done"

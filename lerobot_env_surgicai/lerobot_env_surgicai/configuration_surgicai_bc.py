@@ -76,7 +76,7 @@ class SurgicaiBcConfig(PreTrainedConfig):
         Raises:
             InputError: the dataset or env lacks one of them, or acts otherwise than we do.
         """
-        given = self.input_features or {}
+        given: dict[str, Any] = self.input_features or {}  # type: ignore[has-type]  # mypy skips its base
         kept = {key: given[key] for key in self._wanted(given) if key in given}
         missing = [key for key in self._wanted(given) if key not in given]
         if missing or not kept:

@@ -7,8 +7,9 @@ Diffusion take three channels only). With `encoder` it sees `observation.environ
 of the views, in place of the pictures.
 """
 
+import dataclasses
 import functools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,12 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 import surgicai_vision.envs  # noqa: F401  # registers the gymnasium ids
 from lerobot_env_surgicai.encoding import EncodeViews
 from surgicai_vision import names, registry
-from surgicai_vision.config import SceneConfig, TaskConfig, to_mapping
+from surgicai_vision.config import RandomisationConfig, SceneConfig, TaskConfig, to_mapping
 from surgicai_vision.dataset import open_dataset
-from surgicai_vision.errors import InputError, check_name
+from surgicai_vision.errors import check_name
 
-DEFAULT = TaskConfig()
 AGENT_POS, FEATURES = "agent_pos", "environment_state"
+TASK_FIELDS = tuple(field.name for field in dataclasses.fields(TaskConfig))
 
 
 @EnvConfig.register_subclass("surgicai")
@@ -36,9 +37,12 @@ AGENT_POS, FEATURES = "agent_pos", "environment_state"
 class SurgicaiEnv(EnvConfig):
     """An env of surgicai-vision.
 
+    What is None is taken from `dataset`, and without one is the default of `TaskConfig`, two views of 224 px, and
+    pictures. After that nothing is None but `encoder`, and `dataset` is forgotten: a saved configuration is whole.
+
     Attributes:
         task: one of `names.TASKS`.
-        dataset: a dataset of ours, in place of everything from `task` to `encoder` but `encoder_weights`.
+        dataset: a dataset of ours.
         cameras: views.
         image_size: height and width of a picture [px].
         step: step-size preset.
@@ -46,60 +50,68 @@ class SurgicaiEnv(EnvConfig):
         reward: "sparse" or "dense".
         max_steps: episode limit [control steps].
         scene: the scene.
-        encoder: show this encoder's features of the views in place of pictures; None shows pictures.
+        randomisation: what differs from episode to episode besides the start.
+        encoder: show this encoder's features of the views in place of pictures.
         encoder_weights: file with the encoder's pretrained weights.
         encoder_sha256: hash of the weights it must have; empty for any.
     """
 
-    task: str | None = DEFAULT.task
+    task: str | None = None
     fps: int = names.FPS
     dataset: str | None = None
-    cameras: list[str] = field(default_factory=lambda: ["front", "back"])
-    image_size: int = 224
-    step: str = DEFAULT.step
-    tolerance: str = DEFAULT.tolerance
-    reward: str = DEFAULT.reward
-    max_steps: int = DEFAULT.max_steps
-    scene: SceneConfig = field(default_factory=SceneConfig)
+    cameras: list[str] | None = None
+    image_size: int | None = None
+    step: str | None = None
+    tolerance: str | None = None
+    reward: str | None = None
+    max_steps: int | None = None
+    scene: SceneConfig | None = None
+    randomisation: RandomisationConfig | None = None
     encoder: str | None = None
     encoder_weights: str | None = None
     encoder_sha256: str = ""
 
     def __post_init__(self) -> None:
-        if self.dataset:
-            self._follow(Path(self.dataset))
-        self.dataset = None  # what it said stands in the fields, and a saved configuration stays whole without it
-        for camera in self.cameras:
+        self._fill(TaskConfig(), ["front", "back"], 224)
+        for camera in self.views:
             check_name("camera", camera, names.CAMERAS)
         self.task_config()
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(names.ACTION_NAMES),))}
         self.features[AGENT_POS] = PolicyFeature(FeatureType.STATE, (len(names.STATE_NAMES),))
         if self.encoder:
-            dim = len(self.cameras) * registry.encoder_card(self.encoder).dim
+            dim = len(self.views) * registry.encoder_card(self.encoder).dim
             self.features[FEATURES] = PolicyFeature(FeatureType.ENV, (dim,))
         else:
             shape = (self.image_size, self.image_size, 3)
-            self.features |= {names.image_key(view): PolicyFeature(FeatureType.VISUAL, shape) for view in self.cameras}
+            self.features |= {names.image_key(view): PolicyFeature(FeatureType.VISUAL, shape) for view in self.views}
         renamed = {AGENT_POS: OBS_STATE, FEATURES: OBS_ENV_STATE}
         self.features_map = {key: renamed.get(key, key) for key in self.features}
 
-    def _follow(self, folder: Path) -> None:
-        """Take task, scene, views, size and encoder from a dataset."""
-        dataset = open_dataset(folder)
-        config = dataset.config
-        self.task, self.step, self.tolerance, self.reward = config.task, config.step, config.tolerance, config.reward
-        self.max_steps, self.scene = config.max_steps, config.scene
-        self.cameras, self.image_size = list(dataset.views), dataset.image_size
-        features = dataset.meta.get("features")
-        if features:
-            self.cameras, self.encoder = list(features["views"]), features["encoder"]
-            self.encoder_sha256 = features["weights_sha256"]
+    def _fill(self, config: TaskConfig, cameras: list[str], image_size: int) -> None:
+        """Fill what is None from the dataset, or from the arguments where there is none."""
+        features: dict[str, Any] = {}
+        if self.dataset:
+            dataset = open_dataset(Path(self.dataset))
+            config, image_size = dataset.config, dataset.image_size
+            features = dataset.meta.get("features") or {}
+            cameras = list(features.get("views", dataset.views))
+        for key in TASK_FIELDS:
+            if getattr(self, key) is None:
+                setattr(self, key, getattr(config, key))
+        self.cameras = list(self.cameras or cameras)
+        self.image_size = self.image_size or image_size
+        if self.encoder is None and features:
+            self.encoder, self.encoder_sha256 = features["encoder"], features["weights_sha256"]
+        self.dataset = None
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Return the views."""
+        return tuple(self.cameras or ())
 
     def task_config(self) -> TaskConfig:
         """Return the task and its scene; refuses what does not exist."""
-        if self.task is None:
-            raise InputError(f"--env.task is missing; give one of {', '.join(names.TASKS)}, or --env.dataset.")
-        return TaskConfig(self.task, self.scene, self.step, self.tolerance, self.reward, self.max_steps)
+        return TaskConfig(**{key: getattr(self, key) for key in TASK_FIELDS})
 
     @property
     def gym_id(self) -> str:
@@ -109,15 +121,13 @@ class SurgicaiEnv(EnvConfig):
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Return the arguments of `gymnasium.make`; its step limit gives LeRobot `_max_episode_steps`."""
+        config = to_mapping(self.task_config())
+        del config["task"]
         return {
+            **config,
             "obs_type": "pixels_agent_pos",
-            "cameras": tuple(self.cameras),
+            "cameras": self.views,
             "image_size": self.image_size,
-            "step": self.step,
-            "tolerance": self.tolerance,
-            "reward": self.reward,
-            "max_steps": self.max_steps,
-            "scene": to_mapping(self.scene),
             "render_mode": "rgb_array",
             "max_episode_steps": self.max_steps,
         }
@@ -142,7 +152,7 @@ class SurgicaiEnv(EnvConfig):
         """Return what stands between env and policy: the encoder, when there is one."""
         steps = []
         if self.encoder:
-            steps = [EncodeViews(self.encoder, tuple(self.cameras), self.encoder_weights, self.encoder_sha256)]
+            steps = [EncodeViews(self.encoder, self.views, self.encoder_weights, self.encoder_sha256)]
         return PolicyProcessorPipeline(steps=steps), PolicyProcessorPipeline(steps=[])
 
 

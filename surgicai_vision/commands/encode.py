@@ -1,12 +1,14 @@
 """`encode`: compute a dataset's frozen features."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from surgicai_vision import names, registry
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import many_of, one_of, option
+from surgicai_vision.files import check_output
 
 EXAMPLE = "surgicai-vision encode --task grasp --encoder imagenet-lite --view front,back"
 
@@ -26,21 +28,27 @@ class Options:
         ("front", "back"), "views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]"
     )
     weights: str | None = option(None, "file with the encoder's pretrained weights", metavar="FILE")
+    export: str | None = option(
+        None, "also write a dataset with the features in place of pictures, for LeRobot's policies", metavar="DIR"
+    )
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Encode every view and say where the features are."""
     registry.find_weights(options.encoder, options.weights)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
+    if options.export:
+        check_output(Path(options.export))
     from surgicai_vision.features import encode
 
     encoder = registry.load_encoder(options.encoder, options.weights)
-    entries = []
+    entries, rows = [], []
     for view in options.view:
         with console.stage(f"encoding {view} by {options.encoder}", "frames") as progress:
             features = encode(dataset, view, encoder, progress=progress)
         state = f"{features.encoded} frames encoded" if features.encoded else "at hand"
         console.say(f"{options.encoder} {view}: {len(features.rows)} × {features.dim}, {state}: {features.folder}")
+        rows.append(features.rows)
         entries.append(
             {
                 "view": view,
@@ -50,4 +58,15 @@ def run(options: Options, console: Console) -> dict[str, Any]:
                 "folder": str(features.folder),
             }
         )
+    if options.export:
+        from surgicai_vision.dataset.exporting import export_features
+
+        about = {
+            "encoder": options.encoder,
+            "views": list(options.view),
+            "weights_sha256": encoder.weights_sha256,
+            "encoder_fingerprint": encoder.fingerprint,
+        }
+        export_features(dataset, rows, about, Path(options.export))
+        console.say(f"exported: {options.export}")
     return {"encoder": options.encoder, "weights_sha256": encoder.weights_sha256, "features": entries}
