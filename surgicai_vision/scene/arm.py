@@ -156,5 +156,5 @@ def add_weld(spec: mujoco.MjSpec, arm: str) -> None:
     """Add the weld between an arm's tip and the needle, inactive, for grasp level "attach"."""
     weld = spec.add_equality(name=f"{arm}_attach", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
     weld.name1, weld.name2, weld.active = f"{arm}_tip", "needle", False
-    weld.data[10] = 1.0  # torque scale
+    weld.data[:11] = [0.0] * 6 + [1.0, 0.0, 0.0, 0.0, 0.01]  # anchor, pose in the jaws, torque scale [m]
     weld.solref, weld.solimp = [0.004, 1.0], [0.99, 0.999, 0.0001, 0.5, 2.0]
