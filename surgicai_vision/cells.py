@@ -138,7 +138,7 @@ def evaluate_once(
         summary: dict[str, Any] = files.read_json(out / MARKER)["summary"]
         return summary
     subject = make_subject()
-    with stage(f"evaluation: {subject.name}, {len(seeds)} starts", "steps") as progress:
+    with stage(f"evaluation: {subject.name}", "steps") as progress:
         return evaluate_into(out, subject, seeds, workers, progress)
 
 

@@ -118,6 +118,20 @@ def test_wrong_input_is_one_line(arguments, said, capsys):
     assert said in fails(capsys, *arguments)
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("env: {max_stpes: 4}", "Did you mean 'max_steps'?"),
+        ("env: {scene: {thread: 7}}", "thread is 7"),
+        ("env: {task: place}", "option of its own"),
+        ("env: 4", "env"),
+    ],
+)
+def test_a_wrong_env_table_is_one_line(text, said, tmp_path, capsys):
+    write(tmp_path / "env.yaml", text)
+    assert said in fails(capsys, "evaluate", "zero", "--config", "env.yaml")
+
+
 def test_missing_weights_are_said_before_anything_else(capsys):
     line = fails(capsys, "train", "--encoder", "r3m", "--view", "back")
     for part in ("pytorch_model.bin", "sha256", "--weights FILE", "imagenet-lite", "random"):

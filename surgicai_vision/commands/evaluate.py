@@ -8,7 +8,7 @@ from typing import Any
 from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import Env, config_only, not_negative, one_of, option, positive
+from surgicai_vision.commands.options import config_only, not_negative, one_of, option, positive, task_config
 from surgicai_vision.errors import InputError, UnknownName
 
 EXAMPLE = "surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json"
@@ -37,7 +37,7 @@ class Options:
         metavar="DIR",
         default_text="outputs/evaluations/<task>-<policy>-starts<seed>+<episodes>",
     )
-    env: Env | None = config_only()
+    env: dict | None = config_only()
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
@@ -64,7 +64,7 @@ def _subject(options: Options) -> Any:
 
     folder = Path(options.policy)
     if options.policy in cells.BASELINES:
-        config = (options.env or Env()).task_config(options.task or "grasp")
+        config = task_config(options.task or "grasp", options.env)
         return cells.baseline_subject(options.policy, config)
     if not folder.exists() and folder.parent == Path():
         raise UnknownName("policy or checkpoint folder", options.policy, cells.BASELINES)
@@ -77,7 +77,7 @@ def _subject(options: Options) -> Any:
     if options.task not in (None, trained_for):
         raise InputError(f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out.")
     if options.env:
-        subject = dataclasses.replace(subject, config=options.env.task_config(trained_for))
+        subject = dataclasses.replace(subject, config=task_config(trained_for, options.env))
     return subject
 
 

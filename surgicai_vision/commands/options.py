@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from surgicai_vision.config import SceneConfig, TaskConfig, from_mapping
+from surgicai_vision.config import TaskConfig, from_mapping
 from surgicai_vision.errors import BadFile, InputError, UnknownName, check_name
 
 T = TypeVar("T")
@@ -34,18 +34,17 @@ def option(default: Any, text: str, *, check: Check | None = None, metavar: str 
     return dataclasses.field(default=default, metadata=metadata)
 
 
-@dataclasses.dataclass(frozen=True)
-class Env:
-    """The table `env` of a `--config` file: how episodes differ from the defaults of `TaskConfig`."""
+def task_config(task: str, env: dict[str, Any] | None) -> TaskConfig:
+    """Return the configuration of `task`, changed by the table `env` of a `--config` file.
 
-    scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
-    step: str = TaskConfig.step
-    tolerance: str = TaskConfig.tolerance
-    max_steps: int = TaskConfig.max_steps
-
-    def task_config(self, task: str) -> TaskConfig:
-        """Return the configuration of `task`."""
-        return TaskConfig(task, self.scene, self.step, self.tolerance, max_steps=self.max_steps)
+    Raises:
+        UnknownName: a key that `TaskConfig` does not have.
+        InputError: a value that is not allowed, or the task itself, which is an option of its own.
+    """
+    changes = env or {}
+    if "task" in changes:
+        raise InputError("env: the task is an option of its own; write `task:` beside `env:`.")
+    return from_mapping(TaskConfig, {**changes, "task": task}, "env")
 
 
 def config_only() -> Any:

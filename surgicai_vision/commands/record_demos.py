@@ -7,7 +7,7 @@ from typing import Any
 from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import Env, config_only, not_negative, one_of, option, positive
+from surgicai_vision.commands.options import config_only, not_negative, one_of, option, positive, task_config
 
 EXAMPLE = "surgicai-vision record-demos --task grasp --episodes 50"
 
@@ -21,14 +21,14 @@ class Options:
     seed: int = option(names.TRAIN_SEED, "seed of the first start; each episode takes the next", check=not_negative)
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     out: str | None = option(None, "folder to make or to continue", metavar="DIR", default_text="outputs/demos/<task>")
-    env: Env | None = config_only()
+    env: dict | None = config_only()
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Record and say where the demonstrations are."""
     from surgicai_vision.demos.record import record
 
-    config = (options.env or Env()).task_config(options.task)
+    config = task_config(options.task, options.env)
     out = Path(options.out) if options.out else folders.demos_folder(options.task)
     folders.check_folder(out, "demos.json")
     with console.stage(f"recording {options.task}", "episodes") as progress:

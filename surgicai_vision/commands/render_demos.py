@@ -8,7 +8,7 @@ from typing import Any
 from surgicai_vision import names
 from surgicai_vision.commands import folders, record_demos
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import Env, config_only, many_of, not_negative, one_of, option, positive
+from surgicai_vision.commands.options import config_only, many_of, not_negative, one_of, option, positive
 from surgicai_vision.errors import InputError
 
 EXAMPLE = "surgicai-vision render-demos --task grasp --episodes 50 --view front,back --depth"
@@ -39,7 +39,7 @@ class Options:
     segmentation: bool = option(False, "render the parts beside RGB")
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     out: str | None = option(None, "dataset to make", metavar="DIR", default_text="outputs/datasets/<task>")
-    env: Env | None = config_only()
+    env: dict | None = config_only()
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import Env, config_only, many_of, not_negative, one_of, option, positive
+from surgicai_vision.commands.options import config_only, many_of, not_negative, one_of, option, positive, task_config
 from surgicai_vision.errors import InputError
 
 EXAMPLE = "surgicai-vision scene --task grasp --seed 0 --sheet sheet.png"
@@ -30,7 +30,7 @@ class Options:
     film: str | None = option(
         None, "draw a film strip of the expert in every subtask instead, in the first view", metavar="FILE.png"
     )
-    env: Env | None = config_only()
+    env: dict | None = config_only()
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
     if options.film:
         return _film(options, console)
-    config = (options.env or Env()).task_config(options.task)
+    config = task_config(options.task, options.env)
     path = Path(options.sheet) if options.sheet else folders.OUTPUTS / f"scene-{options.task}.png"
     if not options.view:
         raise InputError(f"--view is empty; give some of {', '.join(names.CAMERAS)}.")
@@ -80,7 +80,7 @@ def _film(options: Options, console: Console) -> dict[str, Any]:
     folders.check_file(path, "--film", (".png", ".jpg", ".pdf", ".svg"))
     with console.stage("filming", "subtasks") as progress:
         for done, subtask in enumerate(names.SUBTASKS):
-            config = (options.env or Env()).task_config(subtask)
+            config = task_config(subtask, options.env)
             episode = evaluate(cells.expert, config, [options.seed], workers=1)[0]
             last = len(episode.film.states) - 1
             moments = [episode.film.states[round(last * share / (FILM_FRAMES - 1))] for share in range(FILM_FRAMES)]
