@@ -16,6 +16,7 @@ import numpy as np
 from surgicai_vision.config import SceneConfig
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.control import StepSize
+from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.place import draw_psm2_grasp
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import hold_needle
@@ -52,13 +53,14 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print JSON only")
     arguments = parser.parse_args()
     simulation = Simulation(build_scene(SceneConfig(thread=arguments.thread)))
+    stitch = Stitch.of(simulation.scene.pair)
     rng = np.random.default_rng(arguments.seed)
     drifts, lost = [], 0
     needle_pose = np.eye(4)
     needle_pose[:3, 3] = PLACE
     while len(drifts) + lost < arguments.trials:
         simulation.reset()
-        if not hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose)):
+        if not hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch)):
             continue
         drift = swing(simulation)
         if drift is None or not simulation.holds(PSM2):

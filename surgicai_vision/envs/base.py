@@ -67,6 +67,12 @@ class SuturingEnv(gymnasium.Env):
         axes = config.randomisation
         self.simulation = Simulation(self.scene, own_model=bool(axes.on), latency=axes.latency)
         self.stitch = Stitch.of(self.scene.pair)
+        if not self.stitch.possible and any(subtask.through for subtask in subtasks):
+            raise InputError(
+                f"'{config.task}' is not possible in layout '{config.scene.layout}': the holes of pair "
+                f"{config.scene.hole_pair} are {self.scene.pair.gap * 1e3:.1f} mm apart, too far for this needle (see "
+                "surgicai_vision.envs.geometry). Allowed there: grasp, place. All tasks: simple, 3dmed_straight."
+            )
         self.observation_space = view.space()
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
         self._subtasks = subtasks
@@ -158,6 +164,11 @@ class SuturingEnv(gymnasium.Env):
     def task_description(self) -> str:
         """Return the task as a sentence, as LeRobot stores it."""
         return names.TASK_TEXTS[self.config.task]
+
+    @property
+    def _max_episode_steps(self) -> int:
+        """Return the episode limit where LeRobot looks for it: this env truncates itself."""
+        return self.config.max_steps
 
     @property
     def subtask(self) -> Subtask:

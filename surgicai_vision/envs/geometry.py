@@ -12,6 +12,14 @@ their middle and runs there at asin(gap / 2R) = 22.6° to the horizontal: 21° o
 of this radius is perpendicular at both holes, so the needle starts perpendicular at the entry (place), turns
 those 21° about its tip while the tip enters, then follows the circle. In the 3.8 mm openings the circle keeps
 at least 0.9 mm of clearance from the flanks' inner edges (`tests/test_scene.py` measures it).
+
+Room for PSM2's jaws: at the end of the insertion the needle's point at `angle_at_entry(INSERT_ANGLE, INSERT_DEPTH)`
+is in the entry, 100° - 11.3° - 2 asin(gap / 2R), and the jaws, `PAD_WIDTH` wide, must still be outside. With the
+`EXTRA` drive that makes room for PSM1 this leaves grasps up to 27° in `simple` and up to 8° to 15° in
+`3dmed_straight` (gaps 9.8 to 10.9 mm): there PSM2 grasps nearer the base. The gaps of `3dmed` (12.2 to 14.1 mm, 74° to
+88° of the needle's 120°) leave less than nothing: a third of this needle cannot stand out of the exit while PSM2 holds
+its base. Those holes are for their challenge's needle of 133°. In `3dmed` grasp and place are possible; what follows
+is refused.
 """
 
 import functools
@@ -24,7 +32,7 @@ from numpy.typing import NDArray
 from surgicai_vision.envs import poses
 from surgicai_vision.names import PSM1, PSM2
 from surgicai_vision.scene import needle
-from surgicai_vision.scene.arm import GRASP_DEPTH
+from surgicai_vision.scene.arm import GRASP_DEPTH, PAD_WIDTH
 from surgicai_vision.scene.holes import HolePair
 from surgicai_vision.scene.kinematics import Pose
 
@@ -36,6 +44,10 @@ WOUND = np.array([0.0, 1.0, 0.0])
 INSERT_ANGLE = math.radians(100.0)
 """The needle's point that the insertion brings to `INSERT_DEPTH` beyond the exit (released code)."""
 INSERT_DEPTH = 0.002
+EXTRA = 0.0014
+"""How far the expert drives the insertion past its goal where the episode lets it [m]: room for PSM1's jaws."""
+FIRST_GRASP = math.radians(6.5)
+"""Needle angle from which on a grasp off by its error has the needle between the pads."""
 HANDOFF_ANGLE = math.radians(105.0)
 """The needle's point that PSM1 grasps (released code)."""
 PULLOUT_SHIFT = np.array([0.030, 0.0, 0.030])
@@ -120,6 +132,20 @@ class Stitch:
         pose[:3, :3] = turn @ self.inserted()[:3, :3]
         pose[:3, 3] = np.asarray(self.pair.exit.centre) + PULLOUT_SHIFT - pose[:3, :3] @ needle.point(HANDOFF_ANGLE)
         return pose
+
+    @functools.cached_property
+    def last_grasp(self) -> float:
+        """Return the largest needle angle at which PSM2's jaws stay outside the entry to the end [rad]."""
+        return self.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA) - PAD_WIDTH / 2 / needle.RADIUS
+
+    @property
+    def possible(self) -> bool:
+        """Say whether the holes leave room for PSM2's jaws; where not, only grasp and place can be done."""
+        return self.last_grasp >= FIRST_GRASP
+
+    def grasps(self, low: float, high: float) -> tuple[float, float]:
+        """Return the part of a range of grasp angles [rad] that the stitch leaves room for."""
+        return (low, min(high, self.last_grasp)) if self.possible else (low, high)
 
     @functools.cached_property
     def place_tip(self) -> Pose:

@@ -32,14 +32,14 @@ def lying_needle(rng: np.random.Generator) -> np.ndarray:
 class Grasp(Subtask):
     """Close PSM2's jaws on the needle at the grasp angle: 1 mm and 10°, both pads in contact (paper)."""
 
-    name = "grasp"
+    name, through = "grasp", False
     tolerances = MappingProxyType({"paper": Tolerance.of(1.0, 10.0), "released": Tolerance.of(3.0, 10.0)})
     demands = MappingProxyType({"paper": Demands(contact=True), "released": Demands()})
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Put the needle on the tissue, both arms at home."""
         simulation.pose_needle(poses.flat(lying_needle(rng)))
-        simulation.memory.grasp_angle = rng.uniform(*GRASP_ANGLES)
+        simulation.memory.grasp_angle = rng.uniform(*stitch.grasps(*GRASP_ANGLES))
         simulation.settle(20)
         return True
 

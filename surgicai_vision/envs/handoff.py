@@ -41,7 +41,7 @@ class Handoff(Subtask):
         """Hold the inserted needle with PSM2, PSM1 at home."""
         needle_pose = inserted_needle(stitch, rng)
         simulation.memory.passed = 2.0
-        held = hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose), STRAIGHT)
+        held = hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch), STRAIGHT)
         return held and not simulation.touches_phantom(needle=False)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:

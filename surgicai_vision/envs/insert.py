@@ -36,7 +36,7 @@ class Insert(Subtask):
         if shift @ outward < -0.0005:
             shift = shift - 2 * (shift @ outward) * outward
         needle_pose = about_point(nominal, tip, draw_rotation(rng, START_TURN), shift)
-        held = hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose))
+        held = hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch))
         return held and not simulation.touches_phantom(needle=True)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:

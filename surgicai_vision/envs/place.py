@@ -20,24 +20,30 @@ GRASP_SHIFT, GRASP_TILT = 0.0015, math.radians(12.0)
 _TIP = poses.flat(needle_frame(needle.TIP_ANGLE))
 
 
-def draw_psm2_grasp(rng: np.random.Generator, needle_pose: np.ndarray) -> np.ndarray:
-    """Draw T_world_tip (4, 4) of PSM2's imperfect grasp of a needle, within the angles that work."""
+def draw_psm2_grasp(rng: np.random.Generator, needle_pose: np.ndarray, stitch: Stitch) -> np.ndarray:
+    """Draw T_world_tip (4, 4) of PSM2's imperfect grasp of a needle, within the angles that work.
+
+    Args:
+        rng: source of the draw.
+        needle_pose: T_world_needle (4, 4).
+        stitch: leaves room for some angles.
+    """
     angle, error = rng.uniform(*GRASP_ANGLES), draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
-    low, high = (limit - error.along / needle.RADIUS for limit in SAFE_ANGLES)
+    low, high = (limit - error.along / needle.RADIUS for limit in stitch.grasps(*SAFE_ANGLES))
     return grasp_pose(PSM2, needle_pose, min(max(angle, low), high), error)
 
 
 class Place(Subtask):
     """Put the needle's tip into the entry: 5 mm and 10° of the needle's whole orientation (paper)."""
 
-    name = "place"
+    name, through = "place", False
     tolerances = MappingProxyType({"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(5.0, 10.0)})
     demands = MappingProxyType({"paper": Demands(), "released": Demands()})
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the needle that still lies on the tissue."""
         needle_pose = lying_needle(rng)
-        return hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose))
+        return hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch))
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at its tip and that frame in the entry."""

@@ -33,7 +33,7 @@ class Pullout(Subtask):
         """Hold the inserted needle with PSM1, PSM2 drawn back with open jaws."""
         needle_pose = inserted_needle(stitch, rng)
         simulation.memory.passed = 2.0
-        away = draw_psm2_grasp(rng, needle_pose)
+        away = draw_psm2_grasp(rng, needle_pose, stitch)
         away[:3, 3] -= RETREAT * away[:3, 2]
         simulation.pose_arm(PSM2, simulation.to_base(PSM2, poses.flat(away)), RELEASED_JAW)
         error = draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.envs import poses
-from surgicai_vision.envs.geometry import grasp_in_needle
+from surgicai_vision.envs.geometry import FIRST_GRASP, grasp_in_needle
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.errors import UnreachablePose
 from surgicai_vision.scene import needle
@@ -28,8 +28,8 @@ CLOSED_JAW = (needle.BODY_RADIUS - PAD_OFFSET) / GRASP_DEPTH
 """Finger angle [rad] at which the pads touch the needle."""
 GRASP_ANGLES = (math.radians(5.0), math.radians(20.0))
 """Needle angle of PSM2's grasp (released code, Approach)."""
-SAFE_ANGLES = (math.radians(6.5), math.radians(27.0))
-"""Where a grasp off by its error still has the needle between the pads and passes the entry."""
+SAFE_ANGLES = (FIRST_GRASP, math.radians(27.0))
+"""Where a grasp off by its error still has the needle between the pads and passes the entry of `simple`."""
 
 
 class GraspError(NamedTuple):

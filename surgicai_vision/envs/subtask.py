@@ -60,6 +60,9 @@ class Subtask(ABC):
         self.phase = names.SUBTASKS.index(self.name)
         """The subtask's index in the procedure."""
 
+    through: ClassVar[bool] = True
+    """The needle is driven through the tissue, or already was."""
+
     @abstractmethod
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Put the simulation into a random start state; False where the draw is not physical (draw again)."""
