@@ -4,7 +4,7 @@
 float32. It keeps nothing between calls, so it answers on any state: from its own episodes, from a learner's
 (DAgger), from a restored one. No teleporting, no forces: the same seven numbers a policy has.
 
-Each subtask's rule says where the commanded tool should be next; `_toward` makes that one action, scaled as a
+Each subtask's rule says where the commanded tool should be next; `toward` makes that one action, scaled as a
 whole so that translation and rotation stay in step on curved paths.
 """
 
@@ -61,11 +61,11 @@ class Expert:
 
     def action(self) -> NDArray[np.float32]:
         """Return the next action for the env's present state, (7,) float32 in [-1, 1]."""
-        scene = _Sight(self.env)
-        return _toward(scene, _RULES[self.env.subtask.name](scene))
+        scene = Sight(self.env)
+        return toward(scene, _RULES[self.env.subtask.name](scene))
 
 
-class _Sight:
+class Sight:
     """What the expert sees: measured poses in world as (4, 4) matrices."""
 
     def __init__(self, env: SuturingEnv):
@@ -92,15 +92,20 @@ class _Sight:
         return self.command @ np.linalg.inv(self.tip) @ self.needle
 
 
-def _toward(scene: _Sight, wish: Wish) -> NDArray[np.float32]:
+def toward(scene: Sight, wish: Wish) -> NDArray[np.float32]:
     """Return the action that moves the command towards `wish`, scaled to at most 1 as a whole."""
-    inverse = scene.base[:3, :3].T
-    shift = inverse @ (wish.tip[:3, 3] - scene.command[:3, 3]) / scene.step.translation
-    turn = matrix_to_rotvec(inverse @ wish.tip[:3, :3] @ scene.command[:3, :3].T @ scene.base[:3, :3])
-    move = np.concatenate([shift, turn / scene.step.rotation])
+    move = moves(scene, wish.tip)
     move /= max(1.0, float(np.abs(move).max()))
     jaw = np.clip((wish.jaw - scene.command_jaw) / scene.step.jaw, -1.0, 1.0)
     return np.append(move, jaw).astype(np.float32)
+
+
+def moves(scene: Sight, tip: Matrix) -> Matrix:
+    """Return how many step sizes the command is from T_world_tip (4, 4), along and about the base's axes, (6,)."""
+    inverse = scene.base[:3, :3].T
+    shift = inverse @ (tip[:3, 3] - scene.command[:3, 3]) / scene.step.translation
+    turn = matrix_to_rotvec(inverse @ tip[:3, :3] @ scene.command[:3, :3].T @ scene.base[:3, :3])
+    return np.concatenate([shift, turn / scene.step.rotation])
 
 
 def _angle(a: Matrix, b: Matrix) -> float:
@@ -116,7 +121,7 @@ def _shifted(pose: Matrix, shift: Matrix) -> Matrix:
 # -- taking the needle ------------------------------------------------------------------------------------------------
 
 
-def _take(scene: _Sight, goal: Matrix, back: float, opened: float) -> Wish:
+def _take(scene: Sight, goal: Matrix, back: float, opened: float) -> Wish:
     """Go before the grasp with open jaws, go in, close.
 
     Args:
@@ -142,12 +147,12 @@ def _take(scene: _Sight, goal: Matrix, back: float, opened: float) -> Wish:
     return Wish(_shifted(goal, retreat * axis), opened)
 
 
-def _grasp(scene: _Sight) -> Wish:
+def _grasp(scene: Sight) -> Wish:
     goal = scene.needle @ grasp_in_needle(scene.arm, scene.memory.grasp_angle)
     return _take(scene, goal, HOVER, OPEN_ABOVE)
 
 
-def _handoff(scene: _Sight) -> Wish:
+def _handoff(scene: Sight) -> Wish:
     goal = scene.needle @ grasp_in_needle(scene.arm, HANDOFF_ANGLE + HANDOFF_OFFSET)
     return _take(scene, goal, HANDOFF_BACK, OPEN_HANDOFF)
 
@@ -155,13 +160,13 @@ def _handoff(scene: _Sight) -> Wish:
 # -- carrying the needle ----------------------------------------------------------------------------------------------
 
 
-def _on_path(stitch: Stitch, turned: float) -> Matrix:
+def on_path(stitch: Stitch, turned: float) -> Matrix:
     """Return the needle's pose after turning by `turned` [rad] about the wound since `Stitch.place`.
 
     First about the tip, which stays in the entry, until the tangent meets the circle; then along the circle.
     """
     start, circle = stitch.place(), stitch.on_arc(needle.TIP_ANGLE)
-    pivot = _turned(start, circle)
+    pivot = turn_about_wound(start, circle)
     if turned >= pivot:
         return stitch.on_arc(needle.TIP_ANGLE - (turned - pivot))
     pose = start.copy()
@@ -171,13 +176,13 @@ def _on_path(stitch: Stitch, turned: float) -> Matrix:
     return pose
 
 
-def _turned(start: Matrix, pose: Matrix) -> float:
+def turn_about_wound(start: Matrix, pose: Matrix) -> float:
     """Return the turn about the wound from `start` to `pose` in the needle's driving direction [rad], in (-π, π]."""
     x, z = start[:3, 0], np.cross(WOUND, start[:3, 0])
     return -math.atan2(float(pose[:3, 0] @ z), float(pose[:3, 0] @ x))
 
 
-def _place(scene: _Sight) -> Wish:
+def _place(scene: Sight) -> Wish:
     """Lift the needle, turn it upright before the entry, bring its tip in."""
     goal = scene.stitch.place()
     outward = scene.stitch.pair.entry.rotation[:, 2]
@@ -190,31 +195,31 @@ def _place(scene: _Sight) -> Wish:
     return Wish(scene.carrying(_shifted(goal, away * outward)), 0.0)
 
 
-def _insert(scene: _Sight) -> Wish:
+def _insert(scene: Sight) -> Wish:
     """Bring the tip in, then drive the needle along its path."""
     start = scene.stitch.place()
     tip = scene.needle[:3, :3] @ needle.point(needle.TIP_ANGLE) + scene.needle[:3, 3]
     local = scene.stitch.pair.entry.rotation.T @ (tip - np.asarray(scene.stitch.pair.entry.centre))
-    turned = _turned(start, scene.needle)
+    turned = turn_about_wound(start, scene.needle)
     if scene.memory.passed == 0.0:
         near = float(np.linalg.norm(local)) < 0.0009
-        tilt = _angle(scene.needle, _on_path(scene.stitch, max(turned, 0.0)))
+        tilt = _angle(scene.needle, on_path(scene.stitch, max(turned, 0.0)))
         if not (near and tilt < math.radians(4.0)):
             return _place(scene)
-    pivot = _turned(start, scene.stitch.on_arc(needle.TIP_ANGLE))
+    pivot = turn_about_wound(start, scene.stitch.on_arc(needle.TIP_ANGLE))
     last = pivot + needle.TIP_ANGLE - scene.stitch.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA)
     return _drive(scene, turned, last)
 
 
-def _drive(scene: _Sight, turned: float, last: float) -> Wish:
+def _drive(scene: Sight, turned: float, last: float) -> Wish:
     """Move the needle on along its path, up to `last` [rad]."""
     start = scene.stitch.place()
-    commanded = _turned(start, scene.commanded_needle)
+    commanded = turn_about_wound(start, scene.commanded_needle)
     ahead = max(min(commanded, turned + LEAD), turned - LEAD)
-    return Wish(scene.carrying(_on_path(scene.stitch, min(max(ahead, 0.0) + DRIVE, last))), 0.0)
+    return Wish(scene.carrying(on_path(scene.stitch, min(max(ahead, 0.0) + DRIVE, last))), 0.0)
 
 
-def _pullout(scene: _Sight) -> Wish:
+def _pullout(scene: Sight) -> Wish:
     """Turn the needle on along the circle until its base is out, then carry it to the end point."""
     stitch = scene.stitch
     if scene.memory.release > 30:
@@ -224,19 +229,19 @@ def _pullout(scene: _Sight) -> Wish:
     if float(outside.min()) > 0.0005:
         return Wish(scene.carrying(stitch.pulled()), 0.0)
     start = stitch.place()
-    turned = _turned(start, scene.needle) % (2 * math.pi)
-    commanded = turned + _wrap(_turned(start, scene.commanded_needle) - turned)
+    turned = turn_about_wound(start, scene.needle) % (2 * math.pi)
+    commanded = turned + _wrap(turn_about_wound(start, scene.commanded_needle) - turned)
     ahead = max(min(commanded, turned + LEAD), turned - LEAD)
-    pivot = _turned(start, stitch.on_arc(needle.TIP_ANGLE))
+    pivot = turn_about_wound(start, stitch.on_arc(needle.TIP_ANGLE))
     last = pivot + needle.TIP_ANGLE + 2 * stitch.half + math.radians(12.0)
-    return Wish(scene.carrying(_on_path(stitch, min(ahead + DRIVE, last))), 0.0)
+    return Wish(scene.carrying(on_path(stitch, min(ahead + DRIVE, last))), 0.0)
 
 
 def _wrap(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-_RULES: dict[str, Callable[[_Sight], Wish]] = {
+_RULES: dict[str, Callable[[Sight], Wish]] = {
     "grasp": _grasp,
     "place": _place,
     "insert": _insert,
