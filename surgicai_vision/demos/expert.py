@@ -18,7 +18,16 @@ from numpy.typing import NDArray
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.control import StepSize
-from surgicai_vision.envs.geometry import HANDOFF_ANGLE, INSERT_ANGLE, INSERT_DEPTH, WOUND, Stitch, grasp_in_needle
+from surgicai_vision.envs.geometry import (
+    EXTRA,
+    HANDOFF_ANGLE,
+    INSERT_ANGLE,
+    INSERT_DEPTH,
+    WOUND,
+    Stitch,
+    grasp_in_needle,
+)
+from surgicai_vision.errors import InputError
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.holes import SURFACE
 from surgicai_vision.scene.rotations import matrix_to_rotvec, rotvec_to_matrix
@@ -40,8 +49,6 @@ DRIVE = math.radians(1.8)
 """Rotation of the needle per control step on the circle [rad]."""
 LEAD = math.radians(9.0)
 """Furthest the command may run ahead of the needle [rad]."""
-EXTRA = 0.0014
-"""How far the insertion goes past its goal when the episode lets it [m]: room for PSM1's jaws."""
 HANDOFF_OFFSET = math.radians(4.0)
 """The expert takes the needle a little nearer to the tip than the goal, away from the tissue."""
 
@@ -54,13 +61,31 @@ class Wish(NamedTuple):
 
 
 class Expert:
-    """The scripted expert of an env; see the module's docstring."""
+    """The scripted expert of an env; see the module's docstring.
 
-    def __init__(self, env: SuturingEnv):
-        self.env = env
+    Args:
+        env: the env.
+        noise: standard deviation of Gaussian noise on the six motions of an action, in units of its range. The jaw
+            stays as meant. The expert sees where the noise took it and recovers: recordings with states off the path.
+        rng: source of the noise; needed with it.
+    """
+
+    def __init__(self, env: SuturingEnv, noise: float = 0.0, rng: np.random.Generator | None = None):
+        if noise < 0.0 or (noise and rng is None):
+            raise InputError(
+                f"Expert got noise {noise} and rng {rng}; noise is at least 0 and comes from a Generator."
+            )
+        self.env, self.noise, self._rng = env, noise, rng
 
     def action(self) -> NDArray[np.float32]:
-        """Return the next action for the env's present state, (7,) float32 in [-1, 1]."""
+        """Return the next action for the env's present state, (7,) float32 in [-1, 1], noise included."""
+        action = self.meant()
+        if self._rng is not None and self.noise:
+            action[:6] = np.clip(action[:6] + self._rng.normal(0.0, self.noise, 6), -1.0, 1.0)
+        return action
+
+    def meant(self) -> NDArray[np.float32]:
+        """Return the action without noise: the label of the present state."""
         scene = Sight(self.env)
         return toward(scene, _RULES[self.env.subtask.name](scene))
 
