@@ -25,6 +25,9 @@ STEPS: Mapping[str, tuple[float, float, float]] = types.MappingProxyType(
 """Step preset → translation [m], rotation [deg], jaw [rad] of an action of 1 (facts.md §1: the image
 evaluation, the RL training script, the trajectories shipped with the release)."""
 
+SUBTASK_STEPS = 200
+"""Control steps a subtask may take (paper, image policies)."""
+
 
 @dataclass(frozen=True)
 class SceneConfig:
@@ -123,7 +126,7 @@ class TaskConfig:
         step: step-size preset, a key of `STEPS`.
         tolerance: "paper" or "released" success tolerances.
         reward: "sparse" (0 on success, else -1) or "dense".
-        max_steps: episode limit [control steps].
+        max_steps: episode limit [control steps]; 0 takes the paper's, 200 a subtask, 1,000 for the five in a row.
         randomisation: what differs from episode to episode besides the start; nothing by default.
     """
 
@@ -132,7 +135,7 @@ class TaskConfig:
     step: str = "paper"
     tolerance: str = "paper"
     reward: str = "sparse"
-    max_steps: int = 200
+    max_steps: int = 0
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
     def __post_init__(self) -> None:
@@ -140,8 +143,36 @@ class TaskConfig:
         check_name("step preset", self.step, STEPS)
         check_name("tolerance preset", self.tolerance, ("paper", "released"))
         check_name("reward", self.reward, ("sparse", "dense"))
-        if self.max_steps < 1:
-            raise InputError(f"max_steps is {self.max_steps}; it must be at least 1.")
+        if self.max_steps < 0:
+            raise InputError(f"max_steps is {self.max_steps}; it must be at least 1, or 0 for the paper's limit.")
+        if self.max_steps == 0:
+            subtasks = len(names.SUBTASKS) if self.task == names.SUTURE else 1
+            object.__setattr__(self, "max_steps", SUBTASK_STEPS * subtasks)
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """Where SurgicAI's released code departs from its paper, each a switch of its own; all are off by default.
+
+    The sixth, its training (one hidden layer, 1e-4, 40 epochs, split over transitions), is plain settings of the
+    recipe "released".
+
+    Attributes:
+        action_noise: evaluation adds uniform noise to the translation, as much as the encoder's file says.
+        preprocessing: R3M and CLIP are fed ImageNet's statistics in place of their own.
+        batch_norm_drift: the frozen network stands under `train()`, so its BatchNorm statistics drift.
+        bgr: pictures are handed over as BGR and read as RGB.
+        three_evaluations: one trained policy is evaluated three times, where the paper trains five.
+    """
+
+    action_noise: bool = False
+    preprocessing: bool = False
+    batch_norm_drift: bool = False
+    bgr: bool = False
+    three_evaluations: bool = False
+
+
+DEVIATIONS = tuple(switch.name for switch in dataclasses.fields(Deviations))
 
 
 def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str = "configuration") -> T:
