@@ -18,6 +18,8 @@ JUMP = 0.004
 """Furthest the tip can move in one control step [m]: eight times the default step size."""
 OUT = 3.0
 """`Memory.passed` of a needle whose base has left the exit too."""
+EJECTED = 5.0
+"""A way in one control step [m] that no fall explains: the contact solver shot the needle away (250 m/s)."""
 
 Point = tuple[float, float, float]
 
@@ -29,6 +31,8 @@ def watch(simulation: Simulation, memory: Memory, pair: HolePair) -> None:
     memory.tip_x, memory.tip_y, memory.tip_z = now
     if math.dist(now, before) > JUMP:
         memory.passed = memory.passed if memory.passed == OUT else 0.0
+        if math.dist(now, before) > EJECTED:
+            memory.diverged = 1.0
     elif memory.passed == 0.0 and _passes(before, now, pair.entry, inward=True):
         memory.passed = 1.0
     elif memory.passed == 1.0:

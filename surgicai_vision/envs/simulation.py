@@ -70,6 +70,8 @@ class Simulation:
         self.offsets: dict[str, tuple[float, ...]] = {}
         self._welds = Welds(self.model, self.data) if welded else None
         self._own = own_model
+        self._instrument = scene.config.instrument
+        self._arms = dict(scene.arms)
         self.memory = Memory()
         self.commands: dict[str, Command] = {}
         self._read: dict[str, Pose] | None = None
@@ -79,7 +81,7 @@ class Simulation:
         self._phantom_id = self.model.body("phantom").id
         self._pads = {arm: scene.arms[arm].pads for arm in names.ARMS}
         self._needle_geoms = (scene.needle_geoms.start, scene.needle_geoms.stop)
-        self._ctrl = self.data.ctrl
+        self._ctrl, self._qpos = self.data.ctrl, self.data.qpos
         self._control_time = SUBSTEPS * float(self.model.opt.timestep)
         self._xpos, self._xmat = self.data.xpos, self.data.xmat
         self._bodies = {arm: scene.arms[arm].tip_body for arm in names.ARMS} | {"needle": self._needle_id}
@@ -145,7 +147,7 @@ class Simulation:
     def command(self, arm: str, command: Command) -> None:
         """Make `command` the arm's present command."""
         self.commands[arm] = command
-        ids = self.scene.arms[arm]
+        ids = self._arms[arm]
         self._ctrl[ids.actuators] = self._with_error(arm, command.joints) if self.offsets else command.joints
         self._ctrl[ids.jaw_actuator] = control.jaw_servo(command.jaw)
 
@@ -180,8 +182,7 @@ class Simulation:
         """
         if self.latency:
             action = self._delayed(action)
-        instrument = self.scene.config.instrument
-        self.command(arm, control.follow(self.commands[arm], action, step, self.bases[arm], instrument))
+        self.command(arm, control.follow(self.commands[arm], action, step, self.bases[arm], self._instrument))
         if self.memory.release > 0:
             self._let_go()
         data = self.data
@@ -298,7 +299,7 @@ class Simulation:
 
     def jaw(self, arm: str) -> float:
         """Return the measured angle of the left finger [rad]."""
-        return float(self.data.qpos[self.scene.arms[arm].finger_qpos])
+        return float(self._qpos[self._arms[arm].finger_qpos])
 
     def needle_point(self, angle: float) -> tuple[float, float, float]:
         """Return the needle's point at `angle` [rad] in world [m]."""
