@@ -1,0 +1,243 @@
+"""Measure speed: physics, pictures, resets and workers, each against the bare thing at equal settings.
+
+    python benchmarks/speed.py
+    python benchmarks/speed.py --only step --repeats 40
+
+step     `env.step` (obs_type state) along an expert's whole procedure, against a loop of `mj_step(…, nstep)` over the
+         same model, states and commands; both must end in the same positions. Without thread and with 10 segments.
+frames   `FrameRenderer.render` against `mujoco.Renderer` with shadows, multisampling and triangles set alike, on the
+         same states; both must give the same pixels. One core: llvmpipe draws in the calling thread.
+reset    per task [ms].
+workers  asynchronous vector envs with two workers against one, with state and with pictures.
+
+A and B take turns; figures are medians over the turns, and ratios are medians of the turns' ratios. `--clock cpu`
+counts the process's own CPU time instead of the wall's, for a machine that others use too; workers are timed by the
+wall in any case.
+"""
+
+import argparse
+import copy
+import os
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ["LP_NUM_THREADS"] = "0"
+
+import gymnasium
+import mujoco
+import numpy as np
+from common import LENGTHS, emit, median
+
+from surgicai_vision import envs, names
+from surgicai_vision.config import SceneConfig, TaskConfig
+from surgicai_vision.demos.expert import Expert
+from surgicai_vision.scene.rendering import QUALITIES, FrameRenderer
+
+STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+SIZE, CAMERA, POSES = 224, "front", 16
+
+
+class Recording(NamedTuple):
+    """An expert's episode: the env, its first state, the actions, and the servo commands they became."""
+
+    env: envs.SuturingEnv
+    start: np.ndarray
+    actions: np.ndarray
+    commands: np.ndarray
+
+
+CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
+
+
+class Clock:
+    """What tells the time; chosen on the command line."""
+
+    now = staticmethod(CLOCKS["wall"])
+
+
+def timed(function: Callable[[], Any]) -> float:
+    """Return how long a call takes [s]."""
+    start = Clock.now()
+    function()
+    return Clock.now() - start
+
+
+def in_turns(one: Callable[[], None], other: Callable[[], None], repeats: int) -> tuple[list[float], list[float]]:
+    """Return the times of two calls [s] that take turns, first one first, then the other; the first turn is lost."""
+    times: tuple[list[float], list[float]] = ([], [])
+    for turn in range(repeats + 1):
+        for index in (0, 1) if turn % 2 else (1, 0):
+            times[index].append(timed((one, other)[index]))
+    return times[0][1:], times[1][1:]
+
+
+def ratio(slow: list[float], fast: list[float]) -> float:
+    """Return the median of slow / fast over the turns."""
+    return median([a / b for a, b in zip(slow, fast, strict=True)])
+
+
+def record(thread: int) -> Recording:
+    """Let the expert throw one stitch."""
+    config = TaskConfig("suture", SceneConfig(thread=thread), max_steps=LENGTHS["suture"])
+    env = envs.make(config)
+    env.reset(seed=names.VALIDATION_SEED)
+    expert, start, actions, commands = Expert(env), env.get_state(), [], []
+    for _ in range(config.max_steps):
+        actions.append(expert.action())
+        ended = env.step(actions[-1])[2]
+        commands.append(env.data.ctrl.copy())
+        if ended:
+            break
+    return Recording(env, start, np.array(actions), np.array(commands))
+
+
+def measure_step(thread: int, repeats: int) -> dict[str, Any]:
+    """Time the env's steps against the bare physics."""
+    env, start, actions, commands = record(thread)
+    model, data, nstep = env.model, mujoco.MjData(env.model), env.frame_skip
+
+    def through_env() -> None:
+        for action in actions:
+            env.step(action)
+
+    def bare() -> None:
+        for command in commands:
+            data.ctrl[:] = command
+            mujoco.mj_step(model, data, nstep)
+
+    def both() -> tuple[float, float]:
+        env.set_state_vector(start)
+        mujoco.mj_setState(model, data, start, STATE)
+        return timed(through_env), timed(bare)
+
+    both()
+    if not np.array_equal(env.data.qpos, data.qpos):
+        raise SystemExit("env.step and the bare loop ended in different positions; the comparison is void.")
+    times = np.array([both() for _ in range(repeats)])
+    return {
+        "control_steps": len(actions),
+        "env_steps_per_s": round(len(actions) / median(times[:, 0].tolist(), 9)),
+        "bare_steps_per_s": round(len(actions) / median(times[:, 1].tolist(), 9)),
+        "of_bare": ratio(times[:, 1].tolist(), times[:, 0].tolist()),
+    }
+
+
+def measure_frames(repeats: int, frames: int) -> dict[str, Any]:
+    """Time our pictures against MuJoCo's own renderer."""
+    env, start, actions, _ = record(0)
+    env.set_state_vector(start)
+    states = []
+    for index, action in enumerate(actions):
+        env.step(action)
+        if index % (len(actions) // POSES) == 0:
+            states.append(copy.copy(env.data))
+    model = copy.deepcopy(env.model)
+    _set_quality(model)
+    ours, bare = FrameRenderer(env.model, SIZE, SIZE), mujoco.Renderer(model, SIZE, SIZE)
+    bare.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+
+    def draw(state: mujoco.MjData) -> np.ndarray:
+        bare.update_scene(state, CAMERA)
+        return bare.render()
+
+    same = all(np.array_equal(ours.render(state, CAMERA), draw(state)) for state in states)
+
+    def through_ours() -> None:
+        for index in range(frames):
+            ours.render(states[index % len(states)], CAMERA)
+
+    def through_bare() -> None:
+        for index in range(frames):
+            draw(states[index % len(states)])
+
+    first, second = in_turns(through_ours, through_bare, repeats)
+    default = mujoco.Renderer(env.model, SIZE, SIZE)
+    slow = timed(lambda: [(default.update_scene(state, CAMERA), default.render()) for state in states])
+    for renderer in (default, bare, ours):
+        renderer.close()
+    return {
+        "size": SIZE,
+        "camera": CAMERA,
+        "same_pixels": same,
+        "frames_per_s": round(frames / median(first, 9)),
+        "bare_frames_per_s": round(frames / median(second, 9)),
+        "of_bare": ratio(second, first),
+        "bare_frames_per_s_at_mujocos_default_quality": round(len(states) / slow, 1),
+    }
+
+
+def _set_quality(model: mujoco.MjModel) -> None:
+    """Set a model to the settings of our quality "fast"."""
+    quality, visual = QUALITIES["fast"], model.vis.quality
+    visual.offsamples, visual.numslices, visual.numstacks = quality.samples, quality.slices, quality.stacks
+    visual.numquads = quality.quads
+
+
+def measure_reset(repeats: int) -> dict[str, float]:
+    """Return the median time of a reset per task [ms]."""
+    row = {}
+    for task in names.TASKS:
+        env = envs.make(TaskConfig(task))
+        env.reset(seed=0)
+        times = [timed(lambda seed=seed, env=env: env.reset(seed=seed)) for seed in range(1, 5 * repeats + 1)]
+        row[task] = median([seconds * 1e3 for seconds in times], 2)
+    return row
+
+
+def measure_workers(repeats: int, steps: int, obs_type: str) -> dict[str, Any]:
+    """Time vector envs with one and with two workers; steps of all workers a second."""
+    chosen = {"obs_type": obs_type, **({"cameras": (CAMERA,), "image_size": SIZE} if obs_type == "pixels" else {})}
+    vectors = [
+        gymnasium.make_vec(
+            names.ENV_IDS["insert"], count, "async", vector_kwargs={"context": "spawn"}, max_steps=10**6, **chosen
+        )
+        for count in (1, 2)
+    ]
+    rng = np.random.default_rng(0)
+    for vector in vectors:
+        vector.reset(seed=0)
+
+    def drive(index: int) -> None:
+        count = index + 1
+        for _ in range(steps):
+            vectors[index].step(rng.uniform(-0.2, 0.2, (count, 7)).astype(np.float32))
+
+    one, two = in_turns(lambda: drive(0), lambda: drive(1), repeats)
+    for vector in vectors:
+        vector.close()
+    return {
+        "one_steps_per_s": round(steps / median(one, 9)),
+        "two_steps_per_s": round(2 * steps / median(two, 9)),
+        "two_of_one": ratio([2 * seconds for seconds in one], two),
+    }
+
+
+def main() -> None:
+    """Measure and print one JSON line."""
+    parts = ("step", "frames", "reset", "workers")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=parts, nargs="+", default=parts)
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--frames", type=int, default=100, help="frames or vector steps in a turn")
+    parser.add_argument("--clock", choices=tuple(CLOCKS), default="wall")
+    chosen = parser.parse_args()
+    Clock.now = staticmethod(CLOCKS[chosen.clock])
+    row: dict[str, Any] = {"repeats": chosen.repeats, "clock": chosen.clock}
+    if "step" in chosen.only:
+        row["step"] = {f"thread_{thread}": measure_step(thread, chosen.repeats) for thread in (0, 10)}
+    if "frames" in chosen.only:
+        row["frames"] = measure_frames(chosen.repeats, chosen.frames)
+    if "reset" in chosen.only:
+        row["reset_ms"] = measure_reset(chosen.repeats)
+    if "workers" in chosen.only:
+        Clock.now = staticmethod(CLOCKS["wall"])
+        kinds = ("state", "pixels")
+        row["workers"] = {kind: measure_workers(chosen.repeats, chosen.frames, kind) for kind in kinds}
+    row["load_average"] = [round(value, 2) for value in os.getloadavg()]
+    emit("speed", row, render="frames" in chosen.only)
+
+
+if __name__ == "__main__":
+    main()
