@@ -10,6 +10,7 @@ import importlib
 import json
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn, final
 
@@ -19,6 +20,10 @@ from surgicai_vision.commands.options import add_arguments, build, nearest_optio
 from surgicai_vision.errors import InputError, SurgicaiError, UnknownName
 
 PROGRAM = "surgicai-vision"
+TITLE = (
+    "Image-based imitation learning for robotic suturing:\n"
+    "scene → env → demos → dataset → features → policy → evaluation → report"
+)
 INTERRUPTED = "interrupted; run the same command again to continue"
 
 
@@ -46,26 +51,34 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(_usage())
-        return 0 if arguments else 2
-    if arguments[0] == "--version":
+    if arguments[:1] == ["--version"]:
         from importlib.metadata import version
 
         print(f"{PROGRAM} {version(PROGRAM)}")
         return 0
+    return _choose("", VERBS, TITLE, arguments)
+
+
+def _choose(group: str, verbs: Mapping[str, str], title: str, arguments: list[str]) -> int:
+    """Find the verb among `verbs`, in the group's own where it has them, and run it."""
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_usage(group, verbs, title))
+        return 0 if arguments else 2
     verb = arguments[0]
     if verb.startswith("-"):
-        raise UnknownName("option before the verb", verb, ("--help", "--version"))
-    if verb not in VERBS:
-        raise UnknownName("verb", verb, VERBS)
-    return _run(verb, arguments[1:])
+        raise UnknownName("option before the verb", verb, ("--help",) if group else ("--help", "--version"))
+    if verb not in verbs:
+        raise UnknownName(f"verb of {group}" if group else "verb", verb, verbs)
+    name = f"{group} {verb}".strip()
+    module = importlib.import_module(module_name(name))
+    if hasattr(module, "VERBS"):
+        return _choose(name, module.VERBS, f"{verbs[verb][0].upper()}{verbs[verb][1:]}.", arguments[1:])
+    return _run(name, verbs[verb], module, arguments[1:])
 
 
-def _run(verb: str, arguments: list[str]) -> int:
+def _run(verb: str, text: str, module: Any, arguments: list[str]) -> int:
     """Parse one verb's options, run it and print its result."""
-    module = importlib.import_module(module_name(verb))
-    parser = _parser(verb, module)
+    parser = _parser(verb, text, module)
     for text in arguments:
         if text.startswith("--") and text.split("=")[0] not in parser._option_string_actions:
             raise nearest_option(text, parser)
@@ -84,20 +97,21 @@ def _run(verb: str, arguments: list[str]) -> int:
     return int(result.get("exit_code", 0))
 
 
-def _usage() -> str:
-    width = max(map(len, VERBS))
+def _usage(group: str, verbs: Mapping[str, str], title: str) -> str:
+    program = f"{PROGRAM} {group}".strip()
+    width = max(map(len, verbs))
     lines = [
-        f"usage: {PROGRAM} VERB [options]",
+        f"usage: {program} VERB [options]",
         "",
-        "Image-based imitation learning for robotic suturing:",
-        "scene → env → demos → dataset → features → policy → evaluation → report",
+        title,
         "",
         "verbs:",
-        *(f"  {verb:<{width}}  {text}" for verb, text in VERBS.items()),
+        *(f"  {verb:<{width}}  {text}" for verb, text in verbs.items()),
         "",
-        f"`{PROGRAM} VERB --help` shows a verb's options, defaults and an example.",
-        f"`{PROGRAM} --version` prints the version.",
+        f"`{program} VERB --help` shows a verb's options, defaults and an example.",
     ]
+    if not group:
+        lines.append(f"`{PROGRAM} --version` prints the version.")
     return "\n".join(lines)
 
 
@@ -110,14 +124,13 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose errors are one `InputError` line."""
 
     def error(self, message: str) -> NoReturn:
-        raise InputError(f"{self.prog.split()[-1]}: {message}; see `{self.prog} --help`.")
+        raise InputError(f"{self.prog.removeprefix(PROGRAM).strip()}: {message}; see `{self.prog} --help`.")
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         raise _HelpShown
 
 
-def _parser(verb: str, module: Any) -> argparse.ArgumentParser:
-    text = VERBS[verb]
+def _parser(verb: str, text: str, module: Any) -> argparse.ArgumentParser:
     parser = _Parser(
         prog=f"{PROGRAM} {verb}",
         description=f"{text[0].upper()}{text[1:]}.",

@@ -1,5 +1,6 @@
 """The command line: help, wrong input in one line, options from files, exit codes."""
 
+import importlib
 import json
 import os
 import subprocess
@@ -17,6 +18,13 @@ from surgicai_vision.commands.options import build, config_only, many_of, option
 from surgicai_vision.config import SceneConfig
 from surgicai_vision.errors import BadFile, InputError, UnknownName
 from surgicai_vision.files import configs_folder
+
+
+def all_verbs():
+    """Every verb, those inside a verb with both words."""
+    for verb in VERBS:
+        inner = getattr(importlib.import_module(module_name(verb)), "VERBS", None)
+        yield from [verb] if inner is None else [f"{verb} {name}" for name in inner]
 
 
 @pytest.fixture(autouse=True)
@@ -37,9 +45,9 @@ def fails(capsys, *arguments):
     return lines[0]
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", list(all_verbs()))
 def test_help_shows_options_and_an_example(verb, capsys):
-    assert main([verb, "--help"]) == 0
+    assert main([*verb.split(), "--help"]) == 0
     text = capsys.readouterr().out
     assert f"example:\n  surgicai-vision {verb}" in text
     assert "--json" in text
@@ -52,17 +60,26 @@ def test_help_names_every_verb(capsys):
     assert all(verb in text for verb in VERBS)
 
 
+def test_help_of_a_verb_with_verbs_names_them(capsys):
+    assert main(["dataset"]) == 2
+    assert main(["dataset", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "usage: surgicai-vision dataset VERB" in text
+    assert "check" in text
+    assert "repair" in text
+
+
 def test_help_imports_nothing_heavy():
+    verbs = list(all_verbs())
     code = (
         "import sys, contextlib, io\n"
         "from surgicai_vision.cli import main\n"
-        "from surgicai_vision.commands import VERBS\n"
         "with contextlib.redirect_stdout(io.StringIO()):\n"
-        "    codes = [main([verb, '--help']) for verb in VERBS]\n"
+        f"    codes = [main([*verb.split(), '--help']) for verb in {verbs}]\n"
         "print(codes, sorted({'torch', 'lerobot', 'mujoco', 'scipy', 'cv2', 'pandas'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == f"{[0] * len(VERBS)} []"
+    assert done.stdout.strip() == f"{[0] * len(verbs)} []"
 
 
 def test_no_arguments_show_help_and_fail(capsys):
@@ -79,6 +96,12 @@ def test_version(capsys):
     ("arguments", "said"),
     [
         (["evaluat"], "Did you mean 'evaluate'?"),
+        (["dataset", "chek"], "Unknown verb of dataset 'chek'. Did you mean 'check'?"),
+        (["dataset", "--jsn"], "option before the verb"),
+        (["dataset", "check"], "dataset check: the following arguments are required: DIR"),
+        (["dataset", "check", "missing"], "missing is not a dataset"),
+        (["dataset", "check", "missing", "--jsn"], "Did you mean '--json'?"),
+        (["dataset", "repair", "missing"], "missing is no LeRobot dataset"),
         (["--vresion"], "Did you mean '--version'?"),
         (["evaluate", "expert", "--episods", "5"], "Did you mean '--episodes'?"),
         (["evaluate", "--episods=5"], "Did you mean '--episodes'?"),
@@ -254,8 +277,8 @@ def test_evaluate_prints_one_json_object_last(capsys, tmp_path):
 
 
 def test_every_verb_has_its_module():
-    for verb in VERBS:
-        module = __import__(module_name(verb), fromlist=["run"])
+    for verb in all_verbs():
+        module = importlib.import_module(module_name(verb))
         assert module.EXAMPLE.startswith(f"surgicai-vision {verb}")
         assert callable(module.run)
 

@@ -2,6 +2,7 @@
 
 A verb's module holds `EXAMPLE` (one command line), `Options` (a frozen dataclass: the schema of its
 options and of its `--config` file) and `run(options, console) -> dict` (the result `--json` prints).
+A verb that has verbs of its own is a folder with its own `VERBS`.
 """
 
 from types import MappingProxyType
@@ -14,7 +15,9 @@ VERBS = MappingProxyType(
         "record-demos": "record demonstrations by the scripted expert",
         "import-demos": "read demonstrations of the original SurgicAI",
         "render-demos": "render demonstrations into a LeRobot dataset",
+        "dataset": "check, repair, reduce or share a dataset",
         "encode": "compute a dataset's frozen features",
+        "cache": "list, measure or prune the cached features",
         "train": "train a policy on a dataset's features",
         "evaluate": "run a policy from held-out starts and count successes",
         "sweep": "encode, train and evaluate every cell of a grid",
@@ -25,5 +28,5 @@ VERBS = MappingProxyType(
 
 
 def module_name(verb: str) -> str:
-    """Name of the module that holds `verb`."""
-    return f"{__name__}.{verb.replace('-', '_')}"
+    """Name of the module that holds `verb` ("dataset check" for a verb inside a verb)."""
+    return f"{__name__}.{verb.replace('-', '_').replace(' ', '.')}"

@@ -3,11 +3,22 @@
     from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 
 `rendering` turns states into pictures (one job an episode), `writing` assembles the episodes with LeRobot's
-own metadata writer, `reading` opens a dataset without torch, `checking` verifies one.
+own metadata writer, `reading` opens a dataset without torch, `checking` verifies one, `repairing` keeps
+the longest verified prefix of a broken one.
 """
 
 from surgicai_vision.dataset.checking import CheckReport, check_dataset
 from surgicai_vision.dataset.reading import Dataset, open_dataset
 from surgicai_vision.dataset.rendering import DatasetSummary, render_demos
+from surgicai_vision.dataset.repairing import Repair, repair_dataset
 
-__all__ = ["CheckReport", "Dataset", "DatasetSummary", "check_dataset", "open_dataset", "render_demos"]
+__all__ = [
+    "CheckReport",
+    "Dataset",
+    "DatasetSummary",
+    "Repair",
+    "check_dataset",
+    "open_dataset",
+    "render_demos",
+    "repair_dataset",
+]

@@ -1,4 +1,4 @@
-"""Check a dataset: counts, order, pictures, numbers, statistics and the digest, every frame of it.
+"""Check a dataset, ours or anyone's: counts, order, pictures, numbers, statistics and the digest, every frame of it.
 
     report = check_dataset(Path("dataset"))
     report.ok, report.problems        # each problem one line
@@ -6,10 +6,12 @@
 What is checked: `meta/surgicai.json`, LeRobot's `meta/info.json`, `meta/episodes` and `meta/stats.json` agree
 with the data and with each other; index columns are gapless and in order; every number is finite; every
 picture decodes, has its size, is not of one colour and is not the one before it while the arm or the needle
-moved; depth is positive; the digest over the decoded content is the one recorded when it was rendered.
+moved; depth is positive; the digest over the decoded content is the one recorded when it was rendered. Of another
+LeRobot dataset, everything that is not ours alone; its digest is that over its files.
 """
 
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,15 +21,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from surgicai_vision import names
+from surgicai_vision.config import digest as digest_of
 from surgicai_vision.dataset import layout
+from surgicai_vision.dataset.judging import PictureWatch, episode_problems, number_problems
+from surgicai_vision.dataset.lerobot_files import INFO, LeRobotFiles
 from surgicai_vision.dataset.reading import Dataset, open_dataset
 from surgicai_vision.dataset.statistics import column_statistics
+from surgicai_vision.dataset.verifying import Verifier
 from surgicai_vision.errors import BadFile
 from surgicai_vision.executor import Progress
-from surgicai_vision.files import read_json
+from surgicai_vision.files import read_json, sha256_file
 
-MOVED = 0.001
-"""An arm or a needle that went further than this between two frames [m] must be seen to have moved."""
 MOST_PROBLEMS = 50
 """Problems listed; the rest is counted."""
 STATISTICS_TOLERANCE = 1e-4
@@ -52,15 +56,21 @@ class CheckReport:
 def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
     """Read all of a dataset and report what is wrong with it.
 
+    Args:
+        path: a dataset of ours or another LeRobot v3 dataset.
+        progress: called with (done, total, "frames" or "episodes").
+
     Raises:
         BadFile: it cannot be opened at all.
     """
+    if (path / INFO).is_file() and not (path / names.META_FILE).exists():
+        return _check_foreign(LeRobotFiles(path), progress or (lambda done, total, unit: None))
     dataset = open_dataset(path)
     problems: list[str] = []
     columns = dataset.columns()
     keys = [key for key, _, _ in layout.picture_keys(dataset.views, dataset.has_depth, dataset.has_segmentation)]
     _check_order(dataset, columns, problems)
-    _check_numbers(columns, problems)
+    problems.extend(number_problems(columns))
     _check_lerobot(dataset, columns, keys, problems)
     digests = []
     bounds = _bounds(dataset.episode_index)
@@ -72,10 +82,41 @@ def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
     digest = layout.dataset_digest(digests)
     if digest != dataset.meta.get("digest"):
         problems.append(f"digest: the content has {digest[:16]}…, its {names.META_FILE} says otherwise.")
-    listed = problems[:MOST_PROBLEMS]
-    if len(problems) > MOST_PROBLEMS:
-        listed.append(f"… and {len(problems) - MOST_PROBLEMS} more.")
-    return CheckReport(dataset.length, len(bounds), digest, tuple(listed))
+    return CheckReport(dataset.length, len(bounds), digest, _listed(problems))
+
+
+def _listed(problems: list[str]) -> tuple[str, ...]:
+    """Return the problems, the last ones counted where there are many."""
+    more = len(problems) - MOST_PROBLEMS
+    return (*problems[:MOST_PROBLEMS], *([f"… and {more} more."] if more > 0 else []))
+
+
+def _check_foreign(files: LeRobotFiles, progress: Progress) -> CheckReport:
+    """Check a LeRobot dataset that is not ours."""
+    rows: list[tuple[int, int, int]] = []
+    start, claimed = 0, int(files.info.get("total_episodes") or 0)
+    with tempfile.TemporaryDirectory(prefix="surgicai-vision-") as scratch:
+        for number, episode in enumerate(Verifier(files).episodes(Path(scratch))):
+            count = len(episode.table)
+            rows.append((count, start, start + count))
+            start += count
+            progress(number + 1, max(claimed, number + 1), "episodes")
+    problems = list(files.problems)
+    if (files.info.get("total_frames"), files.info.get("total_episodes")) != (start, len(rows)):
+        problems.append(
+            f"{INFO}: it counts {files.info.get('total_episodes')} episodes and {files.info.get('total_frames')} "
+            f"frames; {len(rows)} and {start} are whole."
+        )
+    written = [
+        tuple(row.get(key) for key in ("length", "dataset_from_index", "dataset_to_index")) for row in files.rows
+    ]
+    if written != rows:
+        problems.append("meta/episodes: its rows are not the episodes of the data.")
+    missing = [key for key, row in files.features.items() if row["dtype"] != "string" and key not in files.statistics]
+    if missing:
+        problems.append(f"meta/stats.json: no statistics of {', '.join(missing)}.")
+    data = [*files.data_files(), *sorted(files.path.glob("videos/*/chunk-*/file-*.mp4"))]
+    return CheckReport(start, len(rows), digest_of([sha256_file(file) for file in data]), _listed(problems))
 
 
 def _bounds(episode_index: np.ndarray) -> list[tuple[int, int]]:
@@ -96,25 +137,7 @@ def _check_order(dataset: Dataset, columns: Mapping[str, np.ndarray], problems: 
     if len(bounds) != dataset.meta.get("episodes"):
         problems.append(f"episodes: {len(bounds)} in the data, {dataset.meta.get('episodes')} in {names.META_FILE}.")
     for number, (start, stop) in enumerate(bounds):
-        steps = np.arange(stop - start)
-        if not np.array_equal(columns["frame_index"][start:stop], steps):
-            problems.append(f"episode {number}: frame_index is not 0, 1, 2, …")
-        if not np.allclose(columns["timestamp"][start:stop], steps / names.FPS, atol=1e-4):
-            problems.append(f"episode {number}: timestamp is not frame_index / {names.FPS}.")
-        if not np.array_equal(columns[names.DONE][start:stop], steps == stop - start - 1):
-            problems.append(f"episode {number}: {names.DONE} is not true at its last frame alone.")
-        if len(np.unique(columns[names.SEED][start:stop])) != 1:
-            problems.append(f"episode {number}: its frames have different seeds.")
-
-
-def _check_numbers(columns: Mapping[str, np.ndarray], problems: list[str]) -> None:
-    """Check that numbers are finite and actions within [-1, 1]."""
-    for key in layout.COLUMNS:
-        wrong = ~np.isfinite(columns[key].astype(np.float64)).reshape(len(columns[key]), -1).all(axis=1)
-        if wrong.any():
-            problems.append(f"{key}: {wrong.sum()} frames with numbers that are not finite, first {wrong.argmax()}.")
-    if len(columns[names.ACTION]) and np.nanmax(np.abs(columns[names.ACTION])) > 1.0:
-        problems.append(f"{names.ACTION}: values outside [-1, 1].")
+        problems.extend(episode_problems(number, {key: rows[start:stop] for key, rows in columns.items()}))
 
 
 def _check_lerobot(dataset: Dataset, columns: Mapping[str, np.ndarray], keys: list[str], problems: list[str]) -> None:
@@ -161,45 +184,20 @@ def _check_episode(
     dataset: Dataset, keys: list[str], start: int, stop: int, rows: Mapping[str, np.ndarray], problems: list[str]
 ) -> str:
     """Check one episode's pictures; return the digest of its content."""
-    shown = np.concatenate([rows[names.STATE][:, :3], rows[names.NEEDLE_POSE][:, :3]], axis=1)
-    # A wrist camera need not see what moved, and a part's outline can stay the same.
-    still = [view for view in dataset.views if not view.startswith("wrist")]
-    watched = {key(view) for view in still for key in (names.image_key, names.depth_key)}
     digest = layout.EpisodeDigest(keys)
     for key in keys:
-        before: np.ndarray | None = None
-        last = shown[0]
+        watch = PictureWatch(key, dataset.image_size, dataset.views, rows)
         for index, frame in enumerate(_frames(dataset, key, start, stop, problems)):
             digest.add(key, frame)
-            problem = _picture_problem(frame, dataset.image_size)
-            if before is not None and np.array_equal(frame, before):
-                if key in watched and np.abs(shown[index] - last).max() > MOVED:
-                    problem = problem or "the picture before it again, although something moved"
-            else:
-                before, last = frame, shown[index]
+            problem = watch.problem(index, frame)
             if problem:
                 problems.append(f"frame {start + index}, {key}: {problem}.")
     return digest.hexdigest(rows)
 
 
-def _frames(dataset: Dataset, key: str, start: int, stop: int, problems: list[str]) -> list[np.ndarray]:
-    """Return an episode's pictures of one column; those before the first that cannot be decoded."""
-    frames = []
+def _frames(dataset: Dataset, key: str, start: int, stop: int, problems: list[str]) -> Iterator[np.ndarray]:
+    """Yield an episode's pictures of one column; those before the first that cannot be decoded."""
     try:
-        for frame in dataset.decoded(key, start, stop):
-            frames.append(frame)
+        yield from dataset.decoded(key, start, stop)
     except BadFile as error:
         problems.append(str(error))
-    return frames
-
-
-def _picture_problem(frame: np.ndarray, size: int) -> str:
-    """Return what is wrong with a picture by itself, or nothing."""
-    if frame.shape[:2] != (size, size):
-        return f"it is {frame.shape[0]} × {frame.shape[1]}, not {size} × {size}"
-    if frame.dtype == np.float32 and not (np.isfinite(frame).all() and frame.min() > 0.0):
-        return "depth that is not finite and positive"
-    low, high = frame.min(), frame.max()
-    if low == high:
-        return "black" if high == 0 else "of one colour"
-    return ""

@@ -4,13 +4,14 @@ Its own writer would do, but importing it takes 11 s on an idle machine (torch, 
 everything else here takes one. `tests/test_dataset.py` holds each of these against what lerobot 0.6.1 writes.
 
     schema = arrow_schema(features)               # of data files, with what `datasets` reads from it
-    write_metadata(folder, features, text, episodes)
+    write_metadata(folder, features, tasks, episodes)
 """
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -40,18 +41,34 @@ Features = Mapping[str, Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class EpisodeRow:
-    """One episode's row: its frames [start, stop), its data file's number, and its statistics by feature."""
+    """One episode's row.
+
+    Attributes:
+        start: its first frame in the dataset.
+        stop: the frame after its last.
+        file: number of its data file.
+        statistics: its statistics by feature.
+        tasks: sentences of its tasks; none where the dataset has one task.
+        videos: feature → (file's number, first second, second after the last).
+    """
 
     start: int
     stop: int
     file: int
     statistics: Mapping[str, Statistics]
+    tasks: tuple[str, ...] = ()
+    videos: Mapping[str, tuple[int, float, float]] = field(default_factory=lambda: MappingProxyType({}))
 
 
 def all_features(features: Features) -> dict[str, Any]:
     """Return the features with the columns LeRobot adds."""
     added = {key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in INDEX_FEATURES.items()}
     return {**features, **added}
+
+
+def video_path(key: str, file: int) -> str:
+    """Return the path of video file number `file` of a feature inside the dataset."""
+    return f"videos/{key}/chunk-{file // FILES_PER_CHUNK:03d}/file-{file % FILES_PER_CHUNK:03d}.mp4"
 
 
 def data_path(file: int) -> str:
@@ -64,73 +81,102 @@ def arrow_schema(features: Features) -> pa.Schema:
     fields: list[pa.Field] = []
     hub: dict[str, Any] = {}
     for key, feature in all_features(features).items():
-        if feature["dtype"] == "image":
-            fields.append(pa.field(key, pa.struct({"bytes": pa.binary(), "path": pa.string()})))
-            hub[key] = {"_type": "Image"}
-            continue
-        kind = pa.bool_() if feature["dtype"] == "bool" else pa.from_numpy_dtype(np.dtype(feature["dtype"]))
-        value = {"dtype": feature["dtype"], "_type": "Value"}
-        if feature["shape"] == (1,):
+        if feature["dtype"] != "video":
+            kind, hub[key] = _types(feature["dtype"], feature["shape"])
             fields.append(pa.field(key, kind))
-            hub[key] = value
-        else:
-            length = feature["shape"][0]
-            fields.append(pa.field(key, pa.list_(kind, length)))
-            hub[key] = {"feature": value, "length": length, "_type": "List"}
     return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": hub}})})
 
 
-def write_metadata(folder: Path, features: Features, text: str, episodes: Sequence[EpisodeRow]) -> None:
-    """Write `meta/info.json`, `tasks.parquet`, `episodes/…` and `stats.json` of a dataset of one task.
+def _types(dtype: str, shape: tuple[int, ...]) -> tuple[Any, dict[str, Any]]:
+    """Return a feature's Arrow type and Hugging Face's."""
+    if dtype == "image":
+        return pa.struct({"bytes": pa.binary(), "path": pa.string()}), {"_type": "Image"}
+    kind = {"bool": pa.bool_(), "string": pa.string()}.get(dtype) or pa.from_numpy_dtype(np.dtype(dtype))
+    value = {"dtype": dtype, "_type": "Value"}
+    if shape == (1,):
+        return kind, value
+    if len(shape) == 1:
+        return pa.list_(kind, shape[0]), {"feature": value, "length": shape[0], "_type": "List"}
+    for _ in shape:
+        kind = pa.list_(kind)
+    return kind, {"shape": list(shape), "dtype": dtype, "_type": f"Array{len(shape)}D"}
+
+
+def write_metadata(
+    folder: Path,
+    features: Features,
+    tasks: Sequence[str],
+    episodes: Sequence[EpisodeRow],
+    origin: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Write `meta/info.json`, `tasks.parquet`, `episodes/…` and `stats.json` of a dataset.
 
     Args:
         folder: the dataset.
         features: its features, without the columns LeRobot adds.
-        text: the task's sentence.
+        tasks: the sentence of every task, in the order of `task_index`.
         episodes: every episode, in order.
+        origin: the `meta/info.json` of the dataset it is made from; what is not counted here is kept.
     """
     import pandas
 
     meta = folder / "meta"
     (meta / "episodes/chunk-000").mkdir(parents=True)
+    videos = any(feature["dtype"] == "video" for feature in features.values())
+    kept = ("fps", "robot_type", "tools", "data_files_size_in_mb", "video_files_size_in_mb")
     info = {
         "codebase_version": CODEBASE_VERSION,
         "fps": names.FPS,
         "features": all_features(features),
         "total_episodes": len(episodes),
         "total_frames": episodes[-1].stop,
-        "total_tasks": 1,
+        "total_tasks": len(tasks),
         "chunks_size": FILES_PER_CHUNK,
         "data_files_size_in_mb": DATA_FILE_MB,
         "video_files_size_in_mb": VIDEO_FILE_MB,
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": None,
+        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4" if videos else None,
         "robot_type": ROBOT_TYPE,
         "splits": {"train": f"0:{len(episodes)}"},
+        **{key: origin[key] for key in kept if key in origin},
     }
     # In the order of the features, which is the order LeRobot shows and policies stack them in.
     (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n")
-    pandas.DataFrame({"task_index": [0]}, index=pandas.Index([text], name="task")).to_parquet(meta / "tasks.parquet")
-    rows = [_row(index, text, episode) for index, episode in enumerate(episodes)]
+    index = pandas.Index(list(tasks), name="task")
+    pandas.DataFrame({"task_index": range(len(tasks))}, index=index).to_parquet(meta / "tasks.parquet")
+    rows = [_row(number, episode.tasks or tasks, episode) for number, episode in enumerate(episodes)]
     table = pa.Table.from_pydict({key: [row[key] for row in rows] for key in rows[0]})
     pq.write_table(table, meta / "episodes/chunk-000/file-000.parquet")
     write_json(meta / "stats.json", aggregate([episode.statistics for episode in episodes]))
 
 
-def _row(index: int, text: str, episode: EpisodeRow) -> dict[str, Any]:
+def _row(index: int, tasks: Sequence[str], episode: EpisodeRow) -> dict[str, Any]:
     """Return an episode's row of `meta/episodes`."""
     row = {
         "episode_index": index,
-        "tasks": [text],
+        "tasks": list(tasks),
         "length": episode.stop - episode.start,
         "data/chunk_index": episode.file // FILES_PER_CHUNK,
         "data/file_index": episode.file % FILES_PER_CHUNK,
         "dataset_from_index": episode.start,
         "dataset_to_index": episode.stop,
     }
+    for key, (file, begin, end) in episode.videos.items():
+        row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"] = divmod(file, FILES_PER_CHUNK)
+        row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"] = begin, end
     for key, statistics in episode.statistics.items():
         row.update({f"stats/{key}/{name}": value for name, value in statistics.items()})
     return {**row, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+
+
+def row_statistics(row: Mapping[str, Any]) -> dict[str, Statistics]:
+    """Return the statistics in an episode's row of `meta/episodes`, by feature."""
+    table: dict[str, Statistics] = {}
+    for name, value in row.items():
+        if name.startswith("stats/") and value is not None:
+            _, key, statistic = name.split("/")
+            table.setdefault(key, {})[statistic] = value
+    return table
 
 
 def aggregate(episodes: Sequence[Mapping[str, Statistics]]) -> dict[str, Statistics]:

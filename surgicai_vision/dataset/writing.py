@@ -43,13 +43,13 @@ def assemble(shards: Sequence[Path], out: Path, features: Features, text: str, m
         meta: content of `meta/surgicai.json`.
     """
     with whole_folder(out) as folder:
-        data = _DataFiles(folder, features)
+        data = DataFiles(folder, features)
         rows = []
         for index, shard in enumerate(shards):
             statistics = read_json(shard / SUMMARY_FILE)["statistics"]
             rows.append(data.append(index, pq.read_table(shard / EPISODE_FILE), statistics))
         data.close()
-        write_metadata(folder, features, text, rows)
+        write_metadata(folder, features, [text], rows)
         write_json(folder / names.META_FILE, meta)
 
 
@@ -68,25 +68,28 @@ def compression(schema: pa.Schema, depth: Sequence[str]) -> dict[str, str]:
     return codecs
 
 
-class _DataFiles:
-    """The growing data files: one row group an episode."""
+class DataFiles:
+    """The growing data files of a dataset in `folder`: one row group an episode."""
 
-    def __init__(self, folder: Path, features: Features):
-        self._folder, self._schema = folder, arrow_schema(features)
+    def __init__(self, folder: Path, features: Features, fps: float = names.FPS):
+        self._folder, self._schema, self._fps = folder, arrow_schema(features), fps
         self._file, self._frames, self._bytes = -1, 0, 0
         self._writer: pq.ParquetWriter | None = None
         self._compression = compression(self._schema, [key for key, row in features.items() if row.get("info")])
 
     def append(self, index: int, episode: pa.Table, statistics: Mapping[str, Any]) -> EpisodeRow:
-        """Write episode `index` and return its row."""
+        """Write episode `index` and return its row; the index columns are made here, `task_index` if it is missing."""
         count, start = len(episode), self._frames
         indices = {
-            "timestamp": (np.arange(count) / names.FPS).astype(np.float32),
+            "timestamp": (np.arange(count) / self._fps).astype(np.float32),
             "frame_index": np.arange(count),
             "episode_index": np.full(count, index),
             "index": np.arange(start, start + count),
             "task_index": np.zeros(count, np.int64),
         }
+        if "task_index" in episode.column_names:
+            indices["task_index"] = episode.column("task_index").to_numpy()
+        episode = episode.drop_columns([name for name in indices if name in episode.column_names])
         for name, values in indices.items():
             episode = episode.append_column(name, pa.array(values))
         writer = self._present()

@@ -1,0 +1,11 @@
+"""`dataset`: verbs on a dataset that exists, one file each."""
+
+from types import MappingProxyType
+
+VERBS = MappingProxyType(
+    {
+        "check": "read all of a dataset and say what is wrong with it",
+        "repair": "keep the longest whole prefix of a broken LeRobot dataset",
+    }
+)
+"""Verb → what it does, in one line."""

@@ -1,0 +1,101 @@
+"""Videos of a LeRobot dataset: frames by their number, written and read with PyAV.
+
+A policy reads at random: every second frame is a key frame.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import Any
+
+import numpy as np
+
+from surgicai_vision.errors import BadFile
+
+CODECS = MappingProxyType(
+    {
+        "h264": ("libx264", {"g": "2", "crf": "30"}),
+        "av1": ("libsvtav1", {"g": "2", "crf": "30", "preset": "12"}),
+    }
+)
+"""Codec → (encoder, options): LeRobot's defaults (lerobot 0.6.1, configs/video.py)."""
+
+PIXELS = "yuv420p"
+
+
+class VideoWriter:
+    """A video file in the making."""
+
+    def __init__(self, path: Path, codec: str, fps: int, size: int):
+        import av
+
+        name, options = CODECS[codec]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._container: Any = av.open(str(path), "w")
+        stream: Any = self._container.add_stream(name, rate=fps, options=dict(options))
+        stream.width = stream.height = size
+        stream.pix_fmt = PIXELS
+        self._stream = stream
+
+    def add(self, frame: np.ndarray) -> None:
+        """Append a frame, (H, W, 3) uint8 RGB."""
+        import av
+
+        picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+        self._container.mux(self._stream.encode(picture))
+
+    def close(self) -> None:
+        """Write what the encoder still holds and the file's index."""
+        self._container.mux(self._stream.encode())
+        self._container.close()
+
+    def __enter__(self) -> "VideoWriter":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None) -> None:
+        self.close() if kind is None else self._container.close()
+
+
+def read_frames(path: Path, first: int, count: int, fps: float) -> Iterator[np.ndarray]:
+    """Yield the frames first … first + count - 1 of a video, each (H, W, 3) uint8 RGB.
+
+    Raises:
+        BadFile: it cannot be decoded, or a frame is missing.
+    """
+    import av
+
+    wanted = first
+    try:
+        with av.open(str(path)) as container:
+            stream: Any = container.streams.video[0]
+            stream.thread_type = "NONE"  # frames by slices in threads would cost more than they bring at this size
+            if first:
+                container.seek(int(first / fps / stream.time_base), stream=stream)
+            for frame in container.decode(stream):
+                number = round(frame.time * fps)
+                if number < wanted:
+                    continue
+                if number > wanted:
+                    break
+                yield frame.to_ndarray(format="rgb24")
+                wanted += 1
+                if wanted == first + count:
+                    return
+    except (OSError, av.FFmpegError, IndexError, TypeError) as error:
+        raise BadFile(f"{path}: frame {wanted} cannot be decoded ({str(error).splitlines()[0]}).") from None
+    if wanted < first + count:
+        raise BadFile(f"{path} has no frame {wanted}.")
+
+
+def count_frames(path: Path) -> int:
+    """Return the number of frames in a video by its packets; 0 where it cannot be read."""
+    import av
+
+    count = 0
+    try:
+        with av.open(str(path)) as container:
+            for packet in container.demux(container.streams.video[0]):
+                count += packet.pts is not None
+    except (OSError, av.FFmpegError, IndexError):
+        return 0
+    return count
