@@ -133,7 +133,7 @@ def _sight(folder: Path, inputs: Mapping[str, Any], features: Mapping[str, Any])
 def _table(path: Path) -> dict[str, Any]:
     """Return a JSON table."""
     content = read_json(path)
-    if not isinstance(content, dict) or (path.name == CONFIG and "type" not in content):
+    if not isinstance(content, dict) or (path.name == CONFIG and not content.get("type")):
         raise BadFile(f"{path} is no configuration of LeRobot.")
     return content
 

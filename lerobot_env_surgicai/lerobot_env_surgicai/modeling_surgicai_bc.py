@@ -56,7 +56,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
         try:
             return super().from_pretrained(pretrained_name_or_path, strict=strict, **arguments)
         except (RuntimeError, SafetensorError) as error:
-            reason = (str(error).splitlines() or [""])[0]
+            reason = " ".join(str(error).split())[:200]
             raise BadFile(f"{pretrained_name_or_path} holds no whole weights of surgicai_bc ({reason}).") from None
 
     def get_optim_params(self) -> Any:
@@ -101,7 +101,8 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
         """Return the action (B, 7); it does not depend on what else is in the batch."""
         if self._acting is None:
             # `act` computes in float64 on the CPU, and so may not have its weights moved or trained under it.
-            self._acting = copy.deepcopy(self.network).cpu().eval()
+            acting = copy.deepcopy(self.network).cpu().eval()
+            object.__setattr__(self, "_acting", acting)  # not a submodule: it must not be saved
         poses = batch[OBS_STATE].float().cpu().numpy()
         return torch.from_numpy(self._acting.act(self._features(batch), poses)).to(batch[OBS_STATE].device)
 
