@@ -14,9 +14,6 @@ from surgicai_vision.provenance import provenance
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-LENGTHS = {"suture": 1000}
-"""Task → episode limit [control steps] where it is not 200."""
-
 
 def emit(name: str, row: dict[str, Any], *, render: bool = False) -> None:
     """Print one JSON line: the benchmark's name, its numbers, machine and versions."""

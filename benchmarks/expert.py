@@ -9,7 +9,7 @@
 import argparse
 from typing import Any, NamedTuple
 
-from common import LENGTHS, chunks, emit, median, spread
+from common import chunks, emit, median, spread
 
 from surgicai_vision import envs, names
 from surgicai_vision.config import SceneConfig, TaskConfig, to_mapping
@@ -87,9 +87,7 @@ def main() -> None:
     chosen = parser.parse_args()
     scene = SceneConfig(layout=chosen.layout, hole_pair=chosen.hole_pair, thread=chosen.thread, grasp=chosen.grasp)
     tasks = names.SUBTASKS if chosen.task == "all" else (chosen.task,)
-    configs = [
-        TaskConfig(task, scene, chosen.step, chosen.tolerance, max_steps=LENGTHS.get(task, 200)) for task in tasks
-    ]
+    configs = [TaskConfig(task, scene, chosen.step, chosen.tolerance) for task in tasks]
     jobs = [Job(config, seeds) for config in configs for seeds in chunks(chosen.seed, chosen.episodes)]
     done = list(zip(jobs, spread(play, jobs, chosen.workers), strict=True))
     rows = {

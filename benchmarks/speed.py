@@ -28,7 +28,7 @@ os.environ["LP_NUM_THREADS"] = "0"
 import gymnasium
 import mujoco
 import numpy as np
-from common import LENGTHS, emit, median
+from common import emit, median
 
 from surgicai_vision import envs, names
 from surgicai_vision.config import SceneConfig, TaskConfig
@@ -80,7 +80,7 @@ def ratio(slow: list[float], fast: list[float]) -> float:
 
 def record(thread: int) -> Recording:
     """Let the expert throw one stitch."""
-    config = TaskConfig("suture", SceneConfig(thread=thread), max_steps=LENGTHS["suture"])
+    config = TaskConfig("suture", SceneConfig(thread=thread))
     env = envs.make(config)
     env.reset(seed=names.VALIDATION_SEED)
     expert, start, actions, commands = Expert(env), env.get_state(), [], []

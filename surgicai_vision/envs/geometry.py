@@ -10,8 +10,8 @@ The path: the holes of layout `simple` lie 7.8 mm apart on flanks tilted 46.1°,
 horizontal. A circle of the needle's radius R through both centres has its centre √(R² - (gap/2)²) = 9.4 mm above
 their middle and runs there at asin(gap / 2R) = 22.6° to the horizontal: 21° off the holes' axes. No rigid arc
 of this radius is perpendicular at both holes, so the needle starts perpendicular at the entry (place), turns
-those 21° about its tip while the tip enters, then follows the circle. In the 3.8 mm openings the circle keeps
-at least 0.9 mm of clearance from the flanks' inner edges (`tests/test_scene.py` measures it).
+those 21° about its tip while the tip enters, then follows the circle. In the 3.8 mm openings the needle's
+skin keeps at least 0.7 mm of clearance all the way (0.71 to 0.82 mm by pair; `tests/test_scene.py` measures it).
 
 Room for PSM2's jaws: at the end of the insertion the needle's point at `angle_at_entry(INSERT_ANGLE, INSERT_DEPTH)`
 is in the entry, 100° - 11.3° - 2 asin(gap / 2R), and the jaws, `PAD_WIDTH` wide, must still be outside. With the
