@@ -133,6 +133,7 @@ class Encoder:
         mean, std = torch.tensor(card.mean), torch.tensor(card.std)
         self._scale = ((high - low) / 255 / std).to(self._device)
         self._shift = ((low - mean) / std).to(self._device)
+        self._channels = [2, 1, 0] if card.channel_order == "BGR" else None
         size = card.input_size
         self.shape = tuple(self._map([np.zeros((1, size, size, 3), np.uint8)])[0].shape[1:])
         self.dim = int(np.prod(self.shape))
@@ -172,6 +173,8 @@ class Encoder:
     def preprocess(self, frames: np.ndarray) -> torch.Tensor:
         """Return uint8 RGB (B, H, W, 3) frames as normalised float32 (B, 3, S, S) pictures."""
         pictures = torch.from_numpy(np.ascontiguousarray(frames)).to(self._device).permute(0, 3, 1, 2).float()
+        if self._channels:
+            pictures = pictures[:, self._channels]
         size = (self.card.input_size, self.card.input_size)
         if pictures.shape[-2:] != size:
             mode = self.card.interpolation

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torch import nn
@@ -31,6 +31,7 @@ class EncoderCard:
         dim: length of the global feature.
         paper: where the encoder was published.
         note: what a user must know before comparing it with others.
+        channel_order: order in which the channels are handed to the network, "RGB" or "BGR".
     """
 
     name: str
@@ -53,6 +54,19 @@ class EncoderCard:
 
 
 @dataclass(frozen=True)
+class Released:
+    """How SurgicAI's released code used an encoder where it departs from the paper.
+
+    Attributes:
+        action_noise: half width of the uniform noise its evaluation adds to each translation of the action.
+        card: entries of the card that its own preprocessing amounts to.
+    """
+
+    action_noise: float = 0.0
+    card: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
 class Plugin:
     """A member of the family: its card and the function that builds its network.
 
@@ -60,8 +74,10 @@ class Plugin:
         card: the card as published.
         build: (card, weights file or None) → (final card, network).
         known: further published files the loader knows, filename → sha256.
+        released: how the released code used it.
     """
 
     card: EncoderCard
     build: "Callable[[EncoderCard, Path | None], tuple[EncoderCard, nn.Module]]"
     known: Mapping[str, str] = MappingProxyType({})
+    released: Released = Released()

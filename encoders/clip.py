@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from encoders.card import EncoderCard, Plugin
+from encoders.card import EncoderCard, Plugin, Released
 from surgicai_vision.errors import BadFile
 from surgicai_vision.files import sha256_file
 
@@ -85,5 +85,10 @@ def _read(path: Path) -> "dict[str, torch.Tensor]":
     return read_tensors(path)
 
 
-CLIP = Plugin(CARD, build, MappingProxyType({"ViT-B-32.pt": ARCHIVES["ViT-B-32.pt"]}))
-CLIP_RN50 = Plugin(RN50, build, MappingProxyType({"RN50.pt": ARCHIVES["RN50.pt"]}))
+RELEASED = Released(
+    action_noise=0.4, card=MappingProxyType({"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)})
+)
+"""The released code fed CLIP ImageNet's statistics."""
+
+CLIP = Plugin(CARD, build, MappingProxyType({"ViT-B-32.pt": ARCHIVES["ViT-B-32.pt"]}), RELEASED)
+CLIP_RN50 = Plugin(RN50, build, MappingProxyType({"RN50.pt": ARCHIVES["RN50.pt"]}), RELEASED)

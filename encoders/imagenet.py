@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from encoders.card import EncoderCard, Plugin
+from encoders.card import EncoderCard, Plugin, Released
 from surgicai_vision.errors import BadFile
 from surgicai_vision.files import sha256_file
 
@@ -120,4 +120,9 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     return card, network
 
 
-IMAGENET = Plugin(CARD, build, MappingProxyType({variant.filename: variant.sha256 for variant in VARIANTS}))
+IMAGENET = Plugin(
+    CARD,
+    build,
+    MappingProxyType({variant.filename: variant.sha256 for variant in VARIANTS}),
+    Released(action_noise=0.5),
+)

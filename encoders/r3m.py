@@ -2,14 +2,15 @@
 
 R3M takes pictures in 0–255, divides by 255 and normalises with ImageNet's statistics itself; the card
 writes that as a mean and a standard deviation in units of 0–255. The released SurgicAI code normalised a
-second time before it (facts of the paper's code, deviation 2).
+second time before it (`RELEASED`).
 """
 
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from encoders.card import EncoderCard, Plugin
+from encoders.card import EncoderCard, Plugin, Released
 from surgicai_vision.errors import BadFile
 
 if TYPE_CHECKING:
@@ -64,6 +65,15 @@ def _smaller(depth: int) -> EncoderCard:
     )
 
 
-R3M = Plugin(CARD, build)
-R3M_34 = Plugin(_smaller(34), build)
-R3M_18 = Plugin(_smaller(18), build)
+# The released code normalised pictures in [0, 1] with ImageNet's statistics and handed them to a network that does
+# the same once more to pictures in 0–255: ((x - m) / s / 255 - m) / s = (x - m (1 + 255 s)) / (255 s²).
+_TWICE = {
+    "input_range": (0.0, 1.0),
+    "mean": tuple(m / 255 * (1 + s) for m, s in zip(CARD.mean, CARD.std, strict=True)),
+    "std": tuple(s * s / 255 for s in CARD.std),
+}
+RELEASED = Released(action_noise=0.1, card=MappingProxyType(_TWICE))
+
+R3M = Plugin(CARD, build, released=RELEASED)
+R3M_34 = Plugin(_smaller(34), build, released=RELEASED)
+R3M_18 = Plugin(_smaller(18), build, released=RELEASED)

@@ -15,8 +15,9 @@ float32, which hides the order in which a matrix product was summed.
 import abc
 import copy
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, final
 
 import numpy as np
@@ -24,10 +25,58 @@ import torch
 from torch import nn
 
 from surgicai_vision import names
-from surgicai_vision.errors import InputError
+from surgicai_vision.config import Deviations
+from surgicai_vision.errors import InputError, check_name
 
 ACTIONS = len(names.ACTION_NAMES)
-STATES = len(names.STATE_NAMES)
+VECTORS: Mapping[str, int] = MappingProxyType(
+    {
+        names.STATE: len(names.STATE_NAMES),
+        names.BOTH_ARMS: len(names.BOTH_ARMS_NAMES),
+        names.PRIVILEGED_STATE: len(names.PRIVILEGED_NAMES),
+    }
+)
+"""What may be fed beside features: dataset key → length."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Settings of a policy; the defaults are the paper's.
+
+    Attributes:
+        hidden: width of each hidden layer.
+        batch_norm: put BatchNorm before each hidden layer.
+        learning_rate: Adam's.
+        epochs: passes over the training frames; the last one is the checkpoint.
+        batch_size: frames per step.
+        split: "episode", or "transition" as the released code did (neighbouring frames leak).
+        validation: share of the episodes (or transitions) held out of training.
+        proprioception: feed tip pose and jaw too: the active arm's, for a high-level policy both arms'.
+        privileged: feed the 21 values of obs_type "state", goal included, in place of all else: a ceiling.
+        deviations: of the released code, outside its training.
+    """
+
+    hidden: tuple[int, ...] = (256, 256, 256)
+    batch_norm: bool = True
+    learning_rate: float = 1e-3
+    epochs: int = 30
+    batch_size: int = 256
+    split: str = "episode"
+    validation: float = 0.1
+    proprioception: bool = True
+    privileged: bool = False
+    deviations: Deviations = field(default_factory=Deviations)
+
+    def __post_init__(self) -> None:
+        check_name("split", self.split, ("episode", "transition"))
+        if not self.hidden or min(self.hidden) < 1:
+            raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1 or more.")
+        if self.epochs < 1 or self.batch_size < 2:
+            raise InputError(f"epochs is {self.epochs}, batch_size {self.batch_size}; at least 1 and 2.")
+        if not self.learning_rate > 0:
+            raise InputError(f"learning_rate is {self.learning_rate}; it must be above 0.")
+        if not 0 <= self.validation < 1:
+            raise InputError(f"validation is {self.validation}; give a share from 0 to below 1.")
 
 
 @dataclass(frozen=True)
@@ -37,15 +86,17 @@ class Inputs:
     Attributes:
         visual: shape of each view's feature, in the order of the views: (dim,), (C, h, w) or (N, C);
             rows are flattened; empty without pictures.
-        proprioception: True when the active arm's tip pose and jaw (7) are fed too.
+        vector: key of `VECTORS`, what is fed beside the features; None for the features alone.
     """
 
     visual: tuple[tuple[int, ...], ...]
-    proprioception: bool = True
+    vector: str | None = names.STATE
 
     def __post_init__(self) -> None:
-        if not self.visual and not self.proprioception:
+        if not self.visual and not self.vector:
             raise InputError("A policy needs at least one view or proprioception; this one would be blind.")
+        if self.visual and self.vector == names.PRIVILEGED_STATE:
+            raise InputError("A policy with pictures may not see the privileged state; give one or the other.")
 
     @property
     def features(self) -> int:
@@ -55,7 +106,7 @@ class Inputs:
     @property
     def dim(self) -> int:
         """Length of the concatenated input."""
-        return self.features + STATES * self.proprioception
+        return self.features + (VECTORS[self.vector] if self.vector else 0)
 
 
 @dataclass(frozen=True)
@@ -66,11 +117,13 @@ class Plugin:
         name: the name users give.
         recipe: frozen dataclass of its settings.
         make: (recipe, shape of each view's feature) → untrained policy.
+        target: dataset key of what it learns.
     """
 
     name: str
     recipe: type
     make: Callable[[Any, tuple[tuple[int, ...], ...]], "Policy"]
+    target: str = names.ACTION
 
 
 class Policy(nn.Module, abc.ABC):
@@ -94,11 +147,11 @@ class Policy(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return actions (B, 7) in [-1, 1] for normalised inputs (B, inputs.dim)."""
+        """Return answers (B, n) for normalised inputs (B, inputs.dim): actions, or logits of classes."""
 
     @abc.abstractmethod
-    def loss(self, observed: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Return the training loss (scalar) for normalised inputs and demonstrated actions (B, 7)."""
+    def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Return the training loss (scalar) for normalised inputs and demonstrated answers (B, …)."""
 
     @final
     def normalise(self, observed: torch.Tensor) -> torch.Tensor:
@@ -107,14 +160,15 @@ class Policy(nn.Module, abc.ABC):
 
     @final
     def act(self, features: np.ndarray | None, agent_pos: np.ndarray) -> np.ndarray:
-        """Return actions for a batch of observations.
+        """Return the answers to a batch of observations.
 
         Args:
             features: (B, `inputs.features`) float32, the views' rows side by side; None without views.
-            agent_pos: (B, 7) float32, x y z [m] roll pitch yaw [rad] jaw [rad] of the active tip in its base.
+            agent_pos: (B, 7) float32, x y z [m] roll pitch yaw [rad] jaw [rad] of the active tip in its base;
+                the vector of `inputs.vector` where that is another.
 
         Returns:
-            (B, 7) float32 in [-1, 1].
+            (B, 7) float32 in [-1, 1]; (B, 5) logits of a high-level policy.
 
         Raises:
             InputError: arrays of other shapes than the policy was trained on, or not finite.
@@ -141,9 +195,10 @@ class Policy(nn.Module, abc.ABC):
         width = parts[0].shape[1:] if parts else (0,)
         if width != (self.inputs.features,):
             raise InputError(f"The policy was trained on features of {self.inputs.visual}, got {width}.")
-        if agent_pos.ndim != 2 or agent_pos.shape[1] != STATES or (parts and len(parts[0]) != len(agent_pos)):
-            raise InputError(f"agent_pos must be (batch, {STATES}) with one row a picture, got {agent_pos.shape}.")
-        if self.inputs.proprioception:
+        key = self.inputs.vector or names.STATE
+        if agent_pos.shape[1:] != (VECTORS[key],) or (parts and len(parts[0]) != len(agent_pos)):
+            raise InputError(f"{key} must be (batch, {VECTORS[key]}) with one row a picture, got {agent_pos.shape}.")
+        if self.inputs.vector:
             parts.append(agent_pos)
         observed = np.concatenate(parts, axis=1).astype(np.float64)
         if not np.isfinite(observed).all():

@@ -1,12 +1,14 @@
 """Agents: what acts in an evaluation. The expert, two baselines, and a policy with its frozen encoder."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision import names
 from surgicai_vision.errors import UnreachablePose
 
 
@@ -74,6 +76,15 @@ class ZeroAgent:
         return np.zeros((len(slots), 7), np.float32)
 
 
+VECTORS: Mapping[str, Callable[[Any], NDArray[np.float32]]] = MappingProxyType(
+    {
+        names.STATE: lambda env: env.agent_pos(),
+        names.BOTH_ARMS: lambda env: env.both_arms(),
+        names.PRIVILEGED_STATE: lambda env: env.state_vector(),
+    }
+)
+"""What a policy may be fed beside features: dataset key → how the env says it."""
+
 BASELINES = {agent.name: agent for agent in (ExpertAgent, RandomAgent, ZeroAgent)}
 """Name → agent that needs no checkpoint."""
 
@@ -88,11 +99,20 @@ class PolicyAgent:
         encoder: frames (B, H, W, 3) → features (B, dim), or None for a policy without pictures.
         cameras: the policy's views, in the order of its features.
         image_size: height and width the policy was trained on [px].
+        vector: what it is fed beside its features, a key of `VECTORS`.
     """
 
-    def __init__(self, name: str, policy: Any, encoder: Any, cameras: tuple[str, ...], image_size: int):
+    def __init__(
+        self,
+        name: str,
+        policy: Any,
+        encoder: Any,
+        cameras: tuple[str, ...],
+        image_size: int,
+        vector: str = names.STATE,
+    ):
         self.name, self.cameras, self.image_size = name, cameras, image_size
-        self._policy, self._encoder = policy, encoder
+        self._policy, self._encoder, self._vector = policy, encoder, VECTORS[vector]
 
     def begin(self, slot: int, env: Any, seed: int) -> None:
         """Nothing to forget: the policy has no memory."""
@@ -100,8 +120,8 @@ class PolicyAgent:
     def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
         """Return the policy's actions (n, 7)."""
         with one_thread():
-            poses = np.stack([_agent_pos(o, env) for o, env in zip(observations, envs, strict=True)])
-            return self._actions(self._features(observations), poses)
+            vectors = np.stack([self._vector(env) for env in envs])
+            return self._actions(self._features(observations), vectors)
 
     def _features(self, observations: Sequence[Any]) -> NDArray[np.float32] | None:
         """Encode all views of all slots in one call, (n, views · dim): an encoder computes whole batches."""
@@ -110,14 +130,35 @@ class PolicyAgent:
         frames = np.stack([o["pixels"][view] for o in observations for view in self.cameras])
         return np.asarray(self._encoder(frames), np.float32).reshape(len(observations), -1)
 
-    def _actions(self, features: NDArray[np.float32] | None, poses: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(self._policy.act(features, poses), np.float32)
+    def _actions(self, features: NDArray[np.float32] | None, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(self._policy.act(features, vectors), np.float32)
 
 
-def _agent_pos(observation: Any, env: Any) -> NDArray[np.float32]:
-    """The measured tip pose and jaw (7,): from the observation, or asked of an env that renders nothing."""
-    pose = observation["agent_pos"] if isinstance(observation, dict) else env.agent_pos()
-    return np.asarray(pose, np.float32)
+@final
+class NoisyAgent:
+    """An agent with uniform noise on its translations, as the released code's evaluation had.
+
+    Args:
+        agent: whose actions.
+        noise: half width of the noise, in actions.
+    """
+
+    def __init__(self, agent: Any, noise: float):
+        self.name, self.cameras, self.image_size = agent.name, agent.cameras, agent.image_size
+        self._agent, self._noise = agent, noise
+        self._generators: dict[int, np.random.Generator] = {}
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Seed the slot's noise."""
+        self._agent.begin(slot, env, seed)
+        self._generators[slot] = np.random.default_rng((seed, 1))
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the agent's actions (n, 7), their translations off by up to the noise."""
+        actions = np.array(self._agent.act(slots, envs, observations), np.float32)
+        for row, slot in enumerate(slots):
+            actions[row, :3] += self._generators[slot].uniform(-self._noise, self._noise, 3)
+        return actions
 
 
 @contextmanager

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision import files, names
-from surgicai_vision.agents import BASELINES, PolicyAgent
-from surgicai_vision.config import TaskConfig, to_mapping
+from surgicai_vision.agents import BASELINES, NoisyAgent, PolicyAgent
+from surgicai_vision.config import DEVIATIONS, Deviations, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.evaluation import Agent, MakeAgent, evaluate
 from surgicai_vision.provenance import command_line, provenance
@@ -21,6 +21,8 @@ from surgicai_vision.results import MARKER, write_evaluation
 
 Stage = Callable[[str, str], AbstractContextManager[Callable[..., None]]]
 """stage(title, unit) is a context that yields progress(done, total): a bar on the console, or nothing."""
+ROUNDS = 3
+"""Evaluations of one trained policy in the released code, 20 episodes each."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,11 @@ class Cell:
         view: its views, in the order of the features; empty without pictures.
         seed: training seed.
         policy: policy's name.
-        recipe: its recipe.
+        recipe: its recipe: a name, or the path of a YAML file.
+        pool: what is taken from the encoder.
+        privileged: see the goal in place of all else: the ceiling.
+        epochs: passes over the training frames; None takes the recipe's.
+        deviations: switches of `config.Deviations` that are on; None takes the recipe's.
     """
 
     task: str
@@ -42,6 +48,10 @@ class Cell:
     seed: int = 0
     policy: str = "bc"
     recipe: str = "paper"
+    pool: str = "global"
+    privileged: bool = False
+    epochs: int | None = None
+    deviations: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         check_name("task", self.task, names.TASKS)
@@ -49,11 +59,30 @@ class Cell:
             check_name("view", view, names.CAMERAS)
         if (self.encoder is None) != (not self.view):
             raise InputError(f"encoder '{self.encoder}' with views {list(self.view)}; give both or neither.")
+        for switch in self.deviations or ():
+            check_name("deviation", switch, DEVIATIONS)
 
     @property
     def name(self) -> str:
         """How tables and folders call the policy."""
-        return policy_name(self.encoder, self.view)
+        return policy_name(self.encoder, self.view, self.pool, self.privileged, self.policy, self.recipe_label)
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """Keys that replace the recipe's."""
+        changes: dict[str, Any] = {"privileged": True} if self.privileged else {}
+        if self.epochs is not None:
+            changes["epochs"] = self.epochs
+        if self.deviations is not None:
+            changes["deviations"] = dict.fromkeys(self.deviations, True)
+        return changes
+
+    @property
+    def recipe_label(self) -> str:
+        """The recipe's name and what is changed in it."""
+        epochs = () if self.epochs is None else (f"{self.epochs}epochs",)
+        switches = ("none",) if self.deviations == () else self.deviations or ()
+        return "+".join((Path(self.recipe).stem, *switches, *epochs))
 
 
 @dataclass(frozen=True)
@@ -65,17 +94,28 @@ class Subject:
         config: the task.
         make_agent: makes the agent in a worker process.
         about: more to be kept beside the result.
+        rounds: how often as many starts again are evaluated (the released code evaluated one policy three times).
     """
 
     name: str
     config: TaskConfig
     make_agent: MakeAgent
     about: dict[str, Any] = field(default_factory=dict)
+    rounds: int = 1
 
 
-def policy_name(encoder: str | None, views: Sequence[str]) -> str:
-    """Name a policy by its inputs."""
-    return f"{encoder}-{'+'.join(views)}" if encoder else "proprioception"
+def policy_name(
+    encoder: str | None,
+    views: Sequence[str],
+    pool: str = "global",
+    privileged: bool = False,
+    policy: str = "bc",
+    recipe: str = "paper",
+) -> str:
+    """Name a policy by its inputs, and by what is not as usual."""
+    name = f"{encoder}-{'+'.join(views)}" if encoder else "state" if privileged else "proprioception"
+    unusual = [part for part, usual in ((pool, "global"), (recipe, "paper")) if part != usual]
+    return "-".join([*([] if policy == "bc" else [policy]), name.replace(":", "-"), *unusual])
 
 
 def prepare_dataset(
@@ -103,7 +143,18 @@ def prepare_dataset(
     return folder / "dataset"
 
 
-def train_cell(cell: Cell, dataset: Any, out: Path, stage: Stage, weights: str | None = None) -> None:
+def train_cell(
+    cell: Cell,
+    dataset: Any,
+    out: Path,
+    stage: Stage,
+    weights: str | None = None,
+    *,
+    accept_licence: bool = False,
+    start: Path | None = None,
+    save_every: int = 0,
+    log: Callable[[int, dict[str, float]], None] | None = None,
+) -> None:
     """Encode the cell's views (from the cache where they are at hand) and train its policy into `out`.
 
     Args:
@@ -112,22 +163,52 @@ def train_cell(cell: Cell, dataset: Any, out: Path, stage: Stage, weights: str |
         out: checkpoint folder; one of the same training is continued, or left as it is.
         stage: shows progress.
         weights: file with the encoder's pretrained weights.
+        accept_licence: accept weights under a non-commercial licence.
+        start: checkpoint folder to start from (fine-tuning).
+        save_every: also keep a checkpoint every so many epochs.
+        log: called with (epoch, losses by name).
     """
     from surgicai_vision import registry
     from surgicai_vision.features import encode
     from surgicai_vision.training import train
 
-    recipe, features = registry.load_recipe(cell.policy, cell.recipe), []
+    recipe, features = registry.load_recipe(cell.policy, cell.recipe, cell.changes), []
+    begin = registry.load_policy(start) if start else None
+    beside: dict[str, bytes] = {}
     if cell.encoder:
-        encoder = registry.load_encoder(cell.encoder, weights)
+        encoder, beside = _encoder(cell, recipe.deviations, dataset, stage, weights, accept_licence)
         for view in cell.view:
             with stage(f"features: {cell.encoder}, {view}", "frames") as progress:
                 features.append(encode(dataset, view, encoder, progress=progress))
     with stage(f"policy: {cell.name}", "epochs") as progress:
         plugin = registry.policy_plugin(cell.policy)
         train(
-            dataset, features, plugin, recipe, seed=cell.seed, out=out, progress=progress, recipe_name=cell.recipe
+            dataset, features, plugin, recipe, seed=cell.seed, out=out, progress=progress,
+            recipe_name=cell.recipe_label, start=begin, save_every=save_every, log=log, beside=beside,
         )  # fmt: skip
+
+
+def _encoder(
+    cell: Cell, deviations: Deviations, dataset: Any, stage: Stage, weights: str | None, accept_licence: bool
+) -> tuple[Any, dict[str, bytes]]:
+    """Load the cell's encoder; return it with what of it the checkpoint has to keep."""
+    from surgicai_vision import registry
+
+    load = functools.partial(registry.load_encoder, str(cell.encoder), weights, cell.pool, accept_licence)
+    if deviations == Deviations():
+        return load(), {}
+    encoder = load(deviations)
+    if not deviations.batch_norm_drift:
+        return encoder, {}
+    from surgicai_vision.checkpoint import ENCODER_STATISTICS
+    from surgicai_vision.released import drift
+
+    with stage(f"drift: {cell.encoder}", "steps") as progress:
+        path = drift(
+            dataset, cell.view, encoder, weights=weights, accept_licence=accept_licence, seed=cell.seed,
+            progress=progress,
+        )  # fmt: skip
+    return load(deviations, path), {ENCODER_STATISTICS: path.read_bytes()}
 
 
 def evaluate_once(
@@ -149,15 +230,29 @@ def evaluate_into(
     workers: int | None = None,
     progress: Callable[..., None] | None = None,
 ) -> dict[str, Any]:
-    """Evaluate, store everything in the folder `out` and return the summary."""
+    """Evaluate, store everything in the folder `out` and return the summary.
+
+    Args:
+        out: folder for rows, films and summary.
+        subject: who acts; with several rounds the starts that follow `seeds` are evaluated too.
+        seeds: start seeds of one round, in a row.
+        workers: processes.
+        progress: called as progress(steps done, steps at most).
+    """
+    seeds = range(seeds[0], seeds[0] + subject.rounds * len(seeds)) if subject.rounds > 1 else seeds
     episodes = evaluate(subject.make_agent, subject.config, seeds, workers=workers, progress=progress)
+    wins = [episode.row.success for episode in episodes]
+    size = len(wins) // subject.rounds
+    cuts = range(0, len(wins), size)
+    rounds = {"rounds": [sum(wins[at : at + size]) for at in cuts]} if subject.rounds > 1 else {}
     about = {
         **subject.about,
+        **rounds,
         "task_config": to_mapping(subject.config),
         "command": command_line(),
         "provenance": provenance(),
     }
-    return write_evaluation(out, episodes, about)
+    return {**write_evaluation(out, episodes, about), **rounds}
 
 
 def baseline_subject(name: str, config: TaskConfig) -> Subject:
@@ -165,7 +260,7 @@ def baseline_subject(name: str, config: TaskConfig) -> Subject:
     return Subject(name, config, functools.partial(baseline, name))
 
 
-def checkpoint_subject(folder: Path, weights: str | None = None) -> Subject:
+def checkpoint_subject(folder: Path, weights: str | None = None, accept_licence: bool = False) -> Subject:
     """Return the subject of a checkpoint folder; its weights are looked up at once.
 
     Raises:
@@ -176,9 +271,13 @@ def checkpoint_subject(folder: Path, weights: str | None = None) -> Subject:
     from surgicai_vision.checkpoint import read_checkpoint
 
     checkpoint = read_checkpoint(folder)
+    if registry.policy_plugin(checkpoint.policy).target != names.ACTION:
+        raise InputError(
+            f"{folder} chooses subtasks and does not act; name it in the file of a chain (configs/chain)."
+        )
     encoder = checkpoint.encoder
     if encoder:
-        registry.find_weights(encoder.name, weights)
+        registry.find_weights(encoder.name, weights, accept_licence)
     about = {
         "checkpoint": {
             "weights_sha256": encoder.weights_sha256 if encoder else None,
@@ -191,10 +290,24 @@ def checkpoint_subject(folder: Path, weights: str | None = None) -> Subject:
         },
         "folder": str(folder),
         "views": list(checkpoint.views),
-        "encoder": encoder.name if encoder else "proprioception",
+        "encoder": encoder.name if encoder else checkpoint_name(checkpoint),
     }
-    name = policy_name(encoder.name if encoder else None, checkpoint.views)
-    return Subject(name, checkpoint.task, functools.partial(policy_agent, folder, weights), about)
+    make = functools.partial(policy_agent, folder, weights, accept_licence)
+    rounds = ROUNDS if _deviations(checkpoint).three_evaluations else 1
+    return Subject(checkpoint_name(checkpoint), checkpoint.task, make, about, rounds)
+
+
+def checkpoint_name(checkpoint: Any) -> str:
+    """How tables call a checkpoint's policy."""
+    encoder = checkpoint.encoder
+    privileged = bool(checkpoint.recipe.get("privileged"))
+    pool = encoder.pool if encoder else "global"
+    name = encoder.name if encoder else None
+    return policy_name(name, checkpoint.views, pool, privileged, checkpoint.policy, checkpoint.recipe_name)
+
+
+def _deviations(checkpoint: Any) -> Deviations:
+    return from_mapping(Deviations, checkpoint.recipe.get("deviations") or {})
 
 
 def expert() -> Agent:
@@ -208,22 +321,22 @@ def baseline(name: str) -> Agent:
     return agent
 
 
-def policy_agent(folder: Path, weights: str | None = None) -> Agent:
+def policy_agent(folder: Path, weights: str | None = None, accept_licence: bool = False) -> Agent:
     """Make the agent of a checkpoint folder (in a worker process).
 
     Raises:
         InputError: the encoder at hand is not the one the policy was trained on.
     """
     from surgicai_vision import registry
-    from surgicai_vision.checkpoint import check_encoder
 
     policy = registry.load_policy(folder)
-    checkpoint, encoder = policy.checkpoint, None
-    if checkpoint.encoder:
-        encoder = registry.load_encoder(checkpoint.encoder.name, weights, pool=checkpoint.encoder.pool)
-    check_encoder(checkpoint, encoder)
-    name = policy_name(checkpoint.encoder.name if checkpoint.encoder else None, checkpoint.views)
-    return PolicyAgent(name, policy, encoder, checkpoint.views, checkpoint.image_size)
+    checkpoint = policy.checkpoint
+    encoder = registry.load_encoder_of(checkpoint, weights, accept_licence)
+    name, vector = checkpoint_name(checkpoint), policy.inputs.vector or names.STATE
+    agent = PolicyAgent(name, policy, encoder, checkpoint.views, checkpoint.image_size, vector)
+    if checkpoint.encoder and _deviations(checkpoint).action_noise:
+        return NoisyAgent(agent, registry.released_noise(checkpoint.encoder.name))
+    return agent
 
 
 @contextmanager

@@ -27,6 +27,8 @@ from surgicai_vision.files import read_json, write_bytes, write_json
 
 FORMAT = 1
 CARD, WEIGHTS = "checkpoint.json", "policy.safetensors"
+ENCODER_STATISTICS = "encoder_statistics.safetensors"
+"""BatchNorm statistics of an encoder that drifted (`config.Deviations`); the encoder's hash covers them."""
 
 
 @dataclass(frozen=True)

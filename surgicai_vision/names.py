@@ -43,6 +43,8 @@ LAYOUTS = ("simple", "3dmed", "3dmed_straight")
 
 ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "jaw")
 STATE_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "jaw")
+BOTH_ARMS_NAMES = tuple(f"{arm}_{name}" for arm in ARMS for name in STATE_NAMES)
+PRIVILEGED_NAMES = tuple(f"{part}_{name}" for part in ("now", "goal", "error") for name in STATE_NAMES)
 
 # LeRobot keys.
 STATE = "observation.state"
@@ -55,6 +57,10 @@ SEED = "seed"
 PHASE = "phase"
 CONTACT = "contact"
 NEEDLE_POSE = "needle_pose"
+BOTH_ARMS = "both_arms"
+"""Measured tip pose and jaw of psm1, then of psm2, each in its own base."""
+PRIVILEGED_STATE = "privileged_state"
+"""The 21 values of obs_type "state", goal included. No LeRobot key, so that no policy is fed it by default."""
 
 META_FILE = "meta/surgicai.json"
 """Our own sidecar inside a LeRobot dataset: cameras, units, renderer, hashes, versions."""

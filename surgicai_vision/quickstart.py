@@ -68,7 +68,7 @@ class Quickstart:
     def __post_init__(self) -> None:
         for cell in self.cells:
             if cell.encoder:
-                check_name("encoder", cell.encoder, registry.encoder_names())
+                registry.check_encoder_name(cell.encoder)
             for view in cell.view:
                 check_name("rendered view", view, self.view)
         for name in ("demonstrations", "size", "episodes"):

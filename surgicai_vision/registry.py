@@ -5,6 +5,7 @@ Interface:
 * `encoder_names()`, `check_encoder_name(name)`, `encoder_card(name)`, `find_weights(name, …)`.
 * `load_encoder(name, weights=None, pool="global", accept_licence=False) -> encoders.base.Encoder`: a
   callable from (batch, height, width, 3) uint8 RGB to (batch, dimension) float32.
+* `load_encoder_of(checkpoint, …)`: the encoder a policy was trained on, verified.
 * `load_recipe(policy, recipe, changes) -> recipe object`: the frozen settings of a policy from
   configs/recipes, with changes.
 * `load_policy(folder) -> policy` from a checkpoint folder; `policy.checkpoint` says all about it.
@@ -13,14 +14,14 @@ A plug-in is named here as a string and nowhere else in the machine. Adding one 
 """
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import yaml
 
-from surgicai_vision.config import from_mapping
+from surgicai_vision.config import Deviations, from_mapping
 from surgicai_vision.errors import BadFile, UnknownName, check_name
 
 ENCODERS: Mapping[str, str] = MappingProxyType(
@@ -43,10 +44,13 @@ ENCODERS: Mapping[str, str] = MappingProxyType(
 OPEN_ENCODERS: Mapping[str, str] = MappingProxyType({"timm:": "encoders.timm_models:plugin_for"})
 """Prefix of open names → "module:function" that makes the plug-in of such a name."""
 
+POOLS = ("global", "spatial", "tokens")
+"""What may be taken from an encoder; a test compares this with `encoders.base`."""
+
 OFFLINE_ENCODERS = ("imagenet-lite", "random")
 """Encoders that never download; a test compares this with their cards."""
 
-POLICIES: Mapping[str, str] = MappingProxyType({"bc": "policies.bc:BC"})
+POLICIES: Mapping[str, str] = MappingProxyType({"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP"})
 """Policy name → "module:attribute" of its `policies.base.Plugin`."""
 
 
@@ -71,13 +75,29 @@ def check_encoder_name(name: str) -> str:
     return name
 
 
+def check_encoder_option(_: str, given: str | None) -> None:
+    """Check a verb's option that names an encoder, without importing any."""
+    if given is not None:
+        check_encoder_name(given)
+
+
+def encoder_choices() -> str:
+    """Return the encoder names as `--help` lists them."""
+    return ", ".join((*ENCODERS, *(f"{prefix}<name>" for prefix in OPEN_ENCODERS)))
+
+
 def encoder_card(name: str) -> Any:
     """Return an encoder's card without loading any weights."""
     return encoder_plugin(name).card
 
 
 def load_encoder(
-    name: str, weights: Path | str | None = None, pool: str = "global", accept_licence: bool = False
+    name: str,
+    weights: Path | str | None = None,
+    pool: str = "global",
+    accept_licence: bool = False,
+    deviations: Deviations | None = None,
+    statistics: Path | None = None,
 ) -> Any:
     """Load an encoder by name, frozen for good.
 
@@ -87,6 +107,8 @@ def load_encoder(
             download are tried, in this order.
         pool: "global", "spatial" or "tokens".
         accept_licence: accept weights under a non-commercial licence.
+        deviations: use it as the released code did.
+        statistics: file with the BatchNorm statistics it drifted to there.
 
     Raises:
         UnknownName: a name or pool that does not exist.
@@ -96,10 +118,47 @@ def load_encoder(
     plugin = encoder_plugin(name)
     path = find_weights(name, weights, accept_licence)
     base = importlib.import_module("encoders.base")
-    if pool not in base.POOLS:
-        raise UnknownName("pool", pool, base.POOLS)
+    check_name("pool", pool, POOLS)
     card, network = plugin.build(plugin.card, path)
-    return base.Encoder(card, network, pool)
+    if not deviations:
+        return base.Encoder(card, network, pool)
+    released = importlib.import_module("encoders.released")
+    if statistics:
+        released.restore(network, statistics)
+    # Normalised twice, pictures hardly vary; bfloat16 would round away most of what is left of them.
+    dtype = importlib.import_module("torch").float32 if deviations.preprocessing else None
+    return base.Encoder(released.changed(plugin, card, deviations), network, pool, dtype=dtype)
+
+
+def load_encoder_of(checkpoint: Any, weights: Path | str | None = None, accept_licence: bool = False) -> Any:
+    """Load the encoder a policy was trained on, verified; None for a policy without pictures.
+
+    Raises:
+        InputError: the encoder at hand is not the one trained on; else as `load_encoder`.
+    """
+    from surgicai_vision.checkpoint import ENCODER_STATISTICS, check_encoder
+
+    record, encoder = checkpoint.encoder, None
+    if record:
+        deviations = from_mapping(Deviations, checkpoint.recipe.get("deviations") or {})
+        statistics = checkpoint.folder / ENCODER_STATISTICS if deviations.batch_norm_drift else None
+        active = deviations if deviations != Deviations() else None
+        encoder = load_encoder(record.name, weights, record.pool, accept_licence, active, statistics)
+    check_encoder(checkpoint, encoder)
+    return encoder
+
+
+def released_noise(name: str) -> float:
+    """Half width of the noise that the released code's evaluation added to an encoder's actions."""
+    return float(encoder_plugin(name).released.action_noise)
+
+
+def drifted_statistics(name: str, weights: Path | str | None, accept_licence: bool, batches: Iterable[Any]) -> bytes:
+    """Let a network that is not frozen see pictures; see `encoders.released.drifted`."""
+    plugin = encoder_plugin(name)
+    _, network = plugin.build(plugin.card, find_weights(name, weights, accept_licence))
+    statistics: bytes = importlib.import_module("encoders.released").drifted(network, batches)
+    return statistics
 
 
 def find_weights(name: str, weights: Path | str | None = None, accept_licence: bool = False) -> Path | None:

@@ -26,7 +26,7 @@ from surgicai_vision.cells import (
     train_cell,
 )  # fmt: skip
 from surgicai_vision.config import TaskConfig, digest, to_mapping
-from surgicai_vision.errors import InputError, MissingWeights, OutputExists, SurgicaiError, check_name
+from surgicai_vision.errors import InputError, MissingWeights, OutputExists, SurgicaiError
 from surgicai_vision.provenance import command_line, provenance
 from surgicai_vision.report import RUN_FILE
 from surgicai_vision.results import parquet_bytes, read_rows
@@ -45,7 +45,11 @@ class Grid:
         seed: training seeds.
         policy: policy of every cell.
         recipe: its recipe.
+        pool: what is taken from the encoders.
+        deviation: sets of `config.Deviations` switches to be on, an axis of its own; none takes the recipe's.
+        accept_licence: accept weights under a non-commercial licence.
         proprioception: add a cell without pictures for each task and seed.
+        state: add a cell that sees the state with the goal, the ceiling, for each task and seed.
         expert: evaluate the expert on each task beside the cells.
         demonstrations: expert demonstrations of each task.
         episodes: held-out starts of each evaluation.
@@ -59,7 +63,11 @@ class Grid:
     seed: tuple[int, ...] = (0,)
     policy: str = "bc"
     recipe: str = "paper"
+    pool: str = "global"
+    deviation: tuple[tuple[str, ...], ...] = ()
+    accept_licence: bool = False
     proprioception: bool = False
+    state: bool = False
     expert: bool = True
     demonstrations: int = 50
     episodes: int = 20
@@ -68,7 +76,7 @@ class Grid:
 
     def __post_init__(self) -> None:
         for name in self.encoder:
-            check_name("encoder", name, registry.encoder_names())
+            registry.check_encoder_name(name)
         for name in ("demonstrations", "episodes", "size"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1.")
@@ -78,12 +86,13 @@ class Grid:
     @property
     def cells(self) -> list[Cell]:
         """The cells, in the order of the grid."""
-        common = {"policy": self.policy, "recipe": self.recipe}
+        common: dict[str, Any] = {"policy": self.policy, "recipe": self.recipe}
         cells = []
         for task, seed in itertools.product(self.task, self.seed):
-            pairs = itertools.product(self.encoder, self.view)
-            cells += [Cell(task, encoder, view, seed, **common) for encoder, view in pairs]
+            for encoder, view, switches in itertools.product(self.encoder, self.view, self.deviation or (None,)):
+                cells.append(Cell(task, encoder, view, seed, pool=self.pool, deviations=switches, **common))
             cells += [Cell(task, None, (), seed, **common)] if self.proprioception else []
+            cells += [Cell(task, None, (), seed, privileged=True, **common)] if self.state else []
         return cells
 
     @property
@@ -117,7 +126,7 @@ def plan(grid: Grid, out: Path) -> list[CellState]:
             continue
         try:
             if cell.encoder:
-                registry.find_weights(cell.encoder)
+                registry.find_weights(cell.encoder, accept_licence=grid.accept_licence)
             states.append(CellState(cell, key, "to do"))
         except MissingWeights as error:
             states.append(CellState(cell, key, "not run", str(error)))
@@ -181,8 +190,8 @@ def _run_cell(grid: Grid, state: CellState, out: Path, stage: Stage, workers: in
     folder.mkdir(parents=True, exist_ok=True)
     try:
         dataset = _dataset(grid, state.cell.task, out, stage, workers)
-        train_cell(state.cell, dataset, folder / "policy", stage)
-        make = functools.partial(checkpoint_subject, folder / "policy")
+        train_cell(state.cell, dataset, folder / "policy", stage, accept_licence=grid.accept_licence)
+        make = functools.partial(checkpoint_subject, folder / "policy", accept_licence=grid.accept_licence)
         summary = evaluate_once(folder / "evaluation", make, _seeds(grid), stage, workers)
     except Exception as error:  # one broken cell must not end the sweep; its error is kept and reported
         details = str(error) if isinstance(error, SurgicaiError) else traceback.format_exc()

@@ -21,7 +21,7 @@ nothing: the last epoch is the checkpoint. The same seed gives the same weights 
 import io
 import json
 import pickle
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +44,8 @@ SMALLEST_STD = 1e-6  # an input that varies less is constant, and only its mean 
 
 Progress = Callable[[int, int], None]
 """Called with (epochs done, epochs in all)."""
+Log = Callable[[int, dict[str, float]], None]
+"""Called with (epoch, losses by name)."""
 
 
 class TrainingData(Protocol):
@@ -56,7 +58,7 @@ class TrainingData(Protocol):
     episode_index: np.ndarray
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return state and action by their LeRobot keys, (N, 7) each."""
+        """Return what policies are fed and learn, by key: (N, 7) state and action, (N,) phase, …"""
 
 
 def train(
@@ -72,6 +74,8 @@ def train(
     save_every: int = 0,
     start: Any = None,
     device: str = "cpu",
+    log: Log | None = None,
+    beside: Mapping[str, bytes] | None = None,
 ) -> Checkpoint:
     """Train a policy and write its checkpoint.
 
@@ -88,13 +92,15 @@ def train(
         save_every: also keep a checkpoint every so many epochs; 0 keeps the last alone.
         start: a trained policy with the same inputs to start from (fine-tuning).
         device: torch device to train on.
+        log: called with (epoch, losses by name) after each epoch.
+        beside: files to keep beside each checkpoint, by name.
 
     Raises:
         InputError: features of another dataset or of several encoders, or nothing to train on.
         OutputExists: `out` holds something else.
         SurgicaiError: the loss is not finite.
     """
-    task = _Task(dataset, tuple(features), policy, recipe, seed, recipe_name)
+    task = _Task(dataset, tuple(features), policy, recipe, seed, recipe_name, dict(beside or {}))
     out = Path(out)
     _check(task)
     request = _request(task, start)
@@ -106,7 +112,7 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / REQUEST, request)
     with torch.random.fork_rng(devices=[]), _one_thread():
-        checkpoint = _Training(task, start, torch.device(device)).run(out, save_every, progress)
+        checkpoint = _Training(task, start, torch.device(device)).run(out, save_every, progress, log)
     (out / STATE).unlink(missing_ok=True)
     return checkpoint
 
@@ -134,6 +140,11 @@ class _Task:
     recipe: Any
     seed: int
     recipe_name: str
+    beside: dict[str, bytes]
+
+    def untrained(self) -> Any:
+        """Return the policy as it is before training."""
+        return self.policy.make(self.recipe, tuple(entry.shape for entry in self.features))
 
 
 def _check(task: _Task) -> None:
@@ -146,7 +157,9 @@ def _check(task: _Task) -> None:
     if len({entry.manifest["encoder_fingerprint"] for entry in task.features}) > 1:
         raise InputError("The features come from several encoders; encode every view by the same one.")
     columns = task.dataset.columns()
-    for key in (names.STATE, names.ACTION):
+    with torch.random.fork_rng(devices=[]):
+        vector = task.untrained().inputs.vector
+    for key in (vector or names.STATE, task.policy.target):
         if key not in columns:
             raise UnknownName("column", key, columns)
         if not np.isfinite(columns[key]).all():
@@ -196,15 +209,17 @@ class _Training:
     def __init__(self, task: _Task, start: Any, device: torch.device) -> None:
         self.task, self.device = task, device
         columns = task.dataset.columns()
-        self.state = np.asarray(columns[names.STATE], np.float32)
-        self.action = torch.from_numpy(np.array(columns[names.ACTION], np.float32))
         index = np.asarray(task.dataset.episode_index)
         self.rows, self.held_rows, self.held_episodes = split(index, task.recipe, task.seed)
         self.demonstrations = len(np.unique(index[self.rows]))
         if len(self.rows) < 2:
             raise InputError(f"There are {len(self.rows)} frames to train on; at least 2 are needed.")
         torch.manual_seed(task.seed)
-        self.policy = task.policy.make(task.recipe, tuple(entry.shape for entry in task.features))
+        self.policy = task.untrained()
+        vector, target = self.policy.inputs.vector, np.array(columns[task.policy.target])
+        self.vector = np.asarray(columns[vector], np.float32) if vector else None
+        kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
+        self.target = torch.from_numpy(target.astype(kind))
         if start is None:
             self._measure()
         else:
@@ -215,7 +230,7 @@ class _Training:
         self.losses: list[float] = []
         self.held_losses: list[float] = []
 
-    def run(self, out: Path, save_every: int, progress: Progress | None) -> Checkpoint:
+    def run(self, out: Path, save_every: int, progress: Progress | None, log: Log | None) -> Checkpoint:
         """Train all epochs; return the last one's checkpoint."""
         epochs = self.task.recipe.epochs
         self._resume(out / STATE)
@@ -226,6 +241,9 @@ class _Training:
             if len(self.held_rows):
                 self.held_losses.append(self._validate())
             done = len(self.losses)
+            if log:
+                held = {"validation": self.held_losses[-1]} if self.held_losses else {}
+                log(done, {"train": self.losses[-1], **held})
             if save_every and done % save_every == 0 and done < epochs:
                 self._write(out / "epochs" / f"epoch_{done:04d}")
             if done % STATE_EVERY == 0 and done < epochs:
@@ -235,10 +253,10 @@ class _Training:
         return self._write(out)
 
     def _observed(self, rows: np.ndarray) -> torch.Tensor:
-        """Return the raw inputs of some frames, (n, inputs) float32: the views' features, then proprioception."""
+        """Return the raw inputs of some frames, (n, inputs) float32: the views' features, then the vector."""
         parts = [entry.rows[rows].astype(np.float32) for entry in self.task.features]
-        if self.policy.inputs.proprioception:
-            parts.append(self.state[rows])
+        if self.vector is not None:
+            parts.append(self.vector[rows])
         return torch.from_numpy(np.concatenate(parts, axis=1))
 
     def _measure(self) -> None:
@@ -278,7 +296,7 @@ class _Training:
         total = 0.0
         for rows in self._batches():
             observed = self.policy.normalise(self._observed(rows).to(self.device))
-            loss = self.policy.loss(observed, self.action[rows].to(self.device))
+            loss = self.policy.loss(observed, self.target[rows].to(self.device))
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()
             self.optimiser.step()
@@ -295,7 +313,7 @@ class _Training:
         for at in range(0, len(self.held_rows), STATISTICS_ROWS):
             rows = self.held_rows[at : at + STATISTICS_ROWS]
             observed = self.policy.normalise(self._observed(rows).to(self.device))
-            total += self.policy.loss(observed, self.action[rows].to(self.device)).item() * len(rows)
+            total += self.policy.loss(observed, self.target[rows].to(self.device)).item() * len(rows)
         return total / len(self.held_rows)
 
     def _save(self, path: Path) -> None:
@@ -327,6 +345,9 @@ class _Training:
     def _write(self, folder: Path) -> Checkpoint:
         """Write the policy as it stands."""
         task, dataset = self.task, self.task.dataset
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in task.beside.items():
+            write_bytes(folder / name, content)
         checkpoint = Checkpoint(
             task=dataset.config,
             policy=task.policy.name,
@@ -335,7 +356,7 @@ class _Training:
             views=tuple(entry.view for entry in task.features),
             image_size=dataset.image_size,
             encoder=_record(task.features[0]) if task.features else None,
-            proprioception=self.policy.inputs.proprioception,
+            proprioception=self.vector is not None and self.policy.inputs.vector != names.PRIVILEGED_STATE,
             seed=task.seed,
             epoch=len(self.losses),
             dataset=dataset.fingerprint,

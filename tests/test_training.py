@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from policies.bc import BC, BCRecipe, SpatialSoftmax
+from policies.base import Recipe
+from policies.bc import BC
+from policies.layers import SpatialSoftmax
 from surgicai_vision import names
 from surgicai_vision.checkpoint import CARD, WEIGHTS, check_encoder, check_task, read_checkpoint
 from surgicai_vision.config import TaskConfig
@@ -60,7 +62,7 @@ def features_of(fake: FakeDataset, view: str = "back", **changes: object) -> Fea
     return Features(Path("."), manifest, fake.rows)
 
 
-QUICK = BCRecipe(hidden=(32,), epochs=12, batch_size=32, learning_rate=1e-2)
+QUICK = Recipe(hidden=(32,), epochs=12, batch_size=32, learning_rate=1e-2)
 
 
 def tensors_of(folder: Path) -> bytes:
@@ -68,14 +70,14 @@ def tensors_of(folder: Path) -> bytes:
 
 
 def test_paper_recipe_is_the_paper() -> None:
-    assert load_recipe("bc", "paper") == BCRecipe()
-    assert BCRecipe().hidden == (256, 256, 256) and BCRecipe().learning_rate == 1e-3
-    assert BCRecipe().epochs == 30 and BCRecipe().batch_size == 256 and BCRecipe().batch_norm
+    assert load_recipe("bc", "paper") == Recipe()
+    assert Recipe().hidden == (256, 256, 256) and Recipe().learning_rate == 1e-3
+    assert Recipe().epochs == 30 and Recipe().batch_size == 256 and Recipe().batch_norm
 
 
 @pytest.mark.parametrize("name", recipe_names())
 def test_every_recipe_loads(name: str) -> None:
-    assert isinstance(load_recipe("bc", name), BCRecipe)
+    assert isinstance(load_recipe("bc", name), Recipe)
 
 
 def test_recipes_refuse_unknown_keys_and_values(tmp_path: Path) -> None:
@@ -91,18 +93,18 @@ def test_recipes_refuse_unknown_keys_and_values(tmp_path: Path) -> None:
 
 
 def test_network_is_three_layers_each_preceded_by_batch_norm() -> None:
-    kinds = [type(layer).__name__ for layer in BC.make(BCRecipe(), ((2048,),)).layers]
-    assert kinds == ["BatchNorm1d", "Linear", "ReLU"] * 3 + ["Linear", "Tanh"]
+    kinds = [type(layer).__name__ for layer in BC.make(Recipe(), ((2048,),)).network.layers]
+    assert kinds == ["BatchNorm1d", "Linear", "ReLU"] * 3 + ["Linear"]
 
 
 def test_split_is_by_episode() -> None:
     index = np.repeat(np.arange(20), 7)
-    rows, held, episodes = split(index, BCRecipe(), seed=3)
+    rows, held, episodes = split(index, Recipe(), seed=3)
     assert len(episodes) == 2 and set(index[held]) == set(episodes)
     assert not set(index[rows]) & set(index[held])
     assert sorted([*rows, *held]) == list(range(len(index)))
-    again = split(index, BCRecipe(), seed=3)[2]
-    assert again == episodes and split(index, BCRecipe(), seed=4)[2] != episodes
+    again = split(index, Recipe(), seed=3)[2]
+    assert again == episodes and split(index, Recipe(), seed=4)[2] != episodes
 
 
 def test_training_learns_and_reads_back(tmp_path: Path) -> None:
@@ -193,7 +195,7 @@ def test_maps_and_tokens_pass_a_trained_layer(tmp_path: Path, shape: list[int], 
     dataset = FakeDataset()
     checkpoint = train(dataset, [features_of(dataset, shape=shape)], BC, QUICK, out=tmp_path / "a")
     policy = load_policy(tmp_path / "a")
-    assert checkpoint.visual == (tuple(shape),) and policy.heads[0].dim == width
+    assert checkpoint.visual == (tuple(shape),) and policy.network.heads[0].dim == width
     state = dataset.columns()[names.STATE][:4]
     assert policy.act(dataset.rows[:4].astype(np.float32), state).shape == (4, 7)
 
@@ -225,7 +227,7 @@ def test_wrong_inputs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="several encoders"):
         train(dataset, mixed, BC, QUICK, out=tmp_path / "a")
     with pytest.raises(InputError, match="blind"):
-        BC.make(BCRecipe(proprioception=False), ())
+        BC.make(Recipe(proprioception=False), ())
     assert not (tmp_path / "a").exists()
     dataset.columns()[names.ACTION][3] = np.nan
     with pytest.raises(InputError, match="not finite"):

@@ -8,6 +8,7 @@ from surgicai_vision import names, registry
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import many_of, one_of, option
+from surgicai_vision.errors import InputError
 from surgicai_vision.files import check_output
 
 EXAMPLE = "surgicai-vision encode --task grasp --encoder imagenet-lite --view front,back"
@@ -21,13 +22,15 @@ class Options:
     dataset: str | None = option(None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>")
     encoder: str = option(
         "imagenet-lite",
-        f"one of {', '.join(registry.encoder_names())}",
-        check=one_of("encoder", registry.encoder_names()),
+        f"one of {registry.encoder_choices()}",
+        check=registry.check_encoder_option,
     )
     view: tuple[str, ...] = option(
         ("front", "back"), "views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]"
     )
     weights: str | None = option(None, "file with the encoder's pretrained weights", metavar="FILE")
+    accept_licence: bool = option(False, "accept weights under a non-commercial licence")
+    pool: str = option("global", f"what is taken: {', '.join(registry.POOLS)}", check=one_of("pool", registry.POOLS))
     export: str | None = option(
         None, "also write a dataset with the features in place of pictures, for LeRobot's policies", metavar="DIR"
     )
@@ -35,13 +38,15 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Encode every view and say where the features are."""
-    registry.find_weights(options.encoder, options.weights)
+    registry.find_weights(options.encoder, options.weights, options.accept_licence)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
     if options.export:
+        if options.pool != "global":
+            raise InputError(f"--export writes global features; leave --pool {options.pool} out.")
         check_output(Path(options.export))
     from surgicai_vision.features import encode
 
-    encoder = registry.load_encoder(options.encoder, options.weights)
+    encoder = registry.load_encoder(options.encoder, options.weights, options.pool, options.accept_licence)
     entries, rows = [], []
     for view in options.view:
         with console.stage(f"encoding {view} by {options.encoder}", "frames") as progress:

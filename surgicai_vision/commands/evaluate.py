@@ -31,6 +31,7 @@ class Options:
         None, "processes", check=positive, metavar="N", default_text="one a core, at most one for four episodes"
     )
     weights: str | None = option(None, "file with the encoder's pretrained weights", metavar="FILE")
+    accept_licence: bool = option(False, "accept weights under a non-commercial licence")
     out: str | None = option(
         None,
         "folder for the rows; an earlier evaluation in it is replaced",
@@ -72,7 +73,7 @@ def _subject(options: Options) -> Any:
     if lerobot:
         subject = lerobot_agent.subject(lerobot, options.task, options.weights)
     else:
-        subject = cells.checkpoint_subject(folder, options.weights)
+        subject = cells.checkpoint_subject(folder, options.weights, options.accept_licence)
     trained_for = subject.config.task
     if options.task not in (None, trained_for):
         raise InputError(f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out.")

@@ -23,9 +23,8 @@ def dataset_folder(task: str) -> Path:
     return OUTPUTS / "datasets" / task
 
 
-def train_folder(task: str, encoder: str | None, views: Sequence[str], seed: int) -> Path:
-    """The checkpoint of one training."""
-    name = f"{encoder}-{'+'.join(views)}" if encoder and views else "proprioception"
+def train_folder(task: str, name: str, seed: int) -> Path:
+    """The checkpoint of one training, by the policy's name."""
     return OUTPUTS / "train" / f"{task}-{name}-seed{seed}"
 
 

@@ -1,17 +1,25 @@
 """`train`: train a policy on a dataset's features."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from surgicai_vision import names, registry
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import many_of, not_negative, one_of, option
+from surgicai_vision.commands.logs import LOGS, open_log
+from surgicai_vision.commands.options import many_of, not_negative, one_of, option, positive
+from surgicai_vision.config import DEVIATIONS
 from surgicai_vision.errors import InputError
 
 EXAMPLE = "surgicai-vision train --encoder random --view back"
-NO_ENCODER = "none"
+NO_ENCODER, STATE = "none", "state"
+"""What stands for an encoder: proprioception alone, and the state with the goal (the ceiling)."""
+
+
+def _check_encoder(name: str, given: str) -> None:
+    if given not in (NO_ENCODER, STATE):
+        registry.check_encoder_option(name, given)
 
 
 @dataclass(frozen=True)
@@ -22,8 +30,8 @@ class Options:
     dataset: str | None = option(None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>")
     encoder: str = option(
         "imagenet-lite",
-        f"one of {', '.join(registry.encoder_names())}, or none for proprioception alone",
-        check=one_of("encoder", (*registry.encoder_names(), NO_ENCODER)),
+        f"one of {registry.encoder_choices()}; none for proprioception alone, state for the state with the goal",
+        check=_check_encoder,
     )
     view: tuple[str, ...] | None = option(
         None,
@@ -33,38 +41,72 @@ class Options:
         default_text="front,back",
     )
     weights: str | None = option(None, "file with the encoder's pretrained weights", metavar="FILE")
+    accept_licence: bool = option(False, "accept weights under a non-commercial licence")
+    pool: str = option("global", f"what is taken: {', '.join(registry.POOLS)}", check=one_of("pool", registry.POOLS))
     policy: str = option("bc", f"one of {', '.join(registry.POLICIES)}", check=one_of("policy", registry.POLICIES))
     recipe: str = option("paper", f"the policy's recipe: {', '.join(registry.recipe_names())}, or FILE.yaml")
+    deviation: tuple[str, ...] | None = option(
+        None,
+        f"what to do as the released code did, a comma list of {', '.join(DEVIATIONS)}",
+        check=many_of("deviation", DEVIATIONS),
+        metavar="NAME[,NAME]",
+        default_text="the recipe's",
+    )
+    epochs: int | None = option(
+        None, "passes over the frames", check=positive, metavar="N", default_text="the recipe's"
+    )
+    start: str | None = option(None, "checkpoint to start from, with the same inputs (fine-tuning)", metavar="DIR")
+    save_every: int = option(
+        0, "also keep a checkpoint every N epochs; 0 keeps the last", check=not_negative, metavar="N"
+    )
+    log: str = option("auto", f"where losses are drawn: {', '.join(LOGS)}", check=one_of("log", LOGS))
     seed: int = option(0, "training seed", check=not_negative)
     out: str | None = option(
         None,
         "checkpoint folder to make or to continue",
         metavar="DIR",
-        default_text="outputs/train/<task>-<encoder>-<views>-seed<seed>",
+        default_text="outputs/train/<task>-<policy>-seed<seed>",
     )
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Encode what is not at hand, train and say where the checkpoint is."""
-    encoder = None if options.encoder == NO_ENCODER else options.encoder
+    encoder = None if options.encoder in (NO_ENCODER, STATE) else options.encoder
     if encoder:
-        registry.find_weights(encoder, options.weights)
-    views = _views(options, encoder)
-    out = Path(options.out) if options.out else folders.train_folder(options.task, encoder, views, options.seed)
-    folders.check_folder(out, "training.json")
-    dataset = folders.open_dataset(options.dataset, options.task, views)
+        registry.find_weights(encoder, options.weights, options.accept_licence)
     from surgicai_vision.cells import Cell, train_cell
 
-    cell = Cell(dataset.task, encoder, views, options.seed, options.policy, options.recipe)
-    train_cell(cell, dataset, out, console.stage, options.weights)
+    cell = Cell(
+        options.task,
+        encoder,
+        _views(options, encoder),
+        options.seed,
+        options.policy,
+        options.recipe,
+        pool=options.pool if encoder else "global",
+        privileged=options.encoder == STATE,
+        epochs=options.epochs,
+        deviations=options.deviation,
+    )
+    registry.load_recipe(cell.policy, cell.recipe, cell.changes)
+    out = Path(options.out) if options.out else folders.train_folder(cell.task, cell.name, cell.seed)
+    folders.check_folder(out, "training.json")
+    dataset = folders.open_dataset(options.dataset, options.task, cell.view)
+    cell = replace(cell, task=dataset.task)
+    with open_log(options.log, out) as log:
+        train_cell(
+            cell, dataset, out, console.stage, options.weights, accept_licence=options.accept_licence,
+            start=Path(options.start) if options.start else None, save_every=options.save_every, log=log,
+        )  # fmt: skip
     console.say(f"checkpoint: {out}")
-    console.say(f"next: surgicai-vision evaluate {out}")
+    if cell.policy == "bc":
+        console.say(f"next: surgicai-vision evaluate {out}")
     return {"checkpoint": str(out)}
 
 
 def _views(options: Options, encoder: str | None) -> tuple[str, ...]:
     if encoder is None:
         if options.view:
-            raise InputError("--encoder none sees nothing; leave --view out, or name an encoder.")
+            raise InputError(f"--encoder {options.encoder} sees no picture; leave --view out, or name an encoder.")
         return ()
     return ("front", "back") if options.view is None else options.view

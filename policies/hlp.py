@@ -1,0 +1,43 @@
+"""`hlp`: the paper's high-level policy, which says the subtask that is due.
+
+The recipe `paper` (paper, Section 4 and appendix): the network of `bc` with the logits of five classes at its
+end; cross-entropy against the phase of each frame of whole procedures; visual features beside the tip pose and
+jaw of both arms.
+"""
+
+from typing import final
+
+import numpy as np
+import torch
+from torch import nn
+
+from policies.base import Inputs, Plugin, Policy, Recipe
+from policies.layers import FeatureMLP
+from surgicai_vision import names
+from surgicai_vision.errors import InputError
+
+
+@final
+class HighLevelPolicy(Policy):
+    """The MLP that classifies the phase."""
+
+    def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
+        if recipe.privileged:
+            raise InputError("Policy 'hlp' sees both arms and pictures; leave 'privileged' off.")
+        super().__init__(Inputs(visual, names.BOTH_ARMS if recipe.proprioception else None))
+        self.network = FeatureMLP(recipe, self.inputs, len(names.SUBTASKS))
+
+    def forward(self, observed: torch.Tensor) -> torch.Tensor:
+        """Return the logits (B, 5) of the subtasks for normalised inputs."""
+        return self.network(observed)
+
+    def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Return the cross-entropy against phases (B,) int64."""
+        return nn.functional.cross_entropy(self(observed), target)
+
+    def choose(self, features: np.ndarray | None, both_arms: np.ndarray) -> np.ndarray:
+        """Return the subtask that is due, (B,) indices in `names.SUBTASKS`, for a batch as `act` takes it."""
+        return self.act(features, both_arms).argmax(axis=1)
+
+
+HLP = Plugin("hlp", Recipe, HighLevelPolicy, names.PHASE)

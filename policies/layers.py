@@ -1,0 +1,104 @@
+"""Layers the members share: what takes in each kind of feature, and the paper's MLP.
+
+A global feature (the paper's) enters as it is; a feature map passes a trained spatial softmax, and tokens a
+trained attention, before the MLP.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import final
+
+import torch
+from torch import nn
+
+from policies.base import Inputs, Recipe
+from surgicai_vision.errors import InputError
+
+POINTS = 32  # patterns of a spatial softmax (Levine et al., End-to-end visuomotor policies, JMLR 2016)
+
+
+@final
+class GlobalFeature(nn.Module):
+    """A global feature, taken as it is."""
+
+    def __init__(self, dim: int):
+        super().__init__()
+        self.dim = dim
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return (B, dim) as given."""
+        return rows
+
+
+@final
+class SpatialSoftmax(nn.Module):
+    """A trained spatial softmax: where in the picture each of `POINTS` learned patterns lies, in [-1, 1]."""
+
+    def __init__(self, channels: int, height: int, width: int):
+        super().__init__()
+        self.shape = (channels, height, width)
+        self.dim = 2 * POINTS
+        self.patterns = nn.Conv2d(channels, POINTS, 1)
+        y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+        self.register_buffer("places", torch.stack([x.flatten(), y.flatten()], dim=1), persistent=False)
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return the expected x and y of each pattern, (B, 2 · POINTS), for flattened maps (B, C·h·w)."""
+        scores = self.patterns(rows.unflatten(1, self.shape)).flatten(2).softmax(dim=2)
+        return (scores @ self.places).flatten(1)
+
+
+@final
+class TokenAttention(nn.Module):
+    """A trained attention over tokens: one learned query chooses what to average."""
+
+    def __init__(self, tokens: int, channels: int):
+        super().__init__()
+        self.shape = (tokens, channels)
+        self.dim = channels
+        self.query = nn.Linear(channels, 1)
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return the weighted mean token (B, C) for flattened tokens (B, N·C)."""
+        tokens = rows.unflatten(1, self.shape)
+        return (self.query(tokens).softmax(dim=1) * tokens).sum(dim=1)
+
+
+HEADS: Mapping[int, Callable[..., GlobalFeature | SpatialSoftmax | TokenAttention]] = {
+    1: GlobalFeature,
+    3: SpatialSoftmax,
+    2: TokenAttention,
+}
+"""Number of axes of a view's feature → the layer that takes it in."""
+
+
+def _head(shape: tuple[int, ...]) -> GlobalFeature | SpatialSoftmax | TokenAttention:
+    """Return the first layer for a feature of `shape`."""
+    if len(shape) not in HEADS:
+        raise InputError(f"A feature of shape {shape} cannot be taken in; allowed are (dim,), (C, h, w) and (N, C).")
+    return HEADS[len(shape)](*shape)
+
+
+@final
+class FeatureMLP(nn.Module):
+    """The paper's network: hidden layers, each preceded by BatchNorm, on features beside a vector."""
+
+    def __init__(self, recipe: Recipe, inputs: Inputs, answers: int):
+        super().__init__()
+        self.inputs = inputs
+        heads = [_head(shape) for shape in inputs.visual]
+        self.heads = nn.ModuleList(heads)
+        layers: list[nn.Module] = []
+        width = sum(head.dim for head in heads) + inputs.dim - inputs.features
+        for hidden in recipe.hidden:
+            layers += [nn.BatchNorm1d(width)] if recipe.batch_norm else []
+            layers += [nn.Linear(width, hidden), nn.ReLU()]
+            width = hidden
+        self.layers = nn.Sequential(*layers, nn.Linear(width, answers))
+
+    def forward(self, observed: torch.Tensor) -> torch.Tensor:
+        """Return (B, answers) for normalised inputs (B, inputs.dim)."""
+        sizes = [math.prod(shape) for shape in self.inputs.visual]
+        *rows, vector = observed.split([*sizes, self.inputs.dim - self.inputs.features], dim=1)
+        seen = [head(row) for head, row in zip(self.heads, rows, strict=True)]
+        return self.layers(torch.cat([*seen, vector], dim=1))

@@ -1,0 +1,62 @@
+"""`cache`: list, measure or prune the cache of frozen features."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision.commands import folders
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.options import one_of, option
+
+EXAMPLE = "surgicai-vision cache list"
+ACTIONS = ("list", "size", "prune")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `cache`."""
+
+    action: str = option(
+        dataclasses.MISSING, "list, size, or prune", metavar="ACTION", check=one_of("action", ACTIONS)
+    )
+    keep: tuple[str, ...] = option(
+        (), "datasets whose features prune keeps, a comma list of folders", metavar="DIR[,DIR]"
+    )
+
+
+def run(options: Options, console: Console) -> dict[str, Any]:
+    """Show the entries, or delete those of no dataset that is kept."""
+    from surgicai_vision.features import default_cache_root, list_cache, prune_cache
+
+    if options.action == "prune":
+        kept = {folders.open_dataset(folder, "", ()).fingerprint for folder in options.keep}
+        entries = prune_cache(keep_datasets=kept)
+    else:
+        entries = list_cache()
+    if options.action != "size":
+        for entry in entries:
+            console.say(f"{entry.folder.name[:12]}  {_mb(entry.size):>10}  {_text(entry.manifest)}")
+    total = sum(entry.size for entry in entries)
+    said = "removed" if options.action == "prune" else "held"
+    console.say(f"{len(entries)} entries, {_mb(total)} {said} in {default_cache_root()}")
+    rows = [_row(entry.folder, entry.size, entry.manifest) for entry in entries]
+    return {"action": options.action, "entries": rows, "bytes": total, "folder": str(default_cache_root())}
+
+
+def _mb(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"
+
+
+def _text(manifest: dict[str, Any] | None) -> str:
+    if manifest is None:
+        return "unfinished"
+    shape = " × ".join(map(str, (manifest["length"], *manifest["shape"])))
+    return (
+        f"{manifest['encoder']}, {manifest['view']}, {manifest['pool']}, {shape}, dataset {manifest['dataset'][:12]}"
+    )
+
+
+def _row(folder: Path, size: int, manifest: dict[str, Any] | None) -> dict[str, Any]:
+    keys = ("dataset", "view", "encoder", "pool", "length", "dim")
+    return {"key": folder.name, "bytes": size, **{key: (manifest or {}).get(key) for key in keys}}

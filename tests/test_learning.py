@@ -1,0 +1,172 @@
+"""The verbs of the learn stage: encode, cache, train, and what a training leaves behind."""
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from encoders.base import POOLS
+from surgicai_vision import names, registry
+from surgicai_vision.checkpoint import read_checkpoint
+from surgicai_vision.cli import main
+from surgicai_vision.commands import folders, logs
+from surgicai_vision.config import TaskConfig
+from surgicai_vision.errors import InputError, UnknownName, check_name
+
+
+@dataclass
+class Dataset:
+    """Four episodes of noise with every column a policy may be fed."""
+
+    task: str = "suture"
+    views: tuple[str, ...] = ("front", "back")
+    image_size: int = 32
+    length: int = 40
+    fingerprint: str = "noise"
+    config: TaskConfig = field(default_factory=lambda: TaskConfig("suture"))
+
+    def __post_init__(self) -> None:
+        self.episode_index = np.repeat(np.arange(4), 10)
+
+    def frames(self, view: str, start: int, stop: int) -> np.ndarray:
+        return np.random.default_rng(len(view)).integers(0, 256, (self.length, 32, 32, 3), np.uint8)[start:stop]
+
+    def columns(self) -> dict[str, np.ndarray]:
+        noise = np.random.default_rng(1).normal(size=(self.length, 49)).astype(np.float32)
+        phase = np.tile(np.repeat(np.arange(5), 2), 4)
+        noise[:, 7:21] += 5 * phase[:, None]  # both arms tell the phase
+        return {
+            names.STATE: noise[:, :7],
+            names.BOTH_ARMS: noise[:, 7:21],
+            names.PRIVILEGED_STATE: noise[:, 21:42],
+            names.ACTION: np.tanh(noise[:, 42:]),
+            names.PHASE: phase,
+        }
+
+
+@pytest.fixture(autouse=True)
+def noise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run in an empty folder, on a dataset of noise, with a tiny encoder and a cache of its own."""
+
+    def open_dataset(folder: str | None, task: str, views: tuple[str, ...]) -> Dataset:
+        for view in views:
+            check_name("view of this dataset", view, Dataset.views)
+        return Dataset()
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(folders, "open_dataset", open_dataset)
+    monkeypatch.setattr(registry, "ENCODERS", {**registry.ENCODERS, "tiny": "tiny_encoder:TINY"})
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict:
+    assert main([*arguments, "--json"]) == 0
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(list(arguments)) == 2
+    return capsys.readouterr().err
+
+
+def test_open_names_pools_and_licences(capsys: pytest.CaptureFixture[str]) -> None:
+    assert registry.POOLS == POOLS
+    assert registry.check_encoder_name("timm:resnet18.a1_in1k") == "timm:resnet18.a1_in1k"
+    with pytest.raises(UnknownName, match="timm:<name>"):
+        registry.check_encoder_name("tmm:resnet18")
+    assert "--accept-licence" in fails(capsys, "encode", "--encoder", "vc1")
+    assert "pytorch_model.bin" in fails(capsys, "train", "--encoder", "vc1", "--accept-licence")
+    assert "Did you mean 'spatial'" in fails(capsys, "encode", "--encoder", "random", "--pool", "spacial")
+
+
+def test_cache_lists_measures_and_prunes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, "cache", "list")["entries"] == []
+    run(capsys, "encode", "--encoder", "tiny")
+    listed = run(capsys, "cache", "list")
+    assert [(row["encoder"], row["view"], row["length"]) for row in listed["entries"]].count(("tiny", "back", 40)) == 1
+    assert run(capsys, "cache", "size")["bytes"] == listed["bytes"] > 0
+    assert run(capsys, "cache", "prune", "--keep", "the/dataset")["entries"] == []
+    assert len(run(capsys, "cache", "prune")["entries"]) == 2
+    assert run(capsys, "cache", "size")["bytes"] == 0
+    assert "Did you mean 'prune'" in fails(capsys, "cache", "prun")
+
+
+def test_epochs_recipe_and_fine_tuning(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ("train", "--task", "suture", "--encoder", "tiny", "--view", "back")
+    first = run(capsys, *arguments, "--epochs", "3", "--save-every", "2")
+    assert first["checkpoint"] == "outputs/train/suture-tiny-back-paper+3epochs-seed0"
+    checkpoint = read_checkpoint(Path(first["checkpoint"]))
+    assert (checkpoint.epoch, checkpoint.recipe_name) == (3, "paper+3epochs")
+    early = Path(first["checkpoint"]) / "epochs" / "epoch_0002"
+    assert read_checkpoint(early).epoch == 2
+    tuned = run(capsys, *arguments, "--epochs", "1", "--start", str(early), "--out", "tuned")
+    fresh = run(capsys, *arguments, "--epochs", "1", "--out", "fresh")
+    losses = [read_checkpoint(Path(result["checkpoint"])).train_losses[0] for result in (tuned, fresh)]
+    assert losses[0] < losses[1]
+    other = ("train", "--encoder", "none", "--start", "tuned", "--out", "other")
+    assert "to start from" in fails(capsys, *other)
+    Path("own.yaml").write_text("epochs: 2\nhidden: [16]\n")
+    own = read_checkpoint(Path(run(capsys, *arguments, "--recipe", "own.yaml")["checkpoint"]))
+    assert (own.epoch, own.recipe["hidden"], own.recipe_name) == (2, [16], "own")
+
+
+def test_controls_are_named_by_what_they_see(capsys: pytest.CaptureFixture[str]) -> None:
+    state = run(capsys, "train", "--task", "suture", "--encoder", "state", "--epochs", "1")["checkpoint"]
+    assert state.startswith("outputs/train/suture-state")
+    policy = registry.load_policy(state)
+    assert policy.inputs.vector == names.PRIVILEGED_STATE and not policy.checkpoint.proprioception
+    assert policy.act(None, np.zeros((2, 21), np.float32)).shape == (2, 7)
+    with pytest.raises(InputError, match="21"):
+        policy.act(None, np.zeros((2, 7), np.float32))
+    recipe = registry.load_recipe("bc", "paper", {"privileged": True})
+    with pytest.raises(InputError, match="privileged state"):
+        registry.policy_plugin("bc").make(recipe, ((8,),))
+    assert "leave --view out" in fails(capsys, "train", "--encoder", "state", "--view", "back")
+
+
+def test_high_level_policy_learns_the_phase(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ("train", "--task", "suture", "--policy", "hlp", "--encoder", "none")
+    folder = run(capsys, *arguments, "--epochs", "60", "--recipe", "paper")["checkpoint"]
+    policy, columns = registry.load_policy(folder), Dataset().columns()
+    chosen = policy.choose(None, columns[names.BOTH_ARMS])
+    assert (chosen == columns[names.PHASE]).mean() > 0.8
+    assert policy.act(None, columns[names.BOTH_ARMS]).shape == (40, 5)
+    kinds = [type(layer).__name__ for layer in policy.network.layers]
+    assert kinds == ["BatchNorm1d", "Linear", "ReLU"] * 3 + ["Linear"]
+    assert "does not act" in fails(capsys, "evaluate", folder)
+
+
+def test_losses_are_drawn_where_tensorboard_is_installed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[tuple] = []
+
+    class SummaryWriter:
+        def __init__(self, folder: str) -> None:
+            drawn.append((folder,))
+
+        def add_scalar(self, *row: object) -> None:
+            drawn.append(row)
+
+        def close(self) -> None:
+            drawn.append(("closed",))
+
+    fake = ModuleType("torch.utils.tensorboard")
+    fake.SummaryWriter = SummaryWriter  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", fake)
+    monkeypatch.setattr(logs, "installed", lambda name: name == "tensorboard")
+    arguments = ("train", "--task", "suture", "--encoder", "none", "--epochs", "2", "--out", "a")
+    run(capsys, *arguments)
+    assert drawn[0] == ("a-tensorboard",) and drawn[-1] == ("closed",)
+    assert [(row[0], row[2]) for row in drawn[1:-1]] == [
+        ("loss/train", 1), ("loss/validation", 1), ("loss/train", 2), ("loss/validation", 2)
+    ]  # fmt: skip
+    count = len(drawn)
+    run(capsys, *arguments)
+    assert len(drawn) == count, "a training that is done draws nothing"
+    monkeypatch.setattr(logs, "installed", lambda name: False)
+    assert "not installed" in fails(capsys, *arguments, "--log", "tensorboard")
