@@ -122,6 +122,8 @@ def test_version(capsys):
         (["render-demos", "--demos", "missing"], "missing"),
         (["render-demos", "--demos", "missing", "--episodes", "3"], "nothing is recorded"),
         (["record-demos", "--episodes", "-3"], "--episodes is -3"),
+        (["record-demos", "--noise", "-0.1"], "--noise is -0.1; it must be within 0 and 1"),
+        (["record-demos", "--recoveries", "2"], "--recoveries is 2.0"),
         (["train", "--encoder", "rndom"], "Did you mean 'random'?"),
         (["train", "--encoder", "none", "--view", "back"], "leave --view out"),
         (["train", "--encoder", "random", "--view", "back"], "surgicai-vision render-demos --task grasp"),

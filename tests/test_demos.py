@@ -9,9 +9,8 @@ from fake_env import FakeEnv, FakeExpert
 
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.demos import record as recording
-from surgicai_vision.demos.record import record, roll
+from surgicai_vision.demos.record import Disturbance, record, roll
 from surgicai_vision.demos.store import (
-    ARRAYS,
     Demo,
     list_demos,
     read_demo,
@@ -41,12 +40,69 @@ def test_write_read_returns_the_same_demo(tmp_path, demo):
     again = read_demo(write_demo(tmp_path, 7, demo))
     for field in dataclasses.fields(Demo):
         one, two = getattr(demo, field.name), getattr(again, field.name)
-        if field.name in ARRAYS:
+        if isinstance(one, np.ndarray):
             assert one.dtype == two.dtype
             np.testing.assert_array_equal(one, two)
         else:
             assert one == two
     assert [path.name for path in tmp_path.iterdir()] == ["episode_000007.safetensors"]
+
+
+def test_noise_is_executed_and_the_label_is_the_experts(tmp_path):
+    env = FakeEnv(CONFIG)
+    noisy = roll(env, FakeExpert(env), 3, disturbance=Disturbance(noise=0.2)).demo
+    again = read_demo(write_demo(tmp_path, 0, noisy))
+    np.testing.assert_array_equal(again.executed, noisy.executed)
+    difference = noisy.executed - noisy.action
+    assert (difference[:, 1:6].std(axis=0) > 0).all()
+    assert (difference[:, 6] == 0).all(), "the jaw is done as meant"
+    assert np.abs(noisy.executed).max() <= 1.0
+    env.reset(seed=3)
+    for state, label, executed in zip(noisy.state, noisy.action, noisy.executed, strict=False):
+        np.testing.assert_array_equal(env.get_state(), state)
+        np.testing.assert_array_equal(FakeExpert(env).action(), label)
+        env.step(executed)
+    np.testing.assert_array_equal(roll(env, FakeExpert(env), 3, disturbance=Disturbance(0.2)).demo.state, noisy.state)
+
+
+class Patient(FakeEnv):
+    """Knows no success while a push lasts."""
+
+    def step(self, action):
+        seen, reward, success, truncated, info = super().step(action)
+        success &= self.state[2] > 25
+        return seen, reward, success, truncated, {**info, "is_success": success}
+
+
+def test_a_recovery_starts_elsewhere_and_its_push_is_not_recorded():
+    env = Patient(dataclasses.replace(CONFIG, max_steps=60))
+    pushed = [roll(env, FakeExpert(env), seed, disturbance=Disturbance(recoveries=0.5)).demo for seed in range(20)]
+    starts = [int(demo.state[0, 2]) for demo in pushed]
+    assert 4 <= sum(start > 0 for start in starts) <= 16
+    assert {start for start in starts if start} <= set(range(8, 26))
+    # A push that ends the episode is undone: the start stays as it was.
+    short = FakeEnv(CONFIG)
+    for seed in range(20):
+        start = roll(short, FakeExpert(short), seed, disturbance=Disturbance(recoveries=1.0)).demo.state[0, 2]
+        assert start < CONFIG.max_steps
+
+
+@pytest.mark.parametrize("wrong", [{"noise": -0.1}, {"noise": float("nan")}, {"recoveries": 1.1}])
+def test_a_senseless_disturbance_is_refused(wrong):
+    with pytest.raises(InputError, match="within 0 and 1"):
+        Disturbance(**wrong)
+
+
+def test_disturbed_recordings_are_another_request(tmp_path, fake):
+    calm = record(CONFIG, episodes=2, out=tmp_path / "calm", seed=1, workers=0)
+    disturbed = Disturbance(noise=0.1)
+    noisy = record(CONFIG, episodes=2, out=tmp_path / "noisy", seed=1, workers=0, disturbance=disturbed)
+    assert read_demo(calm[0]).executed is None
+    assert read_demo(noisy[0]).executed is not None
+    assert "noise" not in read_marker(tmp_path / "calm")["request"]
+    assert read_marker(tmp_path / "noisy")["request"]["noise"] == 0.1
+    with pytest.raises(OutputExists):
+        record(CONFIG, episodes=2, out=tmp_path / "noisy", seed=1, workers=0)
 
 
 def test_demo_refuses_bad_lengths_quoting_both(demo):
@@ -56,6 +112,8 @@ def test_demo_refuses_bad_lengths_quoting_both(demo):
         dataclasses.replace(demo, reward=demo.reward[:2])
     with pytest.raises(InputError, match="it must be float32"):
         dataclasses.replace(demo, action=demo.action.astype(np.float64))
+    with pytest.raises(InputError, match=r"it must be .* float32"):
+        dataclasses.replace(demo, executed=demo.action[:-1])
     with pytest.raises(InputError, match="not finite"):
         dataclasses.replace(demo, state=np.full_like(demo.state, np.nan))
 

@@ -64,6 +64,12 @@ def not_negative(name: str, value: float | None) -> None:
         raise InputError(f"{name} is {value}; it must be at least 0.")
 
 
+def share(name: str, value: float | None) -> None:
+    """Refuse a number that is not within 0 and 1."""
+    if value is not None and not 0 <= value <= 1:
+        raise InputError(f"{name} is {value}; it must be within 0 and 1.")
+
+
 def one_of(kind: str, allowed: Iterable[str]) -> Check:
     """Return a check that admits one of `allowed`."""
     known = tuple(allowed)

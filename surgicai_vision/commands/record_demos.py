@@ -7,7 +7,7 @@ from typing import Any
 from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import config_only, not_negative, one_of, option, positive, task_config
+from surgicai_vision.commands.options import config_only, not_negative, one_of, option, positive, share, task_config
 
 EXAMPLE = "surgicai-vision record-demos --task grasp --episodes 50"
 
@@ -19,6 +19,15 @@ class Options:
     task: str = option("grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
     episodes: int = option(50, "successful episodes to keep", check=positive, metavar="N")
     seed: int = option(names.TRAIN_SEED, "seed of the first start; each episode takes the next", check=not_negative)
+    noise: float = option(
+        0.0,
+        "standard deviation of the noise on executed motions, in units of an action's range; labels stay the expert's",
+        check=share,
+        metavar="SIGMA",
+    )
+    recoveries: float = option(
+        0.0, "share of episodes that start with a push that is not recorded", check=share, metavar="P"
+    )
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     out: str | None = option(None, "folder to make or to continue", metavar="DIR", default_text="outputs/demos/<task>")
     env: dict | None = config_only()
@@ -26,14 +35,20 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Record and say where the demonstrations are."""
-    from surgicai_vision.demos.record import record
+    from surgicai_vision.demos.record import Disturbance, record
 
     config = task_config(options.task, options.env)
     out = Path(options.out) if options.out else folders.demos_folder(options.task)
     folders.check_folder(out, "demos.json")
     with console.stage(f"recording {options.task}", "episodes") as progress:
         paths = record(
-            config, episodes=options.episodes, out=out, seed=options.seed, workers=options.workers, progress=progress
+            config,
+            episodes=options.episodes,
+            out=out,
+            seed=options.seed,
+            disturbance=Disturbance(options.noise, options.recoveries),
+            workers=options.workers,
+            progress=progress,
         )
     console.say(f"{len(paths)} demonstrations of {options.task}: {out}")
     return {"task": options.task, "episodes": len(paths), "demos": str(out)}

@@ -14,7 +14,7 @@ import functools
 import json
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,13 +28,22 @@ from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.dataset import layout, pictures
 from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
 from surgicai_vision.dataset.writing import EPISODE_FILE, SUMMARY_FILE, assemble, compression
-from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo
+from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo, read_marker
 from surgicai_vision.errors import BadFile, InputError, OutputExists, check_name
 from surgicai_vision.executor import Job, Progress, building, run, work_folder
 from surgicai_vision.files import check_output, code_version, read_json, sha256_file, write_json
 
 SIZES = (16, 1024)
 """Smallest and largest image side [px]; MuJoCo's off-screen buffer ends at the latter."""
+
+
+MEASURED: Mapping[str, Callable[[Any], np.ndarray]] = {
+    names.STATE: lambda env: env.agent_pos(),
+    names.NEEDLE_POSE: lambda env: env.needle_pose(),
+    names.BOTH_ARMS: lambda env: env.both_arms(),
+    names.PRIVILEGED_STATE: lambda env: env.state_vector(),
+}
+"""Column → what the env says of the state that was set."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +105,7 @@ def render_demos(
     ]
     with building(out) as (store, result):
         shards = run(jobs, store, workers=workers, progress=progress, unit="frames")
-        meta = _meta(request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins)
+        meta = _meta(demos, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins)
         table = layout.features(views, size, depth, segmentation)
         assemble(shards, result, table, names.TASK_TEXTS[config.task], meta)
     return DatasetSummary(meta["frames"], meta["episodes"], time.monotonic() - started, meta["digest"])
@@ -140,7 +149,11 @@ def _same_config(origins: Sequence[_Origin], where: Path) -> TaskConfig:
 
 
 def _meta(
-    request: Mapping[str, Any], config: TaskConfig, summaries: Sequence[Mapping[str, Any]], origins: Sequence[_Origin]
+    demos: Path,
+    request: Mapping[str, Any],
+    config: TaskConfig,
+    summaries: Sequence[Mapping[str, Any]],
+    origins: Sequence[_Origin],
 ) -> dict[str, Any]:
     """Return the content of `meta/surgicai.json`."""
     return {
@@ -159,6 +172,7 @@ def _meta(
         "scene_hash": origins[0].scene_hash,
         "sources": sorted({origin.source for origin in origins}),
         "demos_digest": request["demos"],
+        "demos_request": read_marker(demos).get("request"),
         "demos_code_versions": sorted({origin.code_version for origin in origins}),
         "code_version": code_version(),
         "frames": sum(summary["frames"] for summary in summaries),
@@ -197,7 +211,7 @@ def render_episode(folder: Path, demo: str, views: Sequence[str], size: int, dep
     content: dict[str, list[bytes]] = {key: [] for key, _, _ in keys}
     statistics = {key: PictureStatistics() for key, _, _ in keys}
     hashes = layout.EpisodeDigest(content)
-    poses, needle = [], []
+    measured: dict[str, list[np.ndarray]] = {key: [] for key in MEASURED}
     for state in episode.state[:-1]:
         env.set_state_vector(state)
         observation = env.observe()
@@ -207,9 +221,9 @@ def render_episode(folder: Path, demo: str, views: Sequence[str], size: int, dep
             content[key].append(pictures.encode(frame))
             statistics[key].add(frame)
             hashes.add(key, frame)
-        poses.append(observation["agent_pos"])
-        needle.append(env.needle_pose())
-    columns = _columns(episode, np.stack(poses), np.stack(needle))
+        for key, measure in MEASURED.items():
+            measured[key].append(measure(env))
+    columns = _columns(episode, {key: np.stack(rows) for key, rows in measured.items()})
     _write_episode(folder, content, columns, [key for key, _, modality in keys if modality == names.DEPTH])
     write_json(
         folder / SUMMARY_FILE,
@@ -226,12 +240,11 @@ def render_episode(folder: Path, demo: str, views: Sequence[str], size: int, dep
     )
 
 
-def _columns(demo: Demo, poses: np.ndarray, needle: np.ndarray) -> dict[str, np.ndarray]:
+def _columns(demo: Demo, measured: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return every column of `layout.COLUMNS`, (T,) or (T, n)."""
     return {
-        names.STATE: poses.astype(np.float32),
+        **{key: rows.astype(np.float32) for key, rows in measured.items()},
         names.ACTION: demo.action,
-        names.NEEDLE_POSE: needle.astype(np.float32),
         names.REWARD: demo.reward,
         names.DONE: np.arange(len(demo)) == len(demo) - 1,
         names.SUCCESS: demo.success,

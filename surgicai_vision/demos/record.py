@@ -8,8 +8,12 @@ continues a run that was killed (the finished episodes lie in `<out>.work` until
 does nothing when it is complete.
 
     rollout = roll(env, expert, seed)      # one episode, kept or not
+
+With a `Disturbance` the expert is shown states off its own path: noise on what is executed, while the label stays the
+expert's own answer (DART, Laskey et al. 2017), and starts that were pushed away before the recording begins.
 """
 
+import dataclasses
 import functools
 import importlib
 import shutil
@@ -35,6 +39,51 @@ MAX_FAILURES = 3
 """Seeds tried per episode wanted, at most; below one success in three the expert is not fit to teach."""
 
 
+DISTURBANCE_STREAM = 0xDA27
+"""Sets the disturbance's random numbers apart from the start's, which are of the same seed."""
+PUSH = (8, 25)
+"""Fewest and most control steps of a push: 4 to 12 mm at the paper's step size."""
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What disturbs an episode.
+
+    Attributes:
+        noise: standard deviation of the Gaussian noise on the six motions of an executed action, in units of its
+            range; the jaw is done as meant, since a random walk of it would drop the needle.
+        recoveries: share of episodes that start with a push in a random direction, which is not recorded.
+    """
+
+    noise: float = 0.0
+    recoveries: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.noise <= 1.0 or not 0.0 <= self.recoveries <= 1.0:
+            raise InputError(
+                f"noise is {self.noise:g} and recoveries {self.recoveries:g}; each must be within 0 and 1."
+            )
+
+    def push(self, env: Any, rng: np.random.Generator) -> bool:
+        """Push the tool away, or not, as chance has it; say whether the episode is still on."""
+        if rng.random() >= self.recoveries:
+            return True
+        direction = np.append(rng.uniform(-1.0, 1.0, 6), 0.0).astype(np.float32)
+        for _ in range(rng.integers(*PUSH, endpoint=True)):
+            _, _, terminated, truncated, _ = env.step(direction)
+            if terminated or truncated:
+                return False
+        return True
+
+    def executed(self, action: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Return what is done in the place of `action`, (7,) float32."""
+        noisy = action + np.append(rng.normal(0.0, self.noise, 6), 0.0)
+        return np.clip(noisy, -1.0, 1.0).astype(np.float32)
+
+
+CALM = Disturbance()
+
+
 class Actor(Protocol):
     """What records: an expert that sees the environment itself; made anew for every episode."""
 
@@ -51,20 +100,24 @@ class Rollout:
     reason: str
 
 
-def roll(env: Any, actor: Actor, seed: int, source: str = "expert") -> Rollout:
+def roll(env: Any, actor: Actor, seed: int, source: str = "expert", disturbance: Disturbance = CALM) -> Rollout:
     """Roll one episode of `env` from `seed` and return it with every state on the way."""
+    rng = np.random.default_rng([seed, DISTURBANCE_STREAM])
     env.reset(seed=seed)
+    if not disturbance.push(env, rng):
+        env.reset(seed=seed)  # the push ended it; this start stays as it was
     states, rows = [env.get_state()], []
     info: dict[str, Any] = {}
     ended = False
     while not ended:
         phase = env.phase
         action = np.asarray(actor.action(), dtype=np.float32)
-        _, reward, terminated, truncated, info = env.step(action)
+        executed = disturbance.executed(action, rng) if disturbance.noise else action
+        _, reward, terminated, truncated, info = env.step(executed)
         states.append(env.get_state())
-        rows.append((action, phase, reward, info["is_success"], info["contact"]))
+        rows.append((action, executed, phase, reward, info["is_success"], info["contact"]))
         ended = terminated or truncated
-    actions, phase, reward, success, contact = (list(column) for column in zip(*rows, strict=True))
+    actions, executed, phase, reward, success, contact = (list(column) for column in zip(*rows, strict=True))
     demo = Demo(
         config=env.config,
         seed=seed,
@@ -77,6 +130,7 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert") -> Rollout:
         reward=np.asarray(reward, dtype=np.float32),
         success=np.asarray(success, dtype=bool),
         contact=np.asarray(contact, dtype=bool),
+        executed=np.stack(executed) if disturbance.noise else None,
     )
     if info["physics_error"]:
         return Rollout(demo, False, "physics error")
@@ -91,11 +145,15 @@ def _env(config: TaskConfig) -> Any:
     return envs.make(config)
 
 
-def record_episode(folder: Path, task: Mapping[str, Any], source: str, seed: int) -> None:
+def record_episode(
+    folder: Path, task: Mapping[str, Any], source: str, seed: int, noise: float = 0.0, recoveries: float = 0.0
+) -> None:
     """Job "record-episode": roll `seed` and write the episode, or why it failed, into `folder`."""
     module, _, name = SOURCES[source].partition(":")
     env = _env(from_mapping(TaskConfig, task))
-    rollout = roll(env, getattr(importlib.import_module(module), name)(env), seed, source)
+    rollout = roll(
+        env, getattr(importlib.import_module(module), name)(env), seed, source, Disturbance(noise, recoveries)
+    )
     if rollout.success:
         write_demo(folder, 0, rollout.demo)
     write_json(folder / "result.json", {"seed": seed, "success": rollout.success, "reason": rollout.reason})
@@ -108,6 +166,7 @@ def record(
     out: Path,
     source: str = "expert",
     seed: int = names.TRAIN_SEED,
+    disturbance: Disturbance = CALM,
     workers: int = 1,
     progress: Progress | None = None,
 ) -> list[Path]:
@@ -119,6 +178,7 @@ def record(
         out: folder to make; the same request continues it or finds it finished.
         source: a key of `SOURCES`.
         seed: first seed; the following ones are taken in order.
+        disturbance: noise and pushes.
         workers: number of processes.
         progress: called with (episodes kept, episodes wanted, "episodes").
 
@@ -130,7 +190,7 @@ def record(
     check_name("source", source, SOURCES)
     if episodes < 1 or seed < 0:
         raise InputError(f"episodes is {episodes} and seed {seed}; they must be at least 1 and 0.")
-    request = {"task": to_mapping(config), "source": source, "seed": seed, "episodes": episodes}
+    request = {"task": to_mapping(config), "source": source, "seed": seed, "episodes": episodes, **_of(disturbance)}
     check_output(out, may_resume=MARKER)
     if finished(out, request):
         return list_demos(out)
@@ -142,6 +202,11 @@ def record(
             details = {"request": request, "skipped": skipped, "episodes": episodes}
             write_marker(folder, config.task, source, code=code_version(), **details)
     return list_demos(out)
+
+
+def _of(disturbance: Disturbance) -> dict[str, float]:
+    """Return what a request says of a disturbance: nothing of what is off."""
+    return {name: value for name, value in dataclasses.asdict(disturbance).items() if value}
 
 
 def finished(out: Path, request: Mapping[str, Any]) -> bool:
@@ -172,10 +237,8 @@ def _take(
                 f"{request['task']['task']}; {wanted} were wanted ({reasons}; …)."
             )
         count = wanted - len(kept)
-        jobs = [
-            Job("record-episode", {"task": request["task"], "source": request["source"], "seed": seed + i})
-            for i in range(count)
-        ]
+        same = {key: request[key] for key in ("task", "source", "noise", "recoveries") if key in request}
+        jobs = [Job("record-episode", {**same, "seed": seed + i}) for i in range(count)]
         report = functools.partial(_report, progress, len(kept), wanted)
         for folder in run(jobs, work, workers=workers, progress=report):
             result = read_json(folder / "result.json")

@@ -35,6 +35,8 @@ ARRAYS = {
     "contact": ("bool", 1),
 }
 """Array → (dtype, number of axes) as stored."""
+EXECUTED = "executed"
+"""The array that only disturbed episodes have."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Demo:
         reward: (T,) float32, of the step.
         success: after the step, (T,) bool.
         contact: jaws touch the needle after the step, (T,) bool.
+        executed: what was done where that was not `action`, the label: (T, 7) float32, or None.
 
     Raises:
         InputError: lengths, shapes or numbers that do not fit each other.
@@ -69,6 +72,7 @@ class Demo:
     reward: np.ndarray
     success: np.ndarray
     contact: np.ndarray
+    executed: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name, (dtype, axes) in ARRAYS.items():
@@ -85,11 +89,14 @@ class Demo:
         for name in ("phase", "reward", "success", "contact"):
             if len(getattr(self, name)) != len(self.action):
                 raise InputError(f"Demo has {len(getattr(self, name))} of {name} and {len(self.action)} actions.")
+        done = self.action if self.executed is None else self.executed
+        if done.shape != self.action.shape or done.dtype != np.float32:
+            raise InputError(f"Demo.executed is {done.shape} {done.dtype}; it must be {self.action.shape} float32.")
         if self.action.shape[1] != len(names.ACTION_NAMES):
             raise InputError(
                 f"Demo.action has {self.action.shape[1]} columns; it must have {len(names.ACTION_NAMES)}."
             )
-        if not (np.isfinite(self.state).all() and np.isfinite(self.action).all() and np.isfinite(self.reward).all()):
+        if not all(np.isfinite(values).all() for values in (self.state, self.action, self.reward, done)):
             raise InputError("Demo holds numbers that are not finite.")
 
     def __len__(self) -> int:
@@ -109,6 +116,8 @@ def demo_bytes(demo: Demo) -> bytes:
         "code_version": demo.code_version,
     }
     arrays = {name: np.ascontiguousarray(getattr(demo, name)) for name in ARRAYS}
+    if demo.executed is not None:
+        arrays[EXECUTED] = np.ascontiguousarray(demo.executed)
     return save(arrays, metadata={"demo": json.dumps(details, sort_keys=True)})
 
 
@@ -128,13 +137,14 @@ def read_demo(path: Path) -> Demo:
     try:
         with safe_open(path, framework="numpy") as file:
             details = json.loads((file.metadata() or {}).get("demo", "null"))
-            arrays = {name: file.get_tensor(name) for name in ARRAYS}
+            present = [*ARRAYS, *({EXECUTED} & set(file.keys()))]
+            arrays = {name: file.get_tensor(name) for name in present}
         if not isinstance(details, dict) or details.pop("format", None) != FORMAT:
             raise BadFile(f"{path} is not a demonstration (no '{FORMAT}' in its metadata).")
         if details.pop("version") != VERSION:
             raise BadFile(f"{path} has another format version; this release reads version {VERSION}.")
         details["config"] = from_mapping(TaskConfig, details["config"], str(path))
-        fields = {field.name for field in dataclasses.fields(Demo)} - set(ARRAYS)
+        fields = {field.name for field in dataclasses.fields(Demo)} - {*ARRAYS, EXECUTED}
         if set(details) != fields:
             raise BadFile(f"{path}: its metadata has {sorted(details)}; expected {sorted(fields)}.")
         return Demo(**details, **arrays)
