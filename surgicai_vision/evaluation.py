@@ -19,6 +19,7 @@ from typing import Any, Protocol, final
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision import names
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.errors import InputError, PhysicsError, SurgicaiError
 from surgicai_vision.statistics import clopper_pearson, mean_and_std
@@ -70,6 +71,7 @@ class EpisodeRow:
         contact: whether the jaws felt the needle at the end.
         error: what broke the episode off, or "".
         failure: "" for a success, else one of `KINDS`.
+        stages: subtasks finished in their order, of the whole procedure; 1 for a subtask's own success.
     """
 
     task: str
@@ -84,6 +86,7 @@ class EpisodeRow:
     error: str
     grasp: str
     failure: str
+    stages: int = 0
 
 
 @dataclass(frozen=True)
@@ -244,6 +247,7 @@ class _Slot:
             error=self.error,
             grasp=self.task_config.scene.grasp,
             failure="" if success else failure_kind(self.error, self.touched, contact),
+            stages=int(self.info.get("progress", success)),
         )
         self.seed = None
         return Episode(row, self._film())
@@ -285,7 +289,13 @@ def summary(rows: Sequence[EpisodeRow]) -> dict[str, Any]:
         "errors": sum(1 for row in rows if row.error),
         "failures": {kind: failures.count(kind) for kind in KINDS if kind in failures},
         "first_seed": min(row.seed for row in rows),
+        **({"reached": _reached(rows)} if first.task == names.SUTURE else {}),
     }
+
+
+def _reached(rows: Sequence[EpisodeRow]) -> dict[str, int]:
+    """Return how many episodes finished each subtask and all before it."""
+    return {subtask: sum(row.stages > index for row in rows) for index, subtask in enumerate(names.SUBTASKS)}
 
 
 def as_table(rows: Sequence[EpisodeRow]) -> list[dict[str, Any]]:

@@ -39,6 +39,12 @@ class FakeEnv:
     def agent_pos(self):
         return np.linspace(0, 1, 7).astype(np.float32) + np.float32(self.state[1])
 
+    def both_arms(self):
+        return np.concatenate([self.agent_pos(), self.agent_pos() + np.float32(1)])
+
+    def state_vector(self):
+        return np.full(21, self.state[0] - self.state[1], np.float32)
+
     def needle_pose(self):
         return np.array([self.state[0], 0, 0, 1, 0, 0, 0], np.float32)
 

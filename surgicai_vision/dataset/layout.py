@@ -19,9 +19,11 @@ VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         names.STATE: names.STATE_NAMES,
         names.ACTION: names.ACTION_NAMES,
         names.NEEDLE_POSE: ("x", "y", "z", "qw", "qx", "qy", "qz"),
+        names.BOTH_ARMS: names.BOTH_ARMS_NAMES,
+        names.PRIVILEGED_STATE: names.PRIVILEGED_NAMES,
     }
 )
-"""float32 columns and the names of their elements; [m], [rad] and unit quaternions."""
+"""float32 columns and the names of their elements; [m], [rad] and unit quaternions; privileged_state in [cm]."""
 
 SCALARS: Mapping[str, str] = MappingProxyType(
     {

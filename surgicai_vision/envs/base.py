@@ -237,6 +237,16 @@ class SuturingEnv(gymnasium.Env):
         simulation, arm = self.simulation, self.subtask.arm
         return np.array(observation.seven(arm, simulation.tip_in_base(arm), simulation.jaw(arm)), dtype=np.float32)
 
+    def both_arms(self) -> NDArray[np.float32]:
+        """Return what `agent_pos` is for psm1, then for psm2, (14,): the proprioception of a high-level policy."""
+        simulation = self.simulation
+        sevens = [observation.seven(arm, simulation.tip_in_base(arm), simulation.jaw(arm)) for arm in names.ARMS]
+        return np.array(sevens, dtype=np.float32).ravel()
+
+    def state_vector(self) -> NDArray[np.float32]:
+        """Return the observation of obs_type "state", goal included, (21,)."""
+        return self._state_vector(self._target())
+
     def needle_pose(self) -> NDArray[np.float32]:
         """Return the needle's position [m] and quaternion (w, x, y, z) in world, (7,)."""
         return self.data.qpos[self.scene.needle_qpos].astype(np.float32)

@@ -27,6 +27,7 @@ class Memory:
         tip_x, tip_y, tip_z: needle tip at the last measurement, world [m].
         hold: T_grasp_needle when the active jaws first held the needle.
         goal: the subtask's fixed goal in world, where it has one.
+        done: subtasks finished in their order (whole procedure).
     """
 
     phase: float = 0.0
@@ -46,8 +47,9 @@ class Memory:
     tool_z: float = 0.0
     hold: Pose = IDENTITY
     goal: Pose = IDENTITY
+    done: float = 0.0
 
-    SIZE: ClassVar[int] = 15 + 2 * 12
+    SIZE: ClassVar[int] = 16 + 2 * 12
     """Numbers of a record; what else is in MuJoCo's user data follows it: see `simulation`."""
 
     def pack(self) -> list[float]:

@@ -2,11 +2,13 @@
 
 The present subtask's success must hold for `DWELL` control steps before the next one begins: the paper's
 tolerances are met before a subtask is finished (an insertion counts 5 mm before its goal), and the next one needs
-it finished. When the pull-out begins PSM2 lets go by itself, as in the released code.
+it finished. When the pull-out begins PSM2 lets go by itself, as in the released code. A high-level policy may choose
+another subtask by `begin`.
 """
 
 from surgicai_vision.envs.base import Info, SuturingEnv
 from surgicai_vision.envs.simulation import RELEASE_STEPS
+from surgicai_vision.errors import InputError
 
 DWELL = 15
 """Control steps a success must hold before the next subtask begins."""
@@ -22,15 +24,32 @@ class Suture(SuturingEnv):
         info["subtask_success"] = info["is_success"]
         memory.dwell = memory.dwell + 1.0 if info["is_success"] else 0.0
         last = int(memory.phase) == len(self._subtasks) - 1
-        info["progress"] = int(memory.phase) + int(last and info["is_success"])
+        if memory.phase == memory.done and (memory.dwell >= DWELL or (last and info["is_success"])):
+            memory.done += 1.0
+        info["progress"] = int(memory.done)
         info["is_success"] = bool(last and info["is_success"])
         if last or memory.dwell < DWELL:
             return False
-        memory.phase += 1.0
+        self._enter(int(memory.phase) + 1)
+        return True
+
+    def begin(self, phase: int) -> None:
+        """Begin a subtask by choice, as a high-level policy does: its arm moves from now on.
+
+        Args:
+            phase: index in `names.SUBTASKS`; that of the present subtask changes nothing.
+        """
+        if not 0 <= phase < len(self._subtasks):
+            raise InputError(f"There is no subtask {phase}; allowed: 0 to {len(self._subtasks) - 1}.")
+        if phase != self.phase:
+            self._enter(phase)
+
+    def _enter(self, phase: int) -> None:
+        """Make a subtask the present one; what lies behind is kept as it is."""
+        memory = self.simulation.memory
+        memory.phase = float(phase)
         memory.dwell = memory.held = 0.0
         if self.config.randomisation.latency:
             self.simulation.drop_waiting()
-        if int(memory.phase) == PULLOUT_PHASE:
-            memory.release = float(RELEASE_STEPS)
+        memory.release = float(RELEASE_STEPS) if phase == PULLOUT_PHASE else 0.0
         self._remember_tool()
-        return True
