@@ -328,11 +328,12 @@ class Simulation:
         return left and right
 
     def touches_phantom(self, *, needle: bool) -> bool:
-        """Say whether an instrument, or with `needle` the needle too, touches the phantom."""
+        """Say whether an instrument, or with `needle` the needle too, touches the phantom; the thread always may."""
         bodies = self.model.geom_bodyid[self.data.contact.geom]
-        touching = (bodies == self._phantom_id).any(axis=1)
-        if not needle:
-            touching &= ~(bodies == self._needle_id).any(axis=1)
+        may = self.model.body_rootid[bodies] == self._needle_id  # the thread hangs on the needle
+        if needle:
+            may &= bodies != self._needle_id
+        touching = (bodies == self._phantom_id).any(axis=1) & ~may.any(axis=1)
         return bool(touching.any())
 
     # -- state ----------------------------------------------------------------------------------------------------
