@@ -6,6 +6,8 @@
 # make lock         rewrite requirements.lock (UPGRADE=1: newest versions allowed)
 
 BIN := .venv/bin
+# Without compiled bytecode each worker process compiles torch and timm anew.
+unexport PYTHONDONTWRITEBYTECODE
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .PHONY: setup quickstart test lint check format lock
