@@ -5,7 +5,7 @@ import pytest
 from episodes import flat, make
 
 from surgicai_vision import envs, names
-from surgicai_vision.config import TaskConfig
+from surgicai_vision.config import SceneConfig, TaskConfig
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.scene import needle
 
@@ -113,6 +113,14 @@ def test_starts_are_physical_and_differ(task):
         assert not info["is_success"] and not info["physics_error"]
         assert info["contact"] == (task in ("place", "insert", "pullout"))
     assert len(np.unique(first, axis=0)) == 40
+
+
+@pytest.mark.parametrize("task", names.SUBTASKS)
+def test_every_subtask_starts_with_a_thread(task):
+    env = make(task, scene=SceneConfig(thread=10))
+    for seed in range(4):
+        seen, info = env.reset(seed=seed)
+        assert np.isfinite(seen).all() and not info["is_success"]
 
 
 def test_the_needle_starts_where_the_released_code_puts_it():
