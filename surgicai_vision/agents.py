@@ -119,9 +119,13 @@ class PolicyAgent:
 
     def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
         """Return the policy's actions (n, 7)."""
+        return self.answer(envs, observations)
+
+    def answer(self, envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the policy's answers (n, …): actions, or a high-level policy's logits."""
         with one_thread():
             vectors = np.stack([self._vector(env) for env in envs])
-            return self._actions(self._features(observations), vectors)
+            return np.asarray(self._policy.act(self._features(observations), vectors), np.float32)
 
     def _features(self, observations: Sequence[Any]) -> NDArray[np.float32] | None:
         """Encode all views of all slots in one call, (n, views · dim): an encoder computes whole batches."""
@@ -129,9 +133,6 @@ class PolicyAgent:
             return None
         frames = np.stack([o["pixels"][view] for o in observations for view in self.cameras])
         return np.asarray(self._encoder(frames), np.float32).reshape(len(observations), -1)
-
-    def _actions(self, features: NDArray[np.float32] | None, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(self._policy.act(features, vectors), np.float32)
 
 
 @final

@@ -334,7 +334,8 @@ def policy_agent(folder: Path, weights: str | None = None, accept_licence: bool 
     encoder = registry.load_encoder_of(checkpoint, weights, accept_licence)
     name, vector = checkpoint_name(checkpoint), policy.inputs.vector or names.STATE
     agent = PolicyAgent(name, policy, encoder, checkpoint.views, checkpoint.image_size, vector)
-    if checkpoint.encoder and _deviations(checkpoint).action_noise:
+    acts = registry.policy_plugin(checkpoint.policy).target == names.ACTION
+    if acts and checkpoint.encoder and _deviations(checkpoint).action_noise:
         return NoisyAgent(agent, registry.released_noise(checkpoint.encoder.name))
     return agent
 

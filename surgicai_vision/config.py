@@ -180,7 +180,7 @@ def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str = "configu
 
     Raises:
         UnknownName: a key that `cls` does not have.
-        InputError: a value of the wrong type.
+        InputError: a value of the wrong type, or one that has no default and is missing.
     """
     if not isinstance(mapping, Mapping):
         raise InputError(f"{where}: expected a table of keys, got {type(mapping).__name__}.")
@@ -190,6 +190,10 @@ def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str = "configu
         if key not in hints:
             raise UnknownName(f"key in {where}", key, hints)
         values[key] = _convert(hints[key], value, f"{where}: {key}")
+    nothing = dataclasses.MISSING
+    for item in dataclasses.fields(cls):  # type: ignore[arg-type]
+        if item.name not in values and item.default is nothing and item.default_factory is nothing:
+            raise InputError(f"{where}: '{item.name}' is missing.")
     return cls(**values)
 
 

@@ -71,7 +71,7 @@ class EpisodeRow:
         contact: whether the jaws felt the needle at the end.
         error: what broke the episode off, or "".
         failure: "" for a success, else one of `KINDS`.
-        stages: subtasks finished in their order, of the whole procedure; 1 for a subtask's own success.
+        stages: subtasks that succeeded in their order, of the whole procedure; 1 for a subtask's own success.
     """
 
     task: str

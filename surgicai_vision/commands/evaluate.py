@@ -8,7 +8,16 @@ from typing import Any
 from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import config_only, not_negative, one_of, option, positive, task_config
+from surgicai_vision.commands.options import (
+    config_only,
+    not_negative,
+    one_of,
+    option,
+    positive,
+    read_yaml,
+    task_config,
+)
+from surgicai_vision.config import from_mapping
 from surgicai_vision.errors import InputError, UnknownName
 
 EXAMPLE = "surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json"
@@ -18,7 +27,9 @@ EXAMPLE = "surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900
 class Options:
     """Options of `evaluate`."""
 
-    policy: str = option(dataclasses.MISSING, "a checkpoint folder, or expert, random or zero", metavar="POLICY")
+    policy: str = option(
+        dataclasses.MISSING, "a checkpoint folder, a chain.yaml, or expert, random or zero", metavar="POLICY"
+    )
     task: str | None = option(
         None,
         f"the task: {', '.join(names.TASKS)}",
@@ -64,6 +75,8 @@ def _subject(options: Options) -> Any:
     from surgicai_vision import cells, lerobot_agent
 
     folder = Path(options.policy)
+    if folder.suffix in (".yaml", ".yml"):
+        return _chain(folder, options)
     if options.policy in cells.BASELINES:
         config = task_config(options.task or "grasp", options.env)
         return cells.baseline_subject(options.policy, config)
@@ -79,6 +92,20 @@ def _subject(options: Options) -> Any:
         raise InputError(f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out.")
     if options.env:
         subject = dataclasses.replace(subject, config=task_config(trained_for, options.env))
+    return subject
+
+
+def _chain(path: Path, options: Options) -> Any:
+    """Say who acts in a chain, in the task suture."""
+    from surgicai_vision import chain
+
+    config = from_mapping(chain.Chain, read_yaml(path), str(path))
+    if options.task not in (None, names.SUTURE):
+        raise InputError(f"{path} is a chain of the whole procedure; leave --task {options.task} out.")
+    subject = chain.subject(config, options.weights, options.accept_licence)
+    if options.env:
+        task = task_config(names.SUTURE, {"max_steps": config.max_steps, **options.env})
+        subject = dataclasses.replace(subject, config=task)
     return subject
 
 

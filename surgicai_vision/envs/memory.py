@@ -27,7 +27,7 @@ class Memory:
         tip_x, tip_y, tip_z: needle tip at the last measurement, world [m].
         hold: T_grasp_needle when the active jaws first held the needle.
         goal: the subtask's fixed goal in world, where it has one.
-        done: subtasks finished in their order (whole procedure).
+        done: subtasks that succeeded in their order (whole procedure).
     """
 
     phase: float = 0.0

@@ -24,7 +24,7 @@ class Suture(SuturingEnv):
         info["subtask_success"] = info["is_success"]
         memory.dwell = memory.dwell + 1.0 if info["is_success"] else 0.0
         last = int(memory.phase) == len(self._subtasks) - 1
-        if memory.phase == memory.done and (memory.dwell >= DWELL or (last and info["is_success"])):
+        if info["is_success"] and memory.phase == memory.done:
             memory.done += 1.0
         info["progress"] = int(memory.done)
         info["is_success"] = bool(last and info["is_success"])

@@ -1,0 +1,150 @@
+"""The chain: high-level policy, low-level policies, terminations, limits."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from policies.base import Recipe
+from policies.bc import BC
+from policies.hlp import HLP
+from surgicai_vision import chain, envs, names
+from surgicai_vision.chain import PATIENCE, Chain, ChainAgent
+from surgicai_vision.checkpoint import Checkpoint, write_checkpoint
+from surgicai_vision.cli import main
+from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.errors import BadFile, InputError, UnknownName
+from surgicai_vision.evaluation import evaluate, summary
+
+EXPERTS = dict.fromkeys(names.SUBTASKS, "expert")
+
+
+def checkpoint(folder: Path, task: str, policy: str = "bc") -> str:
+    """Write an untrained policy that sees no picture."""
+    plugin = {"bc": BC, "hlp": HLP}[policy]
+    written = Checkpoint(
+        task=TaskConfig(task), policy=policy, recipe=to_mapping(Recipe()), recipe_name="paper", views=(),
+        image_size=32, encoder=None, proprioception=True, seed=0, epoch=1, dataset="", demonstrations=1, frames=1,
+        validation_episodes=(), train_losses=(), validation_losses=(), device="cpu", code_version="",
+    )  # fmt: skip
+    write_checkpoint(folder, written, plugin.make(Recipe(), ()).state_dict())
+    return str(folder)
+
+
+class Env:
+    """Counts what a chain asks of it; the present subtask succeeds after `length` steps."""
+
+    def __init__(self, length: int = 3):
+        self.length, self.phase, self.steps, self.begun = length, 0, 0, []
+
+    def begin(self, phase: int) -> None:
+        if phase != self.phase:
+            self.begun.append(phase)
+            self.phase, self.steps = phase, 0
+
+    def step(self) -> None:
+        self.steps += 1
+        if self.steps == self.length and self.phase < 4:
+            self.phase, self.steps = self.phase + 1, 0
+
+
+def agent(classes: list[int], **changes: object) -> ChainAgent:
+    """Return a chain whose high-level policy says `classes` one after another, and whose policies say their index."""
+    made = ChainAgent("chain", Chain("order", **{**EXPERTS, **changes}))
+    said = iter(classes)
+    made._high = SimpleNamespace(answer=lambda envs, _: np.eye(5)[[next(said) for _ in envs]])
+    made._low = [
+        SimpleNamespace(
+            begin=lambda *_: None, act=lambda slots, *_, value=index: np.full((len(slots), 7), value / 10)
+        )
+        for index in range(5)
+    ]  # fmt: skip
+    return made
+
+
+def roll(actor: ChainAgent, env: Env, steps: int) -> list[int]:
+    """Return which low-level policy acted in each step; -1 where the arms hold still."""
+    actor.begin(0, env, 0)
+    acted = []
+    for _ in range(steps):
+        value = actor.act([0], [env], [None])[0, 0]
+        acted.append(round(10 * float(value)))
+        env.step()
+    return acted
+
+
+def test_privileged_termination_asks_when_the_subtask_has_ended() -> None:
+    env = Env(3)
+    assert roll(agent([0, 1, 2, 3, 4]), env, 14) == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4]
+    assert env.begun == []
+
+
+def test_a_choice_moves_its_own_arm() -> None:
+    env = Env(3)
+    assert roll(agent([0, 3, 1]), env, 7) == [0, 0, 0, 3, 3, 3, 1]
+    assert env.begun == [3, 1]
+
+
+def test_a_subtask_ends_after_its_steps_and_an_episode_after_its_decisions() -> None:
+    acted = roll(agent([1, 2, 3, 4], steps=2, decisions=3), Env(100), 9)
+    assert acted == [1, 1, 2, 2, 3, 3, 0, 0, 0], "after the third decision the arms hold still"
+
+
+def test_learned_termination_waits_for_the_high_level_policy() -> None:
+    actor, env = agent([0] * 4 + [1] * 3 + [0] + [1] * 20), Env(2)
+    object.__setattr__(actor.chain, "termination", "learned")
+    acted = roll(actor, env, 8 + PATIENCE + 2)
+    assert acted == [0] * (8 + PATIENCE - 1) + [1] * 3, "the env's own success must not end a subtask"
+
+
+def test_experts_in_their_order_sew_and_count_their_stages() -> None:
+    made = chain.subject(Chain("order", **EXPERTS, max_steps=1000))
+    assert made.config.task == "suture"
+    row = evaluate(made.make_agent, made.config, [names.TEST_SEED], workers=1)[0].row
+    assert row.success and row.stages == 5, row
+    assert summary([row])["reached"] == dict.fromkeys(names.SUBTASKS, 1)
+
+
+def test_begin_changes_the_arm_and_earns_nothing() -> None:
+    env = envs.make(TaskConfig("suture", max_steps=50))
+    env.reset(seed=names.TEST_SEED)
+    both, first = env.both_arms(), env.agent_pos()
+    np.testing.assert_array_equal(both[7:], first)
+    env.begin(4)
+    np.testing.assert_array_equal(env.agent_pos(), both[:7])
+    _, _, _, _, info = env.step(np.zeros(7, np.float32))
+    assert (info["phase"], info["progress"], info["is_success"]) == (4, 0, False)
+    with pytest.raises(InputError, match="no subtask 5"):
+        env.begin(5)
+
+
+def test_trained_policies_are_chained_in_any_batch(tmp_path: Path) -> None:
+    hlp = checkpoint(tmp_path / "hlp", "suture", "hlp")
+    low = {subtask: checkpoint(tmp_path / subtask, subtask) for subtask in names.SUBTASKS}
+    for termination in chain.TERMINATIONS:
+        made = chain.subject(Chain(hlp, **low, termination=termination, steps=4, max_steps=12))
+        rows = [
+            [e.row for e in evaluate(made.make_agent, made.config, [900_000, 900_001], batch=batch, workers=1)]
+            for batch in (1, 2)
+        ]
+        assert rows[0] == rows[1] and rows[0][0].steps == 12
+
+
+def test_wrong_chains_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grasp, hlp = checkpoint(tmp_path / "grasp", "grasp"), checkpoint(tmp_path / "hlp", "suture", "hlp")
+    with pytest.raises(InputError, match="not for 'place'"):
+        chain.subject(Chain("order", **{**EXPERTS, "place": grasp}))
+    with pytest.raises(InputError, match="takes an 'hlp'"):
+        chain.subject(Chain(grasp, **EXPERTS))
+    with pytest.raises(InputError, match="does not act"):
+        chain.subject(Chain("order", **{**EXPERTS, "grasp": hlp}))
+    with pytest.raises(BadFile, match="not a checkpoint"):
+        chain.subject(Chain(str(tmp_path), **EXPERTS))
+    with pytest.raises(InputError, match="needs a high-level policy"):
+        Chain("order", **EXPERTS, termination="learned")
+    with pytest.raises(UnknownName, match="termination"):
+        from_mapping(Chain, {"hlp": "order", **EXPERTS, "terminaton": "learned"})
+    (tmp_path / "chain.yaml").write_text("hlp: order\ngrasp: expert\n")
+    assert main(["evaluate", str(tmp_path / "chain.yaml")]) == 2
+    assert "'place'" in capsys.readouterr().err
