@@ -115,8 +115,8 @@ def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
 
 
 def flag(name: str) -> str:
-    """The command-line spelling of a field's name."""
-    return f"--{name.replace('_', '-')}"
+    """The command-line spelling of a field's name; `from_` is `--from`, a keyword of Python."""
+    return f"--{name.rstrip('_').replace('_', '-')}"
 
 
 def build(cls: type[T], given: Mapping[str, Any], config: Path | None) -> T:

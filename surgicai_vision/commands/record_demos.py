@@ -1,4 +1,4 @@
-"""`record-demos`: record demonstrations by the scripted expert."""
+"""`record-demos`: record demonstrations by the scripted expert, or by movement primitives learned from some."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +8,7 @@ from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import config_only, not_negative, one_of, option, positive, share, task_config
+from surgicai_vision.errors import InputError
 
 EXAMPLE = "surgicai-vision record-demos --task grasp --episodes 50"
 
@@ -18,6 +19,9 @@ class Options:
 
     task: str = option("grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
     episodes: int = option(50, "successful episodes to keep", check=positive, metavar="N")
+    source: str = option("expert", "who acts: expert, or dmp: movement primitives learned from --from")
+    from_: str | None = option(None, "demonstrations to learn from (--source dmp)", metavar="DEMOS")
+    demos_used: int = option(1, "how many of them to learn from", check=positive, metavar="N")
     seed: int = option(names.TRAIN_SEED, "seed of the first start; each episode takes the next", check=not_negative)
     noise: float = option(
         0.0,
@@ -36,19 +40,46 @@ class Options:
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Record and say where the demonstrations are."""
     from surgicai_vision.demos.record import Disturbance, record
+    from surgicai_vision.demos.store import MARKER, read_marker
+    from surgicai_vision.statistics import clopper_pearson
 
     config = task_config(options.task, options.env)
     out = Path(options.out) if options.out else folders.demos_folder(options.task)
     folders.check_folder(out, "demos.json")
+    taught = _taught(Path(options.from_), options.demos_used) if options.from_ else []
     with console.stage(f"recording {options.task}", "episodes") as progress:
         paths = record(
             config,
             episodes=options.episodes,
             out=out,
+            source=options.source,
             seed=options.seed,
             disturbance=Disturbance(options.noise, options.recoveries),
             workers=options.workers,
+            demos=taught,
             progress=progress,
         )
+    tried = len(paths) + len(read_marker(out)["skipped"])
+    low, high = clopper_pearson(len(paths), tried)
     console.say(f"{len(paths)} demonstrations of {options.task}: {out}")
-    return {"task": options.task, "episodes": len(paths), "demos": str(out)}
+    console.say(
+        f"{len(paths)}/{tried} starts succeeded (95 % interval {low:.0%} to {high:.0%})"
+        + (f"; {out / MARKER} names the others." if tried > len(paths) else ".")
+    )
+    return {
+        "task": options.task,
+        "episodes": len(paths),
+        "starts": tried,
+        "interval": [low, high],
+        "demos": str(out),
+    }
+
+
+def _taught(folder: Path, count: int) -> list[Path]:
+    """Return the first `count` demonstrations of a folder."""
+    from surgicai_vision.demos.store import list_demos
+
+    paths = list_demos(folder)
+    if count > len(paths):
+        raise InputError(f"--demos-used is {count}; {folder} holds {len(paths)}.")
+    return paths[:count]

@@ -16,8 +16,9 @@ expert's own answer (DART, Laskey et al. 2017), and starts that were pushed away
 import dataclasses
 import functools
 import importlib
+import itertools
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -30,10 +31,14 @@ from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.demos.store import MARKER, Demo, list_demos, read_demo, read_marker, write_demo, write_marker
 from surgicai_vision.errors import InputError, OutputExists, SurgicaiError, check_name
 from surgicai_vision.executor import Job, Progress, building, run, work_folder
-from surgicai_vision.files import check_output, code_version, read_json, whole_folder, write_json
+from surgicai_vision.files import check_output, code_version, read_json, sha256_file, whole_folder, write_json
 
-SOURCES: Mapping[str, str] = MappingProxyType({"expert": "surgicai_vision.demos.expert:Expert"})
-"""Source → "module:class" of what acts; built as `class(env)`."""
+SOURCES: Mapping[str, str] = MappingProxyType(
+    {"expert": "surgicai_vision.demos.expert:Expert", "dmp": "surgicai_vision.demos.imitator:Imitator"}
+)
+"""Source → "module:class" of what acts; built as `class(env)`, or as `class(env, demos)` where it is `TAUGHT`."""
+TAUGHT = frozenset({"dmp"})
+"""Sources that learn from demonstrations."""
 
 MAX_FAILURES = 3
 """Seeds tried per episode wanted, at most; below one success in three the expert is not fit to teach."""
@@ -117,7 +122,7 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert", disturbance:
         states.append(env.get_state())
         rows.append((action, executed, phase, reward, info["is_success"], info["contact"]))
         ended = terminated or truncated
-    actions, executed, phase, reward, success, contact = (list(column) for column in zip(*rows, strict=True))
+    actions, sent, phase, reward, success, contact = (list(column) for column in zip(*rows, strict=True))
     demo = Demo(
         config=env.config,
         seed=seed,
@@ -130,7 +135,7 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert", disturbance:
         reward=np.asarray(reward, dtype=np.float32),
         success=np.asarray(success, dtype=bool),
         contact=np.asarray(contact, dtype=bool),
-        executed=np.stack(executed) if disturbance.noise else None,
+        executed=np.stack(sent) if disturbance.noise else None,
     )
     if info["physics_error"]:
         return Rollout(demo, False, "physics error")
@@ -146,14 +151,19 @@ def _env(config: TaskConfig) -> Any:
 
 
 def record_episode(
-    folder: Path, task: Mapping[str, Any], source: str, seed: int, noise: float = 0.0, recoveries: float = 0.0
+    folder: Path,
+    task: Mapping[str, Any],
+    source: str,
+    seed: int,
+    noise: float = 0.0,
+    recoveries: float = 0.0,
+    demos: Sequence[str] = (),
 ) -> None:
     """Job "record-episode": roll `seed` and write the episode, or why it failed, into `folder`."""
     module, _, name = SOURCES[source].partition(":")
     env = _env(from_mapping(TaskConfig, task))
-    rollout = roll(
-        env, getattr(importlib.import_module(module), name)(env), seed, source, Disturbance(noise, recoveries)
-    )
+    actor = getattr(importlib.import_module(module), name)(env, *([demos] if demos else []))
+    rollout = roll(env, actor, seed, source, Disturbance(noise, recoveries))
     if rollout.success:
         write_demo(folder, 0, rollout.demo)
     write_json(folder / "result.json", {"seed": seed, "success": rollout.success, "reason": rollout.reason})
@@ -168,6 +178,7 @@ def record(
     seed: int = names.TRAIN_SEED,
     disturbance: Disturbance = CALM,
     workers: int = 1,
+    demos: Sequence[Path] = (),
     progress: Progress | None = None,
 ) -> list[Path]:
     """Record `episodes` successful demonstrations into the folder `out`; return their files.
@@ -180,28 +191,44 @@ def record(
         seed: first seed; the following ones are taken in order.
         disturbance: noise and pushes.
         workers: number of processes.
+        demos: files of the demonstrations that a source in `TAUGHT` learns from; their seeds are left out.
         progress: called with (episodes kept, episodes wanted, "episodes").
 
     Raises:
-        InputError: fewer than one episode, a negative seed, an unknown source.
+        InputError: fewer than one episode, a negative seed, an unknown source, demonstrations for a source that
+            learns from none, or none for one that does.
         OutputExists: `out` holds something else.
         SurgicaiError: the expert failed at too many seeds.
     """
     check_name("source", source, SOURCES)
     if episodes < 1 or seed < 0:
         raise InputError(f"episodes is {episodes} and seed {seed}; they must be at least 1 and 0.")
+    _check_taught(source, demos)
     request = {"task": to_mapping(config), "source": source, "seed": seed, "episodes": episodes, **_of(disturbance)}
+    if demos:
+        request["demos"] = [sha256_file(path) for path in demos]
     check_output(out, may_resume=MARKER)
     if finished(out, request):
         return list_demos(out)
     with building(out) as (store, result):
-        kept, skipped = _take(request, store, workers, progress or (lambda done, total, unit: None))
+        kept, skipped = _take(request, demos, store, workers, progress or (lambda done, total, unit: None))
         with whole_folder(result) as folder:
             for index, path in enumerate(kept):
                 shutil.copyfile(path, folder / f"episode_{index:06d}.safetensors")
             details = {"request": request, "skipped": skipped, "episodes": episodes}
             write_marker(folder, config.task, source, code=code_version(), **details)
     return list_demos(out)
+
+
+def _check_taught(source: str, demos: Sequence[Path]) -> None:
+    """Refuse a source without the demonstrations it learns from, or with some that it does not."""
+    if source in TAUGHT and not demos:
+        raise InputError(f"Source '{source}' learns from demonstrations; give at least one (--from DEMOS).")
+    if demos and source not in TAUGHT:
+        taught = ", ".join(sorted(TAUGHT))
+        raise InputError(
+            f"Source '{source}' learns from no demonstrations; leave them (--from) out or take source {taught}."
+        )
 
 
 def _of(disturbance: Disturbance) -> dict[str, float]:
@@ -223,12 +250,17 @@ def finished(out: Path, request: Mapping[str, Any]) -> bool:
 
 
 def _take(
-    request: Mapping[str, Any], work: Path, workers: int, progress: Progress
+    request: Mapping[str, Any], demos: Sequence[Path], work: Path, workers: int, progress: Progress
 ) -> tuple[list[Path], list[dict[str, Any]]]:
     """Try seeds in order until enough succeeded; return the kept files and the skipped seeds."""
     kept: list[Path] = []
     skipped: list[dict[str, Any]] = []
-    wanted, seed = request["episodes"], request["seed"]
+    wanted, inputs = request["episodes"], tuple(request.get("demos", ()))
+    same = {key: request[key] for key in ("task", "source", "noise", "recoveries") if key in request}
+    if demos:
+        same["demos"] = [str(path.resolve()) for path in demos]
+    known = {read_demo(path).seed for path in demos}
+    seeds = (seed for seed in itertools.count(request["seed"]) if seed not in known)
     while len(kept) < wanted:
         if len(kept) + len(skipped) >= MAX_FAILURES * wanted + 5:
             reasons = "; ".join(f"seed {row['seed']}: {row['reason']}" for row in skipped[:3])
@@ -236,9 +268,10 @@ def _take(
                 f"The {request['source']} succeeded at {len(kept)} of {len(kept) + len(skipped)} starts of "
                 f"{request['task']['task']}; {wanted} were wanted ({reasons}; …)."
             )
-        count = wanted - len(kept)
-        same = {key: request[key] for key in ("task", "source", "noise", "recoveries") if key in request}
-        jobs = [Job("record-episode", {**same, "seed": seed + i}) for i in range(count)]
+        jobs = [
+            Job("record-episode", {**same, "seed": seed}, inputs, label=("demos",))
+            for seed in itertools.islice(seeds, wanted - len(kept))
+        ]
         report = functools.partial(_report, progress, len(kept), wanted)
         for folder in run(jobs, work, workers=workers, progress=report):
             result = read_json(folder / "result.json")
@@ -246,7 +279,6 @@ def _take(
                 kept.append(folder / "episode_000000.safetensors")
             else:
                 skipped.append({"seed": result["seed"], "reason": result["reason"]})
-        seed += count
         progress(len(kept), wanted, "episodes")
     return kept, skipped
 
