@@ -6,11 +6,8 @@ from surgicai_vision import envs
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.demos.expert import Expert
 
-LONG = {"grasp": 200, "place": 200, "insert": 200, "handoff": 200, "pullout": 200, "suture": 1000}
-
 
 def make(task, *, obs_type="state", **fields):
-    fields = {"max_steps": LONG[task]} | fields
     return envs.make(TaskConfig(task, **fields), obs_type=obs_type, cameras=("back",), image_size=32)
 
 

@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 import pytest
-from episodes import LONG, actions, make, play
+from episodes import actions, make, play
 
 from surgicai_vision import names
 from surgicai_vision.config import SceneConfig
@@ -17,7 +17,7 @@ SEEDS = range(names.VALIDATION_SEED, names.VALIDATION_SEED + 8)
 def solve(env):
     """Let the expert go on to the end; return the last info and the actions (steps, 7)."""
     expert, done = Expert(env), []
-    for _ in range(LONG[env.task]):
+    for _ in range(env.config.max_steps):
         done.append(expert.action())
         _, _, terminated, truncated, info = env.step(done[-1])
         if terminated or truncated:
@@ -48,7 +48,7 @@ def test_the_expert_solves_the_whole_procedure(thread, seed):
     env.reset(seed=seed)
     phases = []
     expert = Expert(env)
-    for _ in range(LONG["suture"]):
+    for _ in range(env.config.max_steps):
         _, _, terminated, _, info = env.step(expert.action())
         phases.append(info["phase"])
         if terminated:
