@@ -12,10 +12,12 @@ drawn from the episode's seed; a policy that declares itself `memoryless` gets a
 LeRobot takes ten seconds and happens in the worker alone.
 """
 
+import contextlib
 import copy
 import dataclasses
 import functools
 import itertools
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,12 +81,13 @@ def subject(folder: Path, task: str | None = None, weights: str | None = None) -
     policy = _table(folder / CONFIG)
     training = _table(folder / TRAINING) if (folder / TRAINING).is_file() else {}
     config, sight = _circumstances(training, folder, task, policy)
-    name = f"{policy['type']}-{'+'.join(sight.cameras)}"
+    encoder, views = sight.encoder or policy.get("encoder"), "+".join(sight.cameras) or "proprioception"
+    name = "-".join(part for part in (policy["type"], encoder, views) if part)
     about = {
         "checkpoint": {"policy_sha256": sha256_file(folder / WEIGHTS), "policy": policy["type"]},
         "folder": str(folder),
         "views": list(sight.cameras),
-        "encoder": sight.encoder or policy.get("encoder") or "own",
+        "encoder": encoder or "own",
     }
     return Subject(name, config, functools.partial(LeRobotAgent, name, folder, sight, weights), about)
 
@@ -215,7 +218,8 @@ def _load(folder: Path, weights: str | None) -> tuple[Any, Any, Any]:
             config.pretrained_backbone_weights = None  # type: ignore[attr-defined]
         if weights and hasattr(config, "encoder_weights"):
             config.encoder_weights = weights
-        policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+        with contextlib.redirect_stdout(sys.stderr):  # LeRobot prints; our standard output is the result
+            policy = get_policy_class(config.type).from_pretrained(folder, config=config)
         overrides = {"device_processor": {"device": config.device}}
         before, after = make_pre_post_processors(config, str(folder), preprocessor_overrides=overrides)
     except SurgicaiError:

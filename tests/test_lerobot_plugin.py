@@ -409,7 +409,7 @@ def test_diffusion_trains_on_frozen_features_and_is_evaluated(dataset: Path, tmp
     config = json.loads((out / CHECKPOINT / "config.json").read_text())
     assert set(config["input_features"]) == {names.STATE, names.ENVIRONMENT_STATE}
     subject = lerobot_agent.subject(lerobot_agent.find(out))
-    assert subject.name == "diffusion-back"
+    assert subject.name == "diffusion-imagenet-lite-back"
     rows = [evaluate(subject.make_agent, subject.config, [1, 2, 3], batch=batch, workers=1) for batch in (1, 3)]
     assert [episode.row for episode in rows[0]] == [episode.row for episode in rows[1]]
 
