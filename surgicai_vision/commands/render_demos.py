@@ -11,6 +11,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import config_only, many_of, not_negative, one_of, option, positive
 from surgicai_vision.errors import InputError
 
+CODECS = ("h264", "av1")
 EXAMPLE = "surgicai-vision render-demos --task grasp --episodes 50 --view front,back --depth"
 
 
@@ -37,6 +38,13 @@ class Options:
     size: int = option(224, "height and width of pictures [px]", check=positive, metavar="PX")
     depth: bool = option(False, "render depth beside RGB")
     segmentation: bool = option(False, "render the parts beside RGB")
+    video: str | None = option(
+        None,
+        f"store RGB as video: {', '.join(CODECS)}; the error is measured",
+        check=one_of("video codec", CODECS),
+        metavar="CODEC",
+        default_text="lossless pictures",
+    )
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     out: str | None = option(None, "dataset to make", metavar="DIR", default_text="outputs/datasets/<task>")
     env: dict | None = config_only()
@@ -62,11 +70,20 @@ def run(options: Options, console: Console) -> dict[str, Any]:
             size=options.size,
             depth=options.depth,
             segmentation=options.segmentation,
+            video=options.video,
             workers=options.workers,
             progress=progress,
         )
     console.say(f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}")
+    say_error(summary, console)
     return {**dataclasses.asdict(summary), "task": task, "views": list(options.view), "dataset": str(out)}
+
+
+def say_error(summary: Any, console: Console) -> None:
+    """Say what the videos lost."""
+    if summary.video_error:
+        lost = ", ".join(f"{view} {error:.2f}" for view, error in summary.video_error.items())
+        console.say(f"mean absolute error of the videos, out of 255: {lost}")
 
 
 def _record(options: Options, task: str, console: Console) -> Path:

@@ -4,13 +4,14 @@
 
 `rendering` turns states into pictures (one job an episode), `writing` assembles the episodes with LeRobot's
 own metadata writer, `reading` opens a dataset without torch, `checking` verifies one, `repairing` keeps
-the longest verified prefix of a broken one.
+the longest verified prefix of a broken one, `viewing` makes one of fewer views or of videos.
 """
 
 from surgicai_vision.dataset.checking import CheckReport, check_dataset
 from surgicai_vision.dataset.reading import Dataset, open_dataset
-from surgicai_vision.dataset.rendering import DatasetSummary, render_demos
+from surgicai_vision.dataset.rendering import render_demos
 from surgicai_vision.dataset.repairing import Repair, repair_dataset
+from surgicai_vision.dataset.viewing import DatasetSummary, view_dataset
 
 __all__ = [
     "CheckReport",
@@ -21,4 +22,5 @@ __all__ = [
     "open_dataset",
     "render_demos",
     "repair_dataset",
+    "view_dataset",
 ]

@@ -73,7 +73,7 @@ def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
     problems.extend(number_problems(columns))
     _check_lerobot(dataset, columns, keys, problems)
     digests = []
-    bounds = _bounds(dataset.episode_index)
+    bounds = dataset.bounds()
     for start, stop in bounds:
         rows = {key: columns[key][start:stop] for key in layout.COLUMNS}
         digests.append(_check_episode(dataset, keys, start, stop, rows, problems))
@@ -119,19 +119,11 @@ def _check_foreign(files: LeRobotFiles, progress: Progress) -> CheckReport:
     return CheckReport(start, len(rows), digest_of([sha256_file(file) for file in data]), _listed(problems))
 
 
-def _bounds(episode_index: np.ndarray) -> list[tuple[int, int]]:
-    """Return (first frame, frame after the last) of every episode."""
-    if not len(episode_index):
-        return []
-    starts = [0, *(np.flatnonzero(np.diff(episode_index)) + 1).tolist()]
-    return list(zip(starts, [*starts[1:], len(episode_index)], strict=True))
-
-
 def _check_order(dataset: Dataset, columns: Mapping[str, np.ndarray], problems: list[str]) -> None:
     """Check the index columns and the ends of the episodes."""
     if not np.array_equal(columns["index"], np.arange(dataset.length)):
         problems.append("index: not 0, 1, 2, … over the dataset.")
-    bounds = _bounds(dataset.episode_index)
+    bounds = dataset.bounds()
     if [int(dataset.episode_index[start]) for start, _ in bounds] != list(range(len(bounds))):
         problems.append("episode_index: episodes are not 0, 1, 2, … in order.")
     if len(bounds) != dataset.meta.get("episodes"):
@@ -152,7 +144,7 @@ def _check_lerobot(dataset: Dataset, columns: Mapping[str, np.ndarray], keys: li
     except (BadFile, OSError, pa.ArrowException) as error:
         problems.append(f"LeRobot's metadata cannot be read ({(str(error).splitlines() or [''])[0]}).")
         return
-    bounds = _bounds(dataset.episode_index)
+    bounds = dataset.bounds()
     if (info.get("total_frames"), info.get("total_episodes")) != (dataset.length, len(bounds)):
         problems.append("meta/info.json: its counts are not those of the data.")
     missing = [key for key in (*keys, *layout.COLUMNS) if key not in info.get("features", {})]
@@ -186,7 +178,7 @@ def _check_episode(
     """Check one episode's pictures; return the digest of its content."""
     digest = layout.EpisodeDigest(keys)
     for key in keys:
-        watch = PictureWatch(key, dataset.image_size, dataset.views, rows)
+        watch = PictureWatch(key, dataset.image_size, dataset.views, rows, key not in dataset.video_keys)
         for index, frame in enumerate(_frames(dataset, key, start, stop, problems)):
             digest.add(key, frame)
             problem = watch.problem(index, frame)

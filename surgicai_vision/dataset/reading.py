@@ -11,6 +11,7 @@ Frames are numbered over the whole dataset, as LeRobot's `index` column. Reading
 
 import functools
 import hashlib
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,11 @@ import pyarrow.parquet as pq
 from surgicai_vision import names
 from surgicai_vision.config import TaskConfig, from_mapping
 from surgicai_vision.dataset import layout, pictures
+from surgicai_vision.dataset.video import read_frames
 from surgicai_vision.errors import BadFile, InputError, check_name
 from surgicai_vision.files import read_json, sha256_file
+
+VIDEO_PLACE = ("chunk_index", "file_index", "from_timestamp")
 
 
 def open_dataset(path: Path) -> "Dataset":
@@ -47,6 +51,7 @@ class Dataset:
         views: cameras, in order.
         image_size: side of the pictures [px].
         length: number of frames N.
+        video: codec of the RGB views, None where they are lossless pictures.
     """
 
     def __init__(self, path: Path):
@@ -63,6 +68,7 @@ class Dataset:
             self.views = tuple(str(view) for view in self.meta["views"])
             self.image_size = int(self.meta["image_size"])
             self.length = int(self.meta["frames"])
+            self.video: str | None = self.meta.get("video")
             self.has_depth, self.has_segmentation = bool(self.meta["depth"]), bool(self.meta["segmentation"])
         except (KeyError, TypeError, ValueError, InputError) as error:
             raise BadFile(f"{self.path / names.META_FILE} is damaged ({error}).") from None
@@ -94,6 +100,16 @@ class Dataset:
         """Episode of every frame, (N,) int64."""
         return self._column("episode_index")
 
+    @property
+    def video_keys(self) -> frozenset[str]:
+        """Picture columns that are videos."""
+        return frozenset(map(names.image_key, self.views)) if self.video else frozenset()
+
+    def bounds(self) -> list[tuple[int, int]]:
+        """Return (first frame, frame after the last) of every episode."""
+        starts = [0, *(np.flatnonzero(np.diff(self.episode_index)) + 1).tolist(), self.length]
+        return list(itertools.pairwise(starts)) if self.length else []
+
     def columns(self) -> dict[str, np.ndarray]:
         """Return every column that is no picture, (N,) or (N, n): those of `layout.COLUMNS` and LeRobot's."""
         return {key: self._column(key) for key in (*layout.COLUMNS, "frame_index", "timestamp", "index")}
@@ -114,11 +130,38 @@ class Dataset:
 
     def decoded(self, key: str, start: int, stop: int) -> Iterator[np.ndarray]:
         """Yield the pictures start … stop - 1 of a column as they decode, whatever their size."""
+        if key in self.video_keys:
+            yield from self._from_videos(key, start, stop)
+            return
         for position, (_, _, first, count) in enumerate(self._groups):
             low, high = max(start, first), min(stop, first + count)
             content = self._content(key, position) if low < high else []
             for index in range(low, high):
                 yield pictures.decode(content[index - first], f"{self.path}: {key}, frame {index}")
+
+    def _from_videos(self, key: str, start: int, stop: int) -> Iterator[np.ndarray]:
+        """Yield the frames start … stop - 1 of a video column."""
+        for row in self._rows:
+            first = row["dataset_from_index"]
+            low, high = max(start, first), min(stop, row["dataset_to_index"])
+            if low < high:
+                chunk, file = row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]
+                path = self.path / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
+                begin = round(row[f"videos/{key}/from_timestamp"] * names.FPS)
+                yield from read_frames(path, begin + low - first, high - low, names.FPS)
+
+    @functools.cached_property
+    def _rows(self) -> list[dict[str, Any]]:
+        """Where every episode is in the videos."""
+        wanted = [f"videos/{key}/{name}" for key in self.video_keys for name in VIDEO_PLACE]
+        rows: list[dict[str, Any]] = []
+        for file in sorted(self.path.glob("meta/episodes/chunk-*/file-*.parquet")):
+            try:
+                columns = ["dataset_from_index", "dataset_to_index", *wanted]
+                rows.extend(_open(file).read(columns).select(columns).to_pylist())
+            except (KeyError, pa.ArrowException) as error:
+                raise BadFile(f"{file} does not say where the videos are ({_line(error)}).") from None
+        return rows
 
     def _view(self, view: str) -> str:
         return check_name("view of this dataset", view, self.views)

@@ -15,7 +15,6 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,11 +25,13 @@ import pyarrow.parquet as pq
 from surgicai_vision import names
 from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.dataset import layout, pictures
+from surgicai_vision.dataset.reading import open_dataset
 from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
+from surgicai_vision.dataset.viewing import DatasetSummary, check_video, finished, write_view
 from surgicai_vision.dataset.writing import EPISODE_FILE, SUMMARY_FILE, assemble, compression
 from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo, read_marker
-from surgicai_vision.errors import BadFile, InputError, OutputExists, check_name
-from surgicai_vision.executor import Job, Progress, building, run, work_folder
+from surgicai_vision.errors import BadFile, InputError, check_name
+from surgicai_vision.executor import Job, Progress, building, run
 from surgicai_vision.files import check_output, code_version, read_json, sha256_file, write_json
 
 SIZES = (16, 1024)
@@ -46,16 +47,6 @@ MEASURED: Mapping[str, Callable[[Any], np.ndarray]] = {
 """Column → what the env says of the state that was set."""
 
 
-@dataclass(frozen=True)
-class DatasetSummary:
-    """What a rendering made: frames, episodes, wall-clock seconds and the digest of the content."""
-
-    frames: int
-    episodes: int
-    seconds: float
-    digest: str
-
-
 def render_demos(
     demos: Path,
     out: Path,
@@ -64,6 +55,7 @@ def render_demos(
     size: int = 224,
     depth: bool = False,
     segmentation: bool = False,
+    video: str | None = None,
     workers: int = 1,
     progress: Progress | None = None,
 ) -> DatasetSummary:
@@ -76,11 +68,12 @@ def render_demos(
         size: side of the square pictures [px].
         depth: also render depth, float32 [m].
         segmentation: also render part indices (`names.PARTS`).
+        video: codec of the RGB views, a key of `video.CODECS`; lossless pictures by default.
         workers: number of processes.
         progress: called with (frames done, frames, "frames").
 
     Raises:
-        UnknownName: a view that does not exist.
+        UnknownName: a view or codec that does not exist.
         BadFile: `demos` holds no readable demonstrations, or of another scene.
         OutputExists: `out` holds something else.
     """
@@ -91,12 +84,13 @@ def render_demos(
         raise InputError(f"views are {', '.join(views) or 'none'}; give at least one, each once.")
     if not SIZES[0] <= size <= SIZES[1]:
         raise InputError(f"size is {size}; it must be within {SIZES[0]} and {SIZES[1]} pixels.")
+    check_video(video)
     check_output(out, may_resume=names.META_FILE)
     paths = list_demos(demos)
     options = {"views": list(views), "size": size, "depth": depth, "segmentation": segmentation}
-    request = {**options, "demos": demos_digest(paths)}
+    request = {**options, "demos": demos_digest(paths), **({"video": video} if video else {})}
     if (out / names.META_FILE).exists():
-        return _finished(out, request, started)
+        return finished(out, request, started)
     origins = [_Origin.of(read_demo(path)) for path in paths]
     config = _same_config(origins, demos)
     jobs = [
@@ -107,21 +101,12 @@ def render_demos(
         shards = run(jobs, store, workers=workers, progress=progress, unit="frames")
         meta = _meta(demos, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins)
         table = layout.features(views, size, depth, segmentation)
-        assemble(shards, result, table, names.TASK_TEXTS[config.task], meta)
-    return DatasetSummary(meta["frames"], meta["episodes"], time.monotonic() - started, meta["digest"])
-
-
-def _finished(out: Path, request: Mapping[str, Any], started: float) -> DatasetSummary:
-    """Return the summary of a finished dataset if it is the one asked for."""
-    meta = read_json(out / names.META_FILE)
-    if meta.get("request") != request:
-        raise OutputExists(
-            f"--out {out} holds a dataset of other demonstrations or options (see {out / names.META_FILE}); "
-            "give another folder."
-        )
-    # Left by a run that was killed after its last step.
-    shutil.rmtree(work_folder(out), ignore_errors=True)
-    return DatasetSummary(meta["frames"], meta["episodes"], time.monotonic() - started, meta["digest"])
+        lossless = store / "lossless" if video else result
+        shutil.rmtree(lossless, ignore_errors=True)
+        assemble(shards, lossless, table, names.TASK_TEXTS[config.task], meta)
+        if video:
+            write_view(open_dataset(lossless), result, views, video, {})
+    return finished(out, request, started)
 
 
 class _Origin(NamedTuple):

@@ -24,7 +24,11 @@ PIXELS = "yuv420p"
 
 
 class VideoWriter:
-    """A video file in the making."""
+    """A video file in the making.
+
+    Attributes:
+        written: bytes encoded so far.
+    """
 
     def __init__(self, path: Path, codec: str, fps: int, size: int):
         import av
@@ -36,18 +40,23 @@ class VideoWriter:
         stream.width = stream.height = size
         stream.pix_fmt = PIXELS
         self._stream = stream
+        self.written = 0
 
     def add(self, frame: np.ndarray) -> None:
         """Append a frame, (H, W, 3) uint8 RGB."""
         import av
 
         picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
-        self._container.mux(self._stream.encode(picture))
+        self._mux(self._stream.encode(picture))
 
     def close(self) -> None:
         """Write what the encoder still holds and the file's index."""
-        self._container.mux(self._stream.encode())
+        self._mux(self._stream.encode())
         self._container.close()
+
+    def _mux(self, packets: Any) -> None:
+        self.written += sum(packet.size for packet in packets)
+        self._container.mux(packets)
 
     def __enter__(self) -> "VideoWriter":
         return self

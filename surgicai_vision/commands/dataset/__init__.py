@@ -5,6 +5,7 @@ from types import MappingProxyType
 VERBS = MappingProxyType(
     {
         "check": "read all of a dataset and say what is wrong with it",
+        "view": "take some views of a dataset, or store them as video, without rendering",
         "repair": "keep the longest whole prefix of a broken LeRobot dataset",
     }
 )
