@@ -16,7 +16,8 @@ cache holds. Measured on a Xeon with AMX (bf16, channels_last): convolutions giv
 batch and thread count; transformers and attention pools do not (up to 1 % between batch sizes, and between
 one and two threads), but do for a fixed batch on one thread, at any position and beside any neighbours. So:
 
-* every piece is padded to exactly `CPU_BATCH` (`CUDA_BATCH`) pictures;
+* every piece holds exactly `CPU_BATCH` (`CUDA_BATCH`) pictures. What is left over is padded, unless this network
+  on this machine is found to give the same bits in smaller pieces: then it is cut into those of `SMALL`;
 * on a CPU each piece is computed by one thread, and pieces run side by side, one per core. That is also
   faster where others use the cores: 4 to 5 times at a load of 5 on 2 cores, ResNet-50 and EfficientNet;
 * features are rounded to the values float16 can hold.
@@ -57,6 +58,8 @@ __all__ = [
 POOLS = ("global", "spatial", "tokens")
 CPU_BATCH = 8  # per thread; larger batches leave the cache and are slower
 CUDA_BATCH = 64
+SMALL = (4, 2, 1)  # smaller pieces that are tried; each costs as much a picture as a whole one
+PROBE_SEED = 0
 FINGERPRINT_VERSION = 1  # raise when the same weights and card begin to give other features
 
 
@@ -135,7 +138,7 @@ class Encoder:
         self._shift = ((low - mean) / std).to(self._device)
         self._channels = [2, 1, 0] if card.channel_order == "BGR" else None
         size = card.input_size
-        self.shape = tuple(self._map([np.zeros((1, size, size, 3), np.uint8)])[0].shape[1:])
+        self.shape = tuple(self._run(np.zeros((1, size, size, 3), np.uint8), pad=False).shape[1:])
         self.dim = int(np.prod(self.shape))
         self.fingerprint = digest(self._identity())
 
@@ -160,8 +163,7 @@ class Encoder:
             )
         if not len(frames):
             return np.zeros((0, self.dim), np.float32)
-        step = CUDA_BATCH if self._device.type == "cuda" else CPU_BATCH
-        pieces = self._map([frames[at : at + step] for at in range(0, len(frames), step)])
+        pieces = self._map(self._cut(frames))
         features = torch.cat(pieces).reshape(len(frames), self.dim).half().float().cpu().numpy()
         if not np.isfinite(features).all():
             raise SurgicaiError(
@@ -185,19 +187,43 @@ class Encoder:
         """Hash the live network: weights and buffers, as they stand in memory now."""
         return state_sha256(self._network)
 
-    def _map(self, pieces: list[np.ndarray]) -> list[torch.Tensor]:
+    def _cut(self, frames: np.ndarray) -> list[np.ndarray]:
+        """Cut frames into whole pieces and what is left over."""
+        step = CUDA_BATCH if self._device.type == "cuda" else CPU_BATCH
+        whole = len(frames) // step * step
+        pieces = [frames[at : at + step] for at in range(0, whole, step)]
+        rest = frames[whole:]
+        for size in SMALL if len(rest) and self._any_size else ():
+            while len(rest) >= size:
+                pieces.append(rest[:size])
+                rest = rest[size:]
+        return [*pieces, rest] if len(rest) else pieces
+
+    @functools.cached_property
+    def _any_size(self) -> bool:
+        """Whether pieces of `SMALL` give the bits of whole ones; asked of the network itself, once."""
+        if self._device.type == "cuda":
+            return False
+        side = self.card.input_size
+        frames = np.random.default_rng(PROBE_SEED).integers(0, 256, (CPU_BATCH, side, side, 3), np.uint8)
+        (whole,) = self._map([frames])
+        small = self._map([frames[-size:] for size in SMALL], pad=False)
+        return all(torch.equal(piece, whole[-len(piece) :]) for piece in small)
+
+    def _map(self, pieces: list[np.ndarray], pad: bool | None = None) -> list[torch.Tensor]:
         """Encode pieces, side by side on a CPU unless the caller has asked torch for one thread."""
         threads = torch.get_num_threads()
         if self._device.type == "cuda" or threads == 1:
-            return [self._run(piece) for piece in pieces]
-        return list(_workers(threads).map(self._run, pieces))
+            return [self._run(piece, pad) for piece in pieces]
+        return list(_workers(threads).map(functools.partial(self._run, pad=pad), pieces))
 
     @torch.inference_mode()
-    def _run(self, frames: np.ndarray) -> torch.Tensor:
-        """Encode one piece of at most a batch; (b, *shape) float32 on the device."""
+    def _run(self, frames: np.ndarray, pad: bool | None = None) -> torch.Tensor:
+        """Encode one piece of at most a batch, padded unless it need not be; (b, *shape) float32 on the device."""
         count = len(frames)
         step = CUDA_BATCH if self._device.type == "cuda" else CPU_BATCH
-        frames = np.concatenate([frames, np.zeros((step - count, *frames.shape[1:]), np.uint8)])
+        if count < step and (not self._any_size if pad is None else pad):
+            frames = np.concatenate([frames, np.zeros((step - count, *frames.shape[1:]), np.uint8)])
         pictures = self.preprocess(frames).to(self._dtype).contiguous(memory_format=torch.channels_last)
         return self._pooled(pictures)[:count].float()
 

@@ -52,6 +52,34 @@ def test_same_picture_same_feature_in_any_batch(encoder: Encoder) -> None:
     np.testing.assert_array_equal(together, encoder(frames[::-1])[::-1])
 
 
+class Restless(torch.nn.Module):
+    """A network whose answer depends on how many pictures it is asked for at once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[int] = []
+
+    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+        self.asked.append(len(pictures))
+        return pictures.mean((2, 3)) + len(pictures)
+
+
+def test_left_over_pictures_are_padded_only_where_the_network_needs_it() -> None:
+    card = registry.encoder_card("random")
+    frames = pictures(11)
+    restless = Encoder(card, Restless(), dtype=torch.float32)
+    together = restless(frames)
+    np.testing.assert_array_equal(np.concatenate([restless(frames[i : i + 1]) for i in range(11)]), together)
+    network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten())
+    calm = Encoder(card, network, dtype=torch.float32)
+    np.testing.assert_array_equal(np.concatenate([calm(frames[i : i + 1]) for i in range(11)]), calm(frames))
+    network.asked = []
+    network.register_forward_pre_hook(lambda module, given: module.asked.append(len(given[0])))
+    if calm._any_size:
+        calm(frames)
+        assert sorted(network.asked) == [1, 2, 8], "every picture is computed once"
+
+
 def test_feature_survives_the_cache(encoder: Encoder) -> None:
     features = encoder(pictures())
     np.testing.assert_array_equal(features, features.astype(np.float16).astype(np.float32))
