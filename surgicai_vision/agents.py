@@ -76,6 +76,46 @@ class ZeroAgent:
         return np.zeros((len(slots), 7), np.float32)
 
 
+@final
+class ReplayAgent:
+    """Blind replay: the same actions in every episode, then none. What it reaches needs no seeing.
+
+    Args:
+        actions: (T, 7), one for each control step.
+    """
+
+    name = "replay"
+    cameras: tuple[str, ...] = ()
+    image_size = 224
+
+    def __init__(self, actions: NDArray[np.float32]):
+        self._actions = np.concatenate([actions, np.zeros((1, 7), np.float32)])
+        self._steps: dict[int, int] = {}
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Start from the first action."""
+        self._steps[slot] = 0
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the actions of the slots' steps (n, 7)."""
+        steps = [min(self._steps[slot], len(self._actions) - 1) for slot in slots]
+        self._steps.update({slot: self._steps[slot] + 1 for slot in slots})
+        return self._actions[steps]
+
+
+def mean_demonstration(action: NDArray[np.float32], episode_index: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return the mean action of each control step (T, 7) over the demonstrations that still run then.
+
+    Args:
+        action: (N, 7) actions of all frames.
+        episode_index: (N,) their episodes.
+    """
+    episodes = [action[episode_index == episode] for episode in np.unique(episode_index)]
+    longest = max(map(len, episodes))
+    steps = [np.mean([e[step] for e in episodes if len(e) > step], axis=0) for step in range(longest)]
+    return np.stack(steps).astype(np.float32)
+
+
 VECTORS: Mapping[str, Callable[[Any], NDArray[np.float32]]] = MappingProxyType(
     {
         names.STATE: lambda env: env.agent_pos(),

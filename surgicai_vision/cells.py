@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision import files, names
-from surgicai_vision.agents import BASELINES, NoisyAgent, PolicyAgent
+from surgicai_vision.agents import BASELINES, NoisyAgent, PolicyAgent, ReplayAgent, mean_demonstration
 from surgicai_vision.config import DEVIATIONS, Deviations, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.evaluation import Agent, MakeAgent, evaluate
@@ -258,6 +258,13 @@ def evaluate_into(
 def baseline_subject(name: str, config: TaskConfig) -> Subject:
     """Return the subject of a baseline: expert, random or zero."""
     return Subject(name, config, functools.partial(baseline, name))
+
+
+def replay_subject(dataset: Any) -> Subject:
+    """Return the subject that replays the mean demonstration of an opened dataset, blind."""
+    actions = mean_demonstration(dataset.columns()[names.ACTION], dataset.episode_index)
+    about = {"dataset": dataset.fingerprint}
+    return Subject(ReplayAgent.name, dataset.config, functools.partial(ReplayAgent, actions), about)
 
 
 def checkpoint_subject(folder: Path, weights: str | None = None, accept_licence: bool = False) -> Subject:

@@ -1,7 +1,7 @@
 """Sweep: a grid of cells; each is encode (cached) → train → evaluate, and is done once.
 
 `out` holds `sweep.json` (the grid), `data/<task>/` (demonstrations and dataset), `cells/<key>/` with
-`policy/`, `evaluation/` and `cell.json` (written last), `references/` (the expert), `episodes.parquet` (one
+`policy/`, `evaluation/` and `cell.json` (written last), `references/` (expert, replay), `episodes.parquet` (one
 row an episode) and `run.json` for the report. The key is the digest of everything a cell is, so running
 again does only what is missing; a cell that failed is tried again, one whose weights cannot be had is
 reported as not run, with the reason.
@@ -23,6 +23,7 @@ from surgicai_vision.cells import (
     checkpoint_subject,
     evaluate_once,
     prepare_dataset,
+    replay_subject,
     train_cell,
 )  # fmt: skip
 from surgicai_vision.config import TaskConfig, digest, to_mapping
@@ -51,6 +52,7 @@ class Grid:
         proprioception: add a cell without pictures for each task and seed.
         state: add a cell that sees the state with the goal, the ceiling, for each task and seed.
         expert: evaluate the expert on each task beside the cells.
+        replay: evaluate blind replay of the mean demonstration too.
         demonstrations: expert demonstrations of each task.
         episodes: held-out starts of each evaluation.
         size: height and width of pictures [px].
@@ -69,6 +71,7 @@ class Grid:
     proprioception: bool = False
     state: bool = False
     expert: bool = True
+    replay: bool = False
     demonstrations: int = 50
     episodes: int = 20
     size: int = 224
@@ -161,6 +164,10 @@ def run_sweep(grid: Grid, out: Path, stage: Stage, workers: int) -> dict[str, An
     if grid.expert:
         for task in grid.task:
             _run_expert(grid, task, out, stage, workers)
+    if grid.replay:
+        for task in grid.task:
+            make = functools.partial(replay_subject, _dataset(grid, task, out, stage, workers))
+            evaluate_once(out / "references" / f"replay-{task}", make, _seeds(grid), stage, workers)
     table = _collect(grid, out)
     _store_run(grid, out, problems)
     return {**counts, "digest": digest(table), "problems": problems, "out": str(out)}

@@ -68,6 +68,8 @@ def test_every_frame_is_the_picture_of_its_state(tmp_path, fake, demos):
                 parts = dataset.segmentation(view, frame, frame + 1)[0]
                 np.testing.assert_array_equal(parts, observation["segmentation"][view])
             np.testing.assert_array_equal(columns[names.STATE][frame], env.agent_pos())
+            np.testing.assert_array_equal(columns[names.BOTH_ARMS][frame], env.both_arms())
+            np.testing.assert_array_equal(columns[names.PRIVILEGED_STATE][frame], env.state_vector())
             np.testing.assert_array_equal(columns[names.ACTION][frame], episode.action[step])
             assert columns[names.SEED][frame] == episode.seed
             assert columns[names.DONE][frame] == (step == len(episode) - 1)

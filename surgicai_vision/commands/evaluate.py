@@ -22,13 +22,16 @@ from surgicai_vision.errors import InputError, UnknownName
 
 EXAMPLE = "surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json"
 
+REPLAY = "replay"
+"""The mean demonstration of a dataset, played blind."""
+
 
 @dataclass(frozen=True)
 class Options:
     """Options of `evaluate`."""
 
     policy: str = option(
-        dataclasses.MISSING, "a checkpoint folder, a chain.yaml, or expert, random or zero", metavar="POLICY"
+        dataclasses.MISSING, "a checkpoint folder, a chain.yaml, or expert, replay, random or zero", metavar="POLICY"
     )
     task: str | None = option(
         None,
@@ -40,6 +43,9 @@ class Options:
     seed: int = option(names.TEST_SEED, "seed of the first start; each episode takes the next", check=not_negative)
     workers: int | None = option(
         None, "processes", check=positive, metavar="N", default_text="one a core, at most one for four episodes"
+    )
+    dataset: str | None = option(
+        None, "dataset whose mean demonstration replay plays", metavar="DIR", default_text="outputs/datasets/<task>"
     )
     weights: str | None = option(None, "file with the encoder's pretrained weights", metavar="FILE")
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
@@ -75,13 +81,18 @@ def _subject(options: Options) -> Any:
     from surgicai_vision import cells, lerobot_agent
 
     folder = Path(options.policy)
+    if options.policy == REPLAY:
+        subject = cells.replay_subject(folders.open_dataset(options.dataset, options.task or "grasp", ()))
+        return _in_env(subject, options.env)
+    if options.dataset:
+        raise InputError("--dataset is for replay alone; leave it out.")
     if folder.suffix in (".yaml", ".yml"):
         return _chain(folder, options)
     if options.policy in cells.BASELINES:
         config = task_config(options.task or "grasp", options.env)
         return cells.baseline_subject(options.policy, config)
     if not folder.exists() and folder.parent == Path():
-        raise UnknownName("policy or checkpoint folder", options.policy, cells.BASELINES)
+        raise UnknownName("policy or checkpoint folder", options.policy, (*cells.BASELINES, REPLAY))
     lerobot = lerobot_agent.find(folder)
     if lerobot:
         subject = lerobot_agent.subject(lerobot, options.task, options.weights)
@@ -90,9 +101,12 @@ def _subject(options: Options) -> Any:
     trained_for = subject.config.task
     if options.task not in (None, trained_for):
         raise InputError(f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out.")
-    if options.env:
-        subject = dataclasses.replace(subject, config=task_config(trained_for, options.env))
-    return subject
+    return _in_env(subject, options.env)
+
+
+def _in_env(subject: Any, env: dict[str, Any] | None) -> Any:
+    """Put a subject into the env of the table `env`, where there is one."""
+    return dataclasses.replace(subject, config=task_config(subject.config.task, env)) if env else subject
 
 
 def _chain(path: Path, options: Options) -> Any:
@@ -103,10 +117,7 @@ def _chain(path: Path, options: Options) -> Any:
     if options.task not in (None, names.SUTURE):
         raise InputError(f"{path} is a chain of the whole procedure; leave --task {options.task} out.")
     subject = chain.subject(config, options.weights, options.accept_licence)
-    if options.env:
-        task = task_config(names.SUTURE, {"max_steps": config.max_steps, **options.env})
-        subject = dataclasses.replace(subject, config=task)
-    return subject
+    return _in_env(subject, {"max_steps": config.max_steps, **options.env} if options.env else None)
 
 
 def summary_line(result: dict[str, Any]) -> str:
