@@ -129,6 +129,10 @@ BASELINES = {agent.name: agent for agent in (ExpertAgent, RandomAgent, ZeroAgent
 """Name → agent that needs no checkpoint."""
 
 
+Shared = dict[tuple[str, tuple[str, ...]], dict[int, NDArray[np.float32]]]
+"""(encoder's fingerprint, views) → id of an observation → its features."""
+
+
 @final
 class PolicyAgent:
     """A trained policy; sees the pictures of its views and the measured pose of its tip, nothing else.
@@ -153,6 +157,11 @@ class PolicyAgent:
     ):
         self.name, self.cameras, self.image_size = name, cameras, image_size
         self._policy, self._encoder, self._vector = policy, encoder, VECTORS[vector]
+        self._shared: Shared | None = None
+
+    def share(self, features: "Shared") -> None:
+        """Look features up in a table that agents share, and put new ones there; its owner empties it each step."""
+        self._shared = features
 
     def begin(self, slot: int, env: Any, seed: int) -> None:
         """Nothing to forget: the policy has no memory."""
@@ -171,6 +180,15 @@ class PolicyAgent:
         """Encode all views of all slots in one call, (n, views · dim): an encoder computes whole batches."""
         if not self.cameras:
             return None
+        if self._shared is None:
+            return self._encode(observations)
+        known = self._shared.setdefault((self._encoder.fingerprint, self.cameras), {})
+        new = [observation for observation in observations if id(observation) not in known]
+        if new:
+            known.update(zip(map(id, new), self._encode(new), strict=True))
+        return np.stack([known[id(observation)] for observation in observations])
+
+    def _encode(self, observations: Sequence[Any]) -> NDArray[np.float32]:
         frames = np.stack([o["pixels"][view] for o in observations for view in self.cameras])
         return np.asarray(self._encoder(frames), np.float32).reshape(len(observations), -1)
 
@@ -193,6 +211,10 @@ class NoisyAgent:
         """Seed the slot's noise."""
         self._agent.begin(slot, env, seed)
         self._generators[slot] = np.random.default_rng((seed, 1))
+
+    def share(self, features: "Shared") -> None:
+        """Share features: see `PolicyAgent.share`."""
+        self._agent.share(features)
 
     def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
         """Return the agent's actions (n, 7), their translations off by up to the noise."""

@@ -19,7 +19,7 @@ A chain is a YAML file, which `surgicai-vision evaluate chain.yaml` takes:
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision import names
-from surgicai_vision.agents import BASELINES, one_thread
+from surgicai_vision.agents import BASELINES, Shared, one_thread
 from surgicai_vision.cells import Subject, checkpoint_subject, policy_agent
 from surgicai_vision.config import TaskConfig, digest, to_mapping
 from surgicai_vision.errors import InputError, check_name
@@ -104,18 +104,14 @@ def subject(chain: Chain, weights: str | None = None, accept_licence: bool = Fal
         if checkpoint.policy != "hlp" or checkpoint.task.task != names.SUTURE:
             raise InputError(f"{chain.hlp} is '{checkpoint.policy}' of '{checkpoint.task.task}'; hlp: takes an 'hlp'.")
         configs["hlp"] = checkpoint.task
-    shared = {"task": names.SUTURE, "max_steps": chain.max_steps}
-    made = [TaskConfig(**{**_plain(config), **shared}) for config in configs.values()] or [TaskConfig(**shared)]
+    base = configs.values() or [TaskConfig()]
+    made = [replace(config, task=names.SUTURE, max_steps=chain.max_steps) for config in base]
     if len(set(made)) > 1:
         raise InputError(
             "The chain's policies were trained in different scenes or with different steps; give one kind."
         )
     name = f"chain-{chain.termination}-{digest(chain)[:8]}"
     return Subject(name, made[0], functools.partial(ChainAgent, name, chain, weights, accept_licence), about)
-
-
-def _plain(config: TaskConfig) -> dict[str, Any]:
-    return {item.name: getattr(config, item.name) for item in fields(config)}
 
 
 def _views(chain: Chain) -> tuple[str, ...]:
@@ -156,7 +152,7 @@ class ChainAgent:
         self.name, self.chain, self.cameras = name, chain, _views(chain)
         load = functools.lru_cache(lambda folder: policy_agent(Path(folder), weights, accept_licence))
         self._low = [BASELINES[policy]() if policy in BASELINES else load(policy) for policy in chain.low]
-        self._high = None if chain.hlp == ORDER else load(chain.hlp)
+        self._high: Any = None if chain.hlp == ORDER else load(chain.hlp)
         sizes = {agent.image_size for agent in (*self._low, self._high) if agent is not None and agent.cameras}
         if len(sizes) > 1:
             raise InputError(
@@ -164,6 +160,10 @@ class ChainAgent:
             )
         self.image_size = sizes.pop() if sizes else 224
         self._slots: dict[int, _Progress] = {}
+        self._features: Shared = {}
+        for agent in (*self._low, self._high):
+            if share := getattr(agent, "share", None):
+                share(self._features)
 
     def begin(self, slot: int, env: Any, seed: int) -> None:
         """Forget the slot's last episode."""
@@ -173,6 +173,7 @@ class ChainAgent:
 
     def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
         """Return the actions (n, 7) of the subtasks that are on, decided anew where one has ended."""
+        self._features.clear()
         states = [self._slots[slot] for slot in slots]
         with one_thread():
             self._decide(states, envs, observations)

@@ -10,6 +10,7 @@ from policies.base import Recipe
 from policies.bc import BC
 from policies.hlp import HLP
 from surgicai_vision import chain, envs, names
+from surgicai_vision.agents import PolicyAgent
 from surgicai_vision.chain import PATIENCE, Chain, ChainAgent
 from surgicai_vision.checkpoint import Checkpoint, write_checkpoint
 from surgicai_vision.cli import main
@@ -129,6 +130,26 @@ def test_trained_policies_are_chained_in_any_batch(tmp_path: Path) -> None:
             for batch in (1, 2)
         ]
         assert rows[0] == rows[1] and rows[0][0].steps == 12
+
+
+def test_policies_of_a_chain_share_features() -> None:
+    encoded: list[int] = []
+
+    def encoder(frames: np.ndarray) -> np.ndarray:
+        encoded.append(len(frames))
+        return frames.reshape(len(frames), -1)[:, :2].astype(np.float32)
+
+    encoder.fingerprint = "one"  # type: ignore[attr-defined]
+    policy = SimpleNamespace(act=lambda features, vectors: np.tile(features[:, :1], 7))
+    shared: dict = {}
+    agents = [PolicyAgent("a", policy, encoder, ("back",), 4) for _ in range(2)]
+    for one in agents:
+        one.share(shared)
+    observations = [{"pixels": {"back": np.full((4, 4, 3), value, np.uint8)}} for value in (1, 2, 3)]
+    envs = [SimpleNamespace(agent_pos=lambda: np.zeros(7, np.float32))] * 3
+    assert agents[0].act([0, 2], envs[:2], observations[::2])[:, 0].tolist() == [1, 3]
+    assert agents[1].act([0, 1, 2], envs, observations)[:, 0].tolist() == [1, 2, 3]
+    assert encoded == [2, 1]
 
 
 def test_wrong_chains_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
