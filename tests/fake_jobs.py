@@ -45,3 +45,9 @@ def slow(folder, number, seconds):
 
 def environment(folder):
     (folder / "result.txt").write_text(os.environ.get("LP_NUM_THREADS", "unset"))
+
+
+def where(folder):
+    import ray
+
+    (folder / "result.txt").write_text(f"{ray.util.get_node_ip_address()} {os.environ['LP_NUM_THREADS']}")

@@ -1,6 +1,7 @@
 """The executor: the store is the truth, whatever becomes of the processes."""
 
 import fcntl
+import importlib.util
 import os
 import signal
 import subprocess
@@ -11,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from surgicai_vision.errors import InputError, SurgicaiError, UnknownName
-from surgicai_vision.executor import JOBS, Job, JobKind, building, run
+from surgicai_vision.executor import JOBS, Engine, Job, JobKind, building, run
 from surgicai_vision.files import whole_folder
 
 TABLE = {
     name: JobKind(f"fake_jobs:{name}", ("names",))
-    for name in ("square", "count", "die_once", "die", "refuse", "crash", "slow", "environment")
+    for name in ("square", "count", "die_once", "die", "refuse", "crash", "slow", "environment", "where")
 }
 
 
@@ -162,6 +163,46 @@ def test_building_nothing_leaves_nothing(tmp_path):
     with pytest.raises(InputError, match="nothing"), building(tmp_path / "out"):
         raise InputError("nothing to build")
     assert not list(tmp_path.iterdir())
+
+
+def listening():
+    """Return where this machine listens for TCP besides loopback, in the kernel's spelling."""
+    lines = [line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()]
+    loopback = ("0100007F:", "0000000000000000FFFF00000100007F:", "00000000000000000000000001000000:")
+    return {row[1] for row in lines if row[3] == "0A" and not row[1].startswith(loopback)}
+
+
+def test_ray_runs_the_same_jobs_on_loopback_and_replaces_a_killed_worker(tmp_path, monkeypatch):
+    """One cluster for all of it: starting Ray takes seconds."""
+    if importlib.util.find_spec("ray") is None:  # found, not imported: the engine sets what it listens on
+        pytest.skip("Ray is an extra: surgicai-vision[ray]")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # where its workers find the jobs of the tests
+    others = listening()
+    store = tmp_path / "store"
+    heard = []
+    jobs = [Job("die_once", {"mark": str(tmp_path / "mark")}), *squares(range(4)), Job("where", {})]
+
+    def progress(*row):
+        heard.append((row, listening() - others))
+
+    run(squares(range(2)), store, workers=0, table=TABLE)
+    folders = run(jobs, store, workers=2, table=TABLE, engine=Engine("ray"), progress=progress)
+    assert texts(folders) == ["done", "0", "1", "4", "9", "127.0.0.1 0"]
+    assert [folder.name for folder in folders] == [job.key(TABLE) for job in jobs]
+    assert heard[0][0] == (2, 6, "jobs"), "the store is the truth"
+    assert all(not foreign for _, foreign in heard), "only loopback listens"
+    again = run(jobs, store, workers=2, table=TABLE, engine=Engine("ray"))  # nothing to do: no cluster is started
+    assert again == folders
+
+
+def test_ray_is_asked_for_in_words(monkeypatch):
+    with pytest.raises(UnknownName, match="Did you mean 'ray'"):
+        Engine("rya")
+    with pytest.raises(InputError, match="give --executor ray with it"):
+        Engine(address="127.0.0.1:6379")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'surgicai-vision\[ray\]'"):
+        Engine("ray")
 
 
 def test_registered_jobs_name_modules_of_this_package():

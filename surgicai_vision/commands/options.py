@@ -114,6 +114,20 @@ def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
             parser.add_argument(flag(field.name), dest=field.name, **keywords)
 
 
+def executor_option() -> Any:
+    """Declare `executor`: what runs a verb's jobs."""
+    return option(
+        "local", "what runs the processes: local, or ray", check=one_of("executor", ("local", "ray")), metavar="NAME"
+    )
+
+
+def address_option() -> Any:
+    """Declare `address`: where `executor` finds a cluster."""
+    return option(
+        None, "with --executor ray, a running cluster", metavar="HOST:PORT", default_text="one on this machine alone"
+    )
+
+
 def flag(name: str) -> str:
     """The command-line spelling of a field's name; `from_` is `--from`, a keyword of Python."""
     return f"--{name.rstrip('_').replace('_', '-')}"

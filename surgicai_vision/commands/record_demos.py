@@ -7,7 +7,17 @@ from typing import Any
 from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import config_only, not_negative, one_of, option, positive, share, task_config
+from surgicai_vision.commands.options import (
+    address_option,
+    config_only,
+    executor_option,
+    not_negative,
+    one_of,
+    option,
+    positive,
+    share,
+    task_config,
+)
 from surgicai_vision.errors import InputError
 
 EXAMPLE = "surgicai-vision record-demos --task grasp --episodes 50"
@@ -33,6 +43,8 @@ class Options:
         0.0, "share of episodes that start with a push that is not recorded", check=share, metavar="P"
     )
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
+    executor: str = executor_option()
+    address: str | None = address_option()
     out: str | None = option(None, "folder to make or to continue", metavar="DIR", default_text="outputs/demos/<task>")
     env: dict | None = config_only()
 
@@ -41,8 +53,10 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     """Record and say where the demonstrations are."""
     from surgicai_vision.demos.record import Disturbance, record
     from surgicai_vision.demos.store import MARKER, read_marker
+    from surgicai_vision.executor import Engine
     from surgicai_vision.statistics import clopper_pearson
 
+    engine = Engine(options.executor, options.address)
     config = task_config(options.task, options.env)
     out = Path(options.out) if options.out else folders.demos_folder(options.task)
     folders.check_folder(out, "demos.json")
@@ -56,6 +70,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
             seed=options.seed,
             disturbance=Disturbance(options.noise, options.recoveries),
             workers=options.workers,
+            engine=engine,
             demos=taught,
             progress=progress,
         )

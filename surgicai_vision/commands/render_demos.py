@@ -8,7 +8,16 @@ from typing import Any
 from surgicai_vision import names
 from surgicai_vision.commands import folders, record_demos
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import config_only, many_of, not_negative, one_of, option, positive
+from surgicai_vision.commands.options import (
+    address_option,
+    config_only,
+    executor_option,
+    many_of,
+    not_negative,
+    one_of,
+    option,
+    positive,
+)
 from surgicai_vision.errors import InputError
 
 CODECS = ("h264", "av1")
@@ -46,6 +55,8 @@ class Options:
         default_text="lossless pictures",
     )
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
+    executor: str = executor_option()
+    address: str | None = address_option()
     out: str | None = option(None, "dataset to make", metavar="DIR", default_text="outputs/datasets/<task>")
     env: dict | None = config_only()
 
@@ -53,7 +64,9 @@ class Options:
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Record where that is asked for, render, and say where the dataset is."""
     from surgicai_vision.dataset import render_demos
+    from surgicai_vision.executor import Engine
 
+    engine = Engine(options.executor, options.address)
     if options.demos and (options.task or options.episodes or options.env):
         raise InputError("--task, --episodes and env say what to record; with --demos DIR nothing is recorded.")
     if not options.view:
@@ -72,6 +85,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
             segmentation=options.segmentation,
             video=options.video,
             workers=options.workers,
+            engine=engine,
             progress=progress,
         )
     console.say(f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}")
@@ -89,6 +103,12 @@ def say_error(summary: Any, console: Console) -> None:
 def _record(options: Options, task: str, console: Console) -> Path:
     """Record the expert's demonstrations first."""
     asked = record_demos.Options(
-        task=task, episodes=options.episodes or 50, seed=options.seed, workers=options.workers, env=options.env
+        task=task,
+        episodes=options.episodes or 50,
+        seed=options.seed,
+        workers=options.workers,
+        executor=options.executor,
+        address=options.address,
+        env=options.env,
     )
     return Path(record_demos.run(asked, console)["demos"])

@@ -31,7 +31,7 @@ from surgicai_vision.dataset.viewing import DatasetSummary, check_video, finishe
 from surgicai_vision.dataset.writing import EPISODE_FILE, SUMMARY_FILE, assemble, compression
 from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo, read_marker
 from surgicai_vision.errors import BadFile, InputError, check_name
-from surgicai_vision.executor import Job, Progress, building, run
+from surgicai_vision.executor import LOCAL, Engine, Job, Progress, building, run
 from surgicai_vision.files import check_output, code_version, read_json, sha256_file, write_json
 
 SIZES = (16, 1024)
@@ -57,6 +57,7 @@ def render_demos(
     segmentation: bool = False,
     video: str | None = None,
     workers: int = 1,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
 ) -> DatasetSummary:
     """Render a folder of demonstrations into a LeRobot dataset.
@@ -70,6 +71,7 @@ def render_demos(
         segmentation: also render part indices (`names.PARTS`).
         video: codec of the RGB views, a key of `video.CODECS`; lossless pictures by default.
         workers: number of processes.
+        engine: what runs them.
         progress: called with (frames done, frames, "frames").
 
     Raises:
@@ -98,7 +100,7 @@ def render_demos(
         for path, row in zip(paths, origins, strict=True)
     ]
     with building(out) as (store, result):
-        shards = run(jobs, store, workers=workers, progress=progress, unit="frames")
+        shards = run(jobs, store, workers=workers, progress=progress, unit="frames", engine=engine)
         meta = _meta(demos, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins)
         table = layout.features(views, size, depth, segmentation)
         lossless = store / "lossless" if video else result

@@ -18,7 +18,7 @@ import functools
 import importlib
 import itertools
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -30,7 +30,7 @@ from surgicai_vision import names
 from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.demos.store import MARKER, Demo, list_demos, read_demo, read_marker, write_demo, write_marker
 from surgicai_vision.errors import InputError, OutputExists, SurgicaiError, check_name
-from surgicai_vision.executor import Job, Progress, building, run, work_folder
+from surgicai_vision.executor import LOCAL, Engine, Job, Progress, building, run, work_folder
 from surgicai_vision.files import check_output, code_version, read_json, sha256_file, whole_folder, write_json
 
 SOURCES: Mapping[str, str] = MappingProxyType(
@@ -178,6 +178,7 @@ def record(
     seed: int = names.TRAIN_SEED,
     disturbance: Disturbance = CALM,
     workers: int = 1,
+    engine: Engine = LOCAL,
     demos: Sequence[Path] = (),
     progress: Progress | None = None,
 ) -> list[Path]:
@@ -191,6 +192,7 @@ def record(
         seed: first seed; the following ones are taken in order.
         disturbance: noise and pushes.
         workers: number of processes.
+        engine: what runs them.
         demos: files of the demonstrations that a source in `TAUGHT` learns from; their seeds are left out.
         progress: called with (episodes kept, episodes wanted, "episodes").
 
@@ -211,7 +213,8 @@ def record(
     if finished(out, request):
         return list_demos(out)
     with building(out) as (store, result):
-        kept, skipped = _take(request, demos, store, workers, progress or (lambda done, total, unit: None))
+        rolling = functools.partial(run, store=store, workers=workers, engine=engine)
+        kept, skipped = _take(request, demos, rolling, progress or (lambda done, total, unit: None))
         with whole_folder(result) as folder:
             for index, path in enumerate(kept):
                 shutil.copyfile(path, folder / f"episode_{index:06d}.safetensors")
@@ -250,7 +253,7 @@ def finished(out: Path, request: Mapping[str, Any]) -> bool:
 
 
 def _take(
-    request: Mapping[str, Any], demos: Sequence[Path], work: Path, workers: int, progress: Progress
+    request: Mapping[str, Any], demos: Sequence[Path], rolling: Callable[..., list[Path]], progress: Progress
 ) -> tuple[list[Path], list[dict[str, Any]]]:
     """Try seeds in order until enough succeeded; return the kept files and the skipped seeds."""
     kept: list[Path] = []
@@ -273,7 +276,7 @@ def _take(
             for seed in itertools.islice(seeds, wanted - len(kept))
         ]
         report = functools.partial(_report, progress, len(kept), wanted)
-        for folder in run(jobs, work, workers=workers, progress=report):
+        for folder in rolling(jobs, progress=report):
             result = read_json(folder / "result.json")
             if result["success"]:
                 kept.append(folder / "episode_000000.safetensors")
