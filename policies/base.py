@@ -118,12 +118,14 @@ class Plugin:
         recipe: frozen dataclass of its settings.
         make: (recipe, shape of each view's feature) → untrained policy.
         target: dataset key of what it learns.
+        ahead: frames by which the target is ahead of what is seen; the last frame's at an episode's end.
     """
 
     name: str
     recipe: type
     make: Callable[[Any, tuple[tuple[int, ...], ...]], "Policy"]
     target: str = names.ACTION
+    ahead: int = 0
 
 
 class Policy(nn.Module, abc.ABC):

@@ -1,8 +1,8 @@
 """`hlp`: the paper's high-level policy, which says the subtask that is due.
 
 The recipe `paper` (paper, Section 4 and appendix): the network of `bc` with the logits of five classes at its
-end; cross-entropy against the phase of each frame of whole procedures; visual features beside the tip pose and
-jaw of both arms.
+end; cross-entropy against the phases of whole procedures, a little ahead (`AHEAD`); visual features beside the
+tip pose and jaw of both arms.
 """
 
 from typing import final
@@ -15,6 +15,11 @@ from policies.base import Inputs, Plugin, Policy, Recipe
 from policies.layers import FeatureMLP
 from surgicai_vision import names
 from surgicai_vision.errors import InputError
+
+AHEAD = 10
+"""Frames by which labels are ahead. In our recordings a subtask goes on for 15 frames after its success, while
+hardly anything moves; labelled as they stand, its last frame and the first of the next subtask could not be told
+apart, and a policy asked there would name the old one for ever. What is due there is the next."""
 
 
 @final
@@ -40,4 +45,4 @@ class HighLevelPolicy(Policy):
         return self.act(features, both_arms).argmax(axis=1)
 
 
-HLP = Plugin("hlp", Recipe, HighLevelPolicy, names.PHASE)
+HLP = Plugin("hlp", Recipe, HighLevelPolicy, names.PHASE, AHEAD)

@@ -219,7 +219,9 @@ class _Training:
         vector, target = self.policy.inputs.vector, np.array(columns[task.policy.target])
         self.vector = np.asarray(columns[vector], np.float32) if vector else None
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
-        self.target = torch.from_numpy(target.astype(kind))
+        last = np.searchsorted(index, index, side="right") - 1
+        ahead = np.minimum(np.arange(len(index)) + task.policy.ahead, last)
+        self.target = torch.from_numpy(target[ahead].astype(kind))
         if start is None:
             self._measure()
         else:

@@ -2,19 +2,22 @@
 
 import json
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+import torch
 
 from encoders.base import POOLS
-from surgicai_vision import names, registry
+from policies import hlp
+from surgicai_vision import names, registry, training
 from surgicai_vision.checkpoint import read_checkpoint
 from surgicai_vision.cli import main
 from surgicai_vision.commands import folders, logs
 from surgicai_vision.config import TaskConfig
+from surgicai_vision.envs import suture
 from surgicai_vision.errors import InputError, UnknownName, check_name
 
 
@@ -128,7 +131,10 @@ def test_controls_are_named_by_what_they_see(capsys: pytest.CaptureFixture[str])
     assert "leave --view out" in fails(capsys, "train", "--encoder", "state", "--view", "back")
 
 
-def test_high_level_policy_learns_the_phase(capsys: pytest.CaptureFixture[str]) -> None:
+def test_high_level_policy_learns_the_phase(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hlp, "HLP", replace(hlp.HLP, ahead=0))  # these episodes are too short for it
     arguments = ("train", "--task", "suture", "--policy", "hlp", "--encoder", "none")
     folder = run(capsys, *arguments, "--epochs", "60", "--recipe", "paper")["checkpoint"]
     policy, columns = registry.load_policy(folder), Dataset().columns()
@@ -138,6 +144,17 @@ def test_high_level_policy_learns_the_phase(capsys: pytest.CaptureFixture[str]) 
     kinds = [type(layer).__name__ for layer in policy.network.layers]
     assert kinds == ["BatchNorm1d", "Linear", "ReLU"] * 3 + ["Linear"]
     assert "does not act" in fails(capsys, "evaluate", folder)
+
+
+def test_labels_of_phases_are_ahead_within_their_episode() -> None:
+    plugin = registry.policy_plugin("hlp")
+    assert 0 < plugin.ahead < suture.DWELL
+    recipe = registry.load_recipe("hlp", "paper", {"validation": 0.0})
+    task = training._Task(Dataset(), (), replace(plugin, ahead=3), recipe, 0, "", {})
+    with torch.random.fork_rng():
+        target = training._Training(task, None, torch.device("cpu")).target
+    assert target[:10].tolist() == [1, 2, 2, 3, 3, 4, 4, 4, 4, 4]
+    assert target[10:20].tolist() == target[:10].tolist()
 
 
 def test_losses_are_drawn_where_tensorboard_is_installed(
