@@ -170,6 +170,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise BadFile(f"{path} is not valid YAML ({' '.join(str(error).split())}).") from None
+    except (RecursionError, ValueError) as error:
+        raise BadFile(f"{path} is not taken: {type(error).__name__} ({' '.join(str(error).split())[:100]}).") from None
     if not isinstance(table, dict) or not all(isinstance(key, str) for key in table):
         raise BadFile(f"{path} holds no table of keys; write one `key: value` a line.")
     return table

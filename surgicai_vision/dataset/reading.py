@@ -175,9 +175,12 @@ class Dataset:
         parts = [self._read(file, None, key) for file in range(len(self._files))]
         column = pa.chunked_array([chunk for part in parts for chunk in part.chunks])
         if pa.types.is_fixed_size_list(column.type):
-            width = column.type.list_size
-            return np.asarray(pc.list_flatten(column)).reshape(-1, width)
-        return np.asarray(column)
+            values: np.ndarray = np.asarray(pc.list_flatten(column)).reshape(-1, column.type.list_size)
+        else:
+            values = np.asarray(column)
+        if values.dtype.kind not in "biuf" or len(values) != self.length:
+            raise BadFile(f"{self.path}: column {key} holds {column.type} or less than a number a frame.")
+        return values
 
     def _pictures(self, key: str, start: int, stop: int | None) -> np.ndarray:
         """Return the decoded pictures start … stop - 1 of a column."""
