@@ -171,4 +171,3 @@ def _arm_ids(model: mujoco.MjModel, name: str) -> ArmIds:
         tip_body=model.body(f"{name}_tip").id,
         pads=(model.geom(f"{name}_left_pad").id, model.geom(f"{name}_right_pad").id),
     )
-
