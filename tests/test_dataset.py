@@ -9,14 +9,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from fake_env import FakeEnv, FakeExpert
+from fake_demos import write_demos
+from fake_env import FakeEnv
 
 from surgicai_vision import names
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.dataset import check_dataset, layout, metadata, open_dataset, pictures, render_demos, rendering
 from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
-from surgicai_vision.demos.record import record, roll
-from surgicai_vision.demos.store import list_demos, read_demo, write_demo, write_marker
+from surgicai_vision.demos.record import record
+from surgicai_vision.demos.store import list_demos, read_demo
 from surgicai_vision.errors import BadFile, InputError, OutputExists, UnknownName
 
 CONFIG = TaskConfig(max_steps=12)
@@ -37,12 +38,7 @@ def fake(monkeypatch):
 
 @pytest.fixture
 def demos(tmp_path):
-    env = FakeEnv(CONFIG)
-    folder = tmp_path / "demos"
-    folder.mkdir()
-    for index, seed in enumerate((1, 2, 4)):
-        write_demo(folder, index, roll(env, FakeExpert(env), seed).demo)
-    write_marker(folder, "grasp", "expert")
+    folder = write_demos(tmp_path / "demos", CONFIG, (1, 2, 4))
     return folder
 
 

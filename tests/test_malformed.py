@@ -20,15 +20,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from fake_demos import render_with_fake_env, write_demos
 from fake_env import FakeEnv, FakeExpert
 
 from surgicai_vision import names
 from surgicai_vision.commands.options import build, config_only, option
 from surgicai_vision.config import SceneConfig, TaskConfig
-from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, rendering
+from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 from surgicai_vision.demos import surgicai
 from surgicai_vision.demos.record import roll
-from surgicai_vision.demos.store import demo_bytes, list_demos, read_demo, write_demo, write_marker
+from surgicai_vision.demos.store import demo_bytes, list_demos, read_demo
 from surgicai_vision.errors import InputError
 
 CONFIG = TaskConfig(max_steps=12)
@@ -304,15 +305,8 @@ def test_safetensors(tmp_path):
 
 @pytest.fixture
 def dataset(tmp_path, monkeypatch):
-    monkeypatch.setattr(rendering, "_env", lambda config, *rest: FakeEnv(CONFIG, *rest))
-    monkeypatch.setattr(rendering, "_renderer", lambda: "none")
-    monkeypatch.setattr(rendering, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()})
-    env = FakeEnv(CONFIG)
-    folder = tmp_path / "demos"
-    folder.mkdir()
-    for index, seed in enumerate((1, 2)):
-        write_demo(folder, index, roll(env, FakeExpert(env), seed).demo)
-    write_marker(folder, "grasp", "expert")
+    render_with_fake_env(monkeypatch, CONFIG)
+    folder = write_demos(tmp_path / "demos", CONFIG, (1, 2))
     render_demos(folder, tmp_path / "set", size=32, depth=True, workers=0)
     assert len(list_demos(folder)) == 2
     return tmp_path / "set"

@@ -7,15 +7,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from fake_env import FakeEnv, FakeExpert
+from fake_demos import render_with_fake_env, write_demos
 
 from surgicai_vision import names
 from surgicai_vision.config import TaskConfig
-from surgicai_vision.dataset import check_dataset, pictures, render_demos, rendering, repair_dataset, thrift
+from surgicai_vision.dataset import check_dataset, pictures, render_demos, repair_dataset, thrift
 from surgicai_vision.dataset.repairing import _exchange
 from surgicai_vision.dataset.salvage import LEROBOT, Writing, salvage
-from surgicai_vision.demos.record import roll
-from surgicai_vision.demos.store import write_demo, write_marker
 from surgicai_vision.errors import BadFile, OutputExists
 
 CAMERA, DATA = "observation.images.cam", "data/chunk-000/file-000.parquet"
@@ -230,15 +228,8 @@ def test_nothing_whole_is_one_line_and_changes_nothing(tmp_path, foreign):
 
 @pytest.fixture
 def ours(tmp_path, monkeypatch):
-    monkeypatch.setattr(rendering, "_env", lambda config, *rest: FakeEnv(CONFIG, *rest))
-    monkeypatch.setattr(rendering, "_renderer", lambda: "none")
-    monkeypatch.setattr(rendering, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()})
-    env = FakeEnv(CONFIG)
-    folder = tmp_path / "demos"
-    folder.mkdir()
-    for index, seed in enumerate((1, 2, 4)):
-        write_demo(folder, index, roll(env, FakeExpert(env), seed).demo)
-    write_marker(folder, "grasp", "expert")
+    render_with_fake_env(monkeypatch, CONFIG)
+    folder = write_demos(tmp_path / "demos", CONFIG, (1, 2, 4))
     render_demos(folder, tmp_path / "set", size=32, depth=True, segmentation=True, workers=0)
     return tmp_path / "set"
 

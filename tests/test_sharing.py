@@ -5,18 +5,15 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import yaml
-from fake_env import FakeEnv, FakeExpert
+from fake_demos import render_with_fake_env, write_demos
 
 from surgicai_vision import names
 from surgicai_vision.cli import main
 from surgicai_vision.config import TaskConfig
-from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, rendering, sharing
+from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, sharing
 from surgicai_vision.dataset.sharing import dataset_card, pull_dataset, push_dataset
-from surgicai_vision.demos.record import roll
-from surgicai_vision.demos.store import write_demo, write_marker
 from surgicai_vision.errors import BadFile, InputError, OutputExists, SurgicaiError
 
 CONFIG = TaskConfig(max_steps=12)
@@ -63,15 +60,8 @@ class FakeHub:
 
 @pytest.fixture
 def dataset(tmp_path, monkeypatch):
-    monkeypatch.setattr(rendering, "_env", lambda config, *rest: FakeEnv(CONFIG, *rest))
-    monkeypatch.setattr(rendering, "_renderer", lambda: "none")
-    monkeypatch.setattr(rendering, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()})
-    env = FakeEnv(CONFIG)
-    folder = tmp_path / "demos"
-    folder.mkdir()
-    for index, seed in enumerate((1, 2)):
-        write_demo(folder, index, roll(env, FakeExpert(env), seed).demo)
-    write_marker(folder, "grasp", "expert")
+    render_with_fake_env(monkeypatch, CONFIG)
+    folder = write_demos(tmp_path / "demos", CONFIG, (1, 2))
     render_demos(folder, tmp_path / "set", size=32, depth=True, workers=0)
     return tmp_path / "set"
 

@@ -6,15 +6,13 @@ import shutil
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from fake_env import FakeEnv, FakeExpert
+from fake_demos import render_with_fake_env, write_demos
 
 from surgicai_vision import names
 from surgicai_vision.commands import render_demos as command
 from surgicai_vision.config import TaskConfig
-from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, rendering, repair_dataset, view_dataset
+from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, repair_dataset, view_dataset
 from surgicai_vision.dataset.video import CODECS
-from surgicai_vision.demos.record import roll
-from surgicai_vision.demos.store import write_demo, write_marker
 from surgicai_vision.errors import InputError, OutputExists, UnknownName
 
 CONFIG = TaskConfig(max_steps=12)
@@ -29,15 +27,8 @@ def offline(tmp_path, monkeypatch):
 
 @pytest.fixture
 def demos(tmp_path, monkeypatch):
-    monkeypatch.setattr(rendering, "_env", lambda config, *rest: FakeEnv(CONFIG, *rest))
-    monkeypatch.setattr(rendering, "_renderer", lambda: "none")
-    monkeypatch.setattr(rendering, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()})
-    env = FakeEnv(CONFIG)
-    folder = tmp_path / "demos"
-    folder.mkdir()
-    for index, seed in enumerate((1, 2, 4)):
-        write_demo(folder, index, roll(env, FakeExpert(env), seed).demo)
-    write_marker(folder, "grasp", "expert")
+    render_with_fake_env(monkeypatch, CONFIG)
+    folder = write_demos(tmp_path / "demos", CONFIG, (1, 2, 4))
     return folder
 
 

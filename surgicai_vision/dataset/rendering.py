@@ -80,13 +80,7 @@ def render_demos(
         OutputExists: `out` holds something else.
     """
     started = time.monotonic()
-    for view in views:
-        check_name("view", view, names.CAMERAS)
-    if not views or len(set(views)) != len(views):
-        raise InputError(f"views are {', '.join(views) or 'none'}; give at least one, each once.")
-    if not SIZES[0] <= size <= SIZES[1]:
-        raise InputError(f"size is {size}; it must be within {SIZES[0]} and {SIZES[1]} pixels.")
-    check_video(video)
+    _check_pictures(views, size, video)
     check_output(out, may_resume=names.META_FILE)
     paths = list_demos(demos)
     options = {"views": list(views), "size": size, "depth": depth, "segmentation": segmentation}
@@ -109,6 +103,17 @@ def render_demos(
         if video:
             write_view(open_dataset(lossless), result, views, video, {})
     return finished(out, request, started)
+
+
+def _check_pictures(views: Sequence[str], size: int, video: str | None) -> None:
+    """Refuse views, sizes and codecs that cannot be rendered."""
+    for view in views:
+        check_name("view", view, names.CAMERAS)
+    if not views or len(set(views)) != len(views):
+        raise InputError(f"views are {', '.join(views) or 'none'}; give at least one, each once.")
+    if not SIZES[0] <= size <= SIZES[1]:
+        raise InputError(f"size is {size}; it must be within {SIZES[0]} and {SIZES[1]} pixels.")
+    check_video(video)
 
 
 class _Origin(NamedTuple):
