@@ -4,7 +4,7 @@ import json
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -157,33 +157,43 @@ def test_labels_of_phases_are_ahead_within_their_episode() -> None:
     assert target[10:20].tolist() == target[:10].tolist()
 
 
-def test_losses_are_drawn_where_tensorboard_is_installed(
+def test_event_file_holds_the_losses(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    arguments = ("train", "--task", "suture", "--encoder", "none", "--epochs", "2", "--out", "a")
+    run(capsys, *arguments)
+    events = EventAccumulator("a-tensorboard").Reload()
+    checkpoint = read_checkpoint(Path("a"))
+    for name, losses in (("train", checkpoint.train_losses), ("validation", checkpoint.validation_losses)):
+        drawn = events.Scalars(f"loss/{name}")
+        assert [event.step for event in drawn] == [1, 2]
+        np.testing.assert_allclose([event.value for event in drawn], losses, rtol=1e-6)
+    files = list(Path("a-tensorboard").iterdir())
+    run(capsys, *arguments)
+    assert list(Path("a-tensorboard").iterdir()) == files, "a training that is done draws nothing"
+    monkeypatch.setattr(logs, "installed", lambda name: False)
+    assert "not installed" in fails(capsys, *arguments, "--log", "tensorboard")
+
+
+def test_wandb_needs_an_account_or_stays_offline(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[tuple] = []
 
-    class SummaryWriter:
-        def __init__(self, folder: str) -> None:
-            drawn.append((folder,))
+    def init(**_: object) -> SimpleNamespace:
+        return SimpleNamespace(
+            log=lambda losses, step: drawn.append((step, sorted(losses))), finish=lambda: drawn.append(("end",))
+        )
 
-        def add_scalar(self, *row: object) -> None:
-            drawn.append(row)
-
-        def close(self) -> None:
-            drawn.append(("closed",))
-
-    fake = ModuleType("torch.utils.tensorboard")
-    fake.SummaryWriter = SummaryWriter  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", fake)
-    monkeypatch.setattr(logs, "installed", lambda name: name == "tensorboard")
-    arguments = ("train", "--task", "suture", "--encoder", "none", "--epochs", "2", "--out", "a")
+    fake = ModuleType("wandb")
+    fake.init, fake.api = init, SimpleNamespace(is_authenticated=False)  # type: ignore[attr-defined]
+    fake.setup = lambda: SimpleNamespace(settings=SimpleNamespace(mode="online"))  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    monkeypatch.setattr(logs, "installed", lambda name: True)
+    arguments = ("train", "--task", "suture", "--encoder", "none", "--epochs", "2", "--log", "wandb", "--out", "a")
+    assert "WANDB_MODE=offline" in fails(capsys, *arguments)
+    assert not Path("a").exists()
+    fake.setup = lambda: SimpleNamespace(settings=SimpleNamespace(mode="offline"))  # type: ignore[attr-defined]
     run(capsys, *arguments)
-    assert drawn[0] == ("a-tensorboard",) and drawn[-1] == ("closed",)
-    assert [(row[0], row[2]) for row in drawn[1:-1]] == [
-        ("loss/train", 1), ("loss/validation", 1), ("loss/train", 2), ("loss/validation", 2)
-    ]  # fmt: skip
-    count = len(drawn)
-    run(capsys, *arguments)
-    assert len(drawn) == count, "a training that is done draws nothing"
-    monkeypatch.setattr(logs, "installed", lambda name: False)
-    assert "not installed" in fails(capsys, *arguments, "--log", "tensorboard")
+    both = ["loss/train", "loss/validation"]
+    assert drawn == [(1, both), (2, both), ("end",)]
