@@ -113,15 +113,23 @@ def sha256_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+FAMILIES = ("encoders", "policies")
+"""Packages beside this one whose sources decide results."""
+
+
 @functools.cache
 def code_version(*stages: str) -> str:
     """Return "<version>+<12 hex digits>": the sha256 over the sources of this package.
 
     Args:
-        stages: only these stages ("envs", "demos", …) and the shared modules; none means all of them.
+        stages: only these stages ("envs", "demos", …) and the shared modules; none means all of them. The families
+            "encoders" and "policies" stand beside the package and are named to be counted.
     """
     package = Path(__file__).parent
     digest = hashlib.sha256()
+    for family in FAMILIES:
+        for path in sorted((package.parent / family).rglob("*.py")) if family in stages else ():
+            digest.update(f"{family}/{path.name}".encode() + b"\0" + path.read_bytes() + b"\0")
     for path in sorted(package.rglob("*.py")):
         stage = path.relative_to(package).parts[0].removesuffix(".py")
         if not stages or stage in (*stages, "names", "config"):

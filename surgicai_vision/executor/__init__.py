@@ -13,12 +13,23 @@ The engine is `local` (spawned processes; `workers=0` runs in this one) or `ray_
 """
 
 from surgicai_vision.executor.jobs import JOBS, Job, JobKind
-from surgicai_vision.executor.running import ENGINES, LOCAL, Engine, Progress, building, claim, run, work_folder
+from surgicai_vision.executor.running import (
+    ENGINES,
+    LOCAL,
+    Ended,
+    Engine,
+    Progress,
+    building,
+    claim,
+    run,
+    work_folder,
+)
 
 __all__ = [
     "ENGINES",
     "JOBS",
     "LOCAL",
+    "Ended",
     "Engine",
     "Job",
     "JobKind",

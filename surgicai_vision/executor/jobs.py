@@ -22,10 +22,12 @@ class JobKind:
     Attributes:
         function: "module:function", imported in the worker on first use.
         stages: the stages whose sources decide the result; a change in them makes a new key.
+        packages: distributions whose versions decide it too.
     """
 
     function: str
     stages: tuple[str, ...] = ()
+    packages: tuple[str, ...] = ("mujoco", "numpy")
 
 
 JOBS: Mapping[str, JobKind] = MappingProxyType(
@@ -70,19 +72,20 @@ class Job:
                 "arguments": {k: v for k, v in self.arguments.items() if k not in self.label},
                 "inputs": list(self.inputs),
                 "code": code_version(*table[self.name].stages),
-                "packages": _package_versions(),
+                "packages": [_version(name) for name in table[self.name].packages],
             }
         )
 
 
 @functools.cache
-def _package_versions() -> list[str]:
-    """Return the versions of the packages that decide numbers and pictures."""
-    return [f"{name} {importlib.metadata.version(name)}" for name in ("mujoco", "numpy")]
+def _version(package: str) -> str:
+    return f"{package} {importlib.metadata.version(package)}"
 
 
 def work(function: str, arguments: dict[str, Any], destination: Path) -> tuple[int, str, str] | None:
     """Do one job; return None, or (exit code, message, traceback) since not every exception can be pickled."""
+    if destination.is_dir():  # its worker was killed after the commit and before it could say so
+        return None
     try:
         module, _, name = function.partition(":")
         with whole_folder(destination) as folder:
@@ -96,16 +99,16 @@ def work(function: str, arguments: dict[str, Any], destination: Path) -> tuple[i
     return None
 
 
-def raise_failure(failure: tuple[int, str, str] | None, job: Job) -> None:
-    """Raise what a job reported."""
+def failure_of(failure: tuple[int, str, str] | None, job: Job) -> SurgicaiError | None:
+    """Return what a job reported as the error it stands for, its traceback in a note; None for a job done."""
     if failure is None:
-        return
+        return None
     code, message, trace = failure
     if not trace:
-        raise (InputError if code == InputError.exit_code else SurgicaiError)(message)
+        return (InputError if code == InputError.exit_code else SurgicaiError)(message)
     error = SurgicaiError(f"{describe(job)} failed: {message}")
     error.add_note(trace)
-    raise error
+    return error
 
 
 def describe(job: Job) -> str:

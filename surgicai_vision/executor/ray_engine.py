@@ -8,16 +8,16 @@ committed counts, whatever becomes of Ray.
 import importlib.util
 import logging
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from surgicai_vision.errors import InputError, SurgicaiError
-from surgicai_vision.executor.jobs import WORKER_ENVIRONMENT, Job, JobKind, describe, raise_failure, work
+from surgicai_vision.executor.jobs import WORKER_ENVIRONMENT, Job, JobKind, describe, failure_of, work
 
-RETRIES = 4
-"""How often Ray starts a task again whose worker or node was lost."""
+ATTEMPTS = 5
+"""How often Ray starts a task whose worker or node is lost, where the caller does not say."""
 
 OBJECT_STORE = 80 * 2**20
 """Bytes of Ray's shared memory, its least: results are files, and nothing of size is passed through it."""
@@ -41,13 +41,18 @@ def check() -> None:
 
 
 def execute(
-    jobs: Mapping[str, Job], store: Path, workers: int, table: Mapping[str, JobKind], address: str | None
-) -> Iterator[str]:
-    """Do `jobs` as Ray tasks, `workers` at a time, and yield their keys as they are committed."""
+    jobs: Mapping[str, Job],
+    store: Path,
+    workers: int,
+    table: Mapping[str, JobKind],
+    address: str | None,
+    attempts: int | None = None,
+) -> Generator[tuple[str, SurgicaiError | None]]:
+    """Do `jobs` as Ray tasks, `workers` at a time; yield each key as it is committed, or with the job's error."""
     if not jobs:
         return
     with _cluster(max(1, workers), address) as ray:
-        task = ray.remote(num_cpus=1, max_retries=RETRIES)(_task)
+        task = ray.remote(num_cpus=1, max_retries=(attempts or ATTEMPTS) - 1)(_task)
         queue = list(jobs)
         running: dict[Any, str] = {}
         while queue or running:
@@ -58,19 +63,18 @@ def execute(
             done, _ = ray.wait(list(running), num_returns=1)
             for reference in done:
                 key = running.pop(reference)
-                raise_failure(_result(ray, reference, jobs[key]), jobs[key])
-                yield key
+                yield key, _error(ray, reference, jobs[key], attempts or ATTEMPTS)
 
 
-def _result(ray: Any, reference: Any, job: Job) -> Any:
-    """Return what a task reported."""
+def _error(ray: Any, reference: Any, job: Job, attempts: int) -> SurgicaiError | None:
+    """Return what a task ended in: None where its result is committed."""
     try:
-        return ray.get(reference)
+        return failure_of(ray.get(reference), job)
     except ray.exceptions.RayError as error:
-        raise SurgicaiError(
-            f"Ray lost {describe(job)} {RETRIES + 1} times ({type(error).__name__}: a worker was killed, or out of "
+        return SurgicaiError(
+            f"Ray lost {describe(job)} {attempts} times ({type(error).__name__}: a worker was killed, or out of "
             "memory). What is finished is kept: run the same command again, with fewer workers."
-        ) from None
+        )
 
 
 def _task(function: str, arguments: dict[str, Any], destination: str) -> Any:

@@ -4,11 +4,11 @@ import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from surgicai_vision.errors import InputError, check_name
+from surgicai_vision.errors import InputError, SurgicaiError, check_name
 from surgicai_vision.executor import local, ray_engine
 from surgicai_vision.executor.jobs import JOBS, Job, JobKind
 from surgicai_vision.files import TEMPORARY, sync_folder
@@ -16,6 +16,8 @@ from surgicai_vision.files import TEMPORARY, sync_folder
 Progress = Callable[[int, int, str], None]
 """`progress(done, total, unit)`, called after every finished job and once at the start."""
 
+Ended = Callable[[Job, Path, SurgicaiError | None], None]
+"""`ended(job, folder, error)`, called as a job ends; without an error the folder holds its result."""
 
 ENGINES = ("local", "ray")
 
@@ -56,6 +58,8 @@ def run(
     unit: str = "jobs",
     table: Mapping[str, JobKind] = JOBS,
     engine: Engine = LOCAL,
+    attempts: int | None = None,
+    ended: Ended | None = None,
 ) -> list[Path]:
     """Do the jobs that the store does not hold yet; return every job's result folder, in order.
 
@@ -67,10 +71,13 @@ def run(
         unit: what the weights count ("frames").
         table: name → kind of job.
         engine: what runs them.
+        attempts: how often a job is started whose worker dies; the engine's own number by default.
+        ended: called with (job, its folder, its error or None) for every job of this run as it ends; then a job that
+            fails does not end the run.
 
     Raises:
         InputError: `workers` below 0, an unknown job, a store in use by another run, or bad input to a job.
-        SurgicaiError: a job failed, or its worker died twice.
+        SurgicaiError: a job failed, or its worker died at every attempt.
     """
     if workers < 0:
         raise InputError(f"workers is {workers}; it must be 0 (this process) or more.")
@@ -84,12 +91,17 @@ def run(
         done = total - sum(job.weight for job in missing.values())
         report(done, total, unit)
         if engine.name == "ray":
-            finished = ray_engine.execute(missing, store.resolve(), workers, table, engine.address)
+            finished = ray_engine.execute(missing, store.resolve(), workers, table, engine.address, attempts)
         else:
-            finished = local.execute(missing, store, workers, table)
-        for key in finished:
-            done += folders[key].weight
-            report(done, total, unit)
+            finished = local.execute(missing, store, workers, table, attempts)
+        with closing(finished):  # workers end with it, whatever is raised here
+            for key, error in finished:
+                if ended:
+                    ended(folders[key], store / key, error)
+                elif error:
+                    raise error
+                done += folders[key].weight
+                report(done, total, unit)
     return [store / job.key(table) for job in jobs]
 
 
