@@ -1,0 +1,134 @@
+"""Groups: the cells that differ by nothing but their training seed, counted together.
+
+Episodes of one cell: k/n with the exact (Clopper–Pearson) interval. Over several training seeds: mean ± standard
+deviation of the cells' rates, and a hierarchical bootstrap interval (training seeds, then episodes).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from surgicai_vision import statistics
+from surgicai_vision.report import text
+from surgicai_vision.report.reading import Collected, Condition, Missing, Result
+
+KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
+"""Kinds of failure in the order in which charts stack them."""
+
+MEASURES = (
+    ("d_trans_mm", "position error", "mm", "distance to the goal when the episode ends"),
+    ("d_angle_deg", "angle error", "°", "angle to the goal when the episode ends"),
+    ("entry_mm", "entry error", "mm", "where the needle passed the entry, from the hole's centre"),
+    ("exit_mm", "exit error", "mm", "where the needle passed the exit, from the hole's centre"),
+    ("slip_mm", "needle slip", "mm", "largest slip of the needle in the grip"),
+    ("slip_deg", "needle slip", "°", "largest turn of the needle in the grip"),
+    ("tissue_force_n", "tissue force", "N", "largest contact force of needle or instrument on the tissue"),
+)
+"""Columns of an episode's row that are no count: name, what, unit, explanation."""
+
+
+@dataclass(frozen=True)
+class Across:
+    """A rate over training seeds: mean, standard deviation and hierarchical bootstrap interval."""
+
+    seeds: int
+    mean: float
+    std: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Group:
+    """One condition: its evaluations, one a training seed, and its cells that have none."""
+
+    condition: Condition
+    results: tuple[Result, ...] = ()
+    missing: tuple[Missing, ...] = ()
+
+    @cached_property
+    def rows(self) -> list[dict[str, Any]]:
+        """The episodes of every training seed."""
+        return [row for result in self.results for row in result.rows]
+
+    @property
+    def successes(self) -> int:
+        """Episodes that succeeded, k."""
+        return sum(bool(row["success"]) for row in self.rows)
+
+    @property
+    def episodes(self) -> int:
+        """Episodes, n; 0 where nothing was evaluated."""
+        return len(self.rows)
+
+    @property
+    def rate(self) -> float:
+        """Success rate k/n."""
+        return self.successes / self.episodes
+
+    @cached_property
+    def interval(self) -> tuple[float, float]:
+        """Exact 95 % interval of the pooled episodes."""
+        return statistics.clopper_pearson(self.successes, self.episodes)
+
+    @cached_property
+    def across(self) -> Across | None:
+        """The rate over training seeds; None with fewer than two."""
+        if len(self.results) < 2:
+            return None
+        groups = [[float(row["success"]) for row in result.rows] for result in self.results]
+        rates = [float(np.mean(group)) for group in groups]
+        spread = statistics.mean_and_std(rates)
+        bounds = statistics.hierarchical_bootstrap(groups, np.random.default_rng(0))
+        assert spread["mean"] is not None and spread["std"] is not None
+        return Across(len(rates), spread["mean"], spread["std"], bounds)
+
+    @property
+    def failures(self) -> dict[str, int]:
+        """Failures by kind, in the order of `KINDS`; kinds this version does not know come last."""
+        found = [row["failure"] for row in self.rows if not row["success"]]
+        known = [*KINDS, *sorted(set(found) - set(KINDS))]
+        return {kind: found.count(kind) for kind in known if kind in found}
+
+    def values(self, column: str) -> list[float | None]:
+        """Return a column over all episodes."""
+        return [row.get(column) for row in self.rows]
+
+    def on_successes(self, column: str) -> dict[str, float | None]:
+        """Return mean and deviation of a column over successful episodes."""
+        return statistics.mean_and_std([float(row[column]) for row in self.rows if row["success"]])
+
+    def across_text(self) -> str:
+        """Return "31.0 ± 4.2 % (22–40 %)", or a dash for one training seed."""
+        if self.across is None:
+            return text.ABSENT
+        mean, std = 100 * self.across.mean, 100 * self.across.std
+        return f"{mean:.1f} ± {std:.1f} % ({text.interval(self.across.interval)})"
+
+
+def group(collected: Collected) -> list[Group]:
+    """Return one group for each condition, in the order of the results, those without any at their places."""
+    from surgicai_vision.report.reading import _condition_order
+
+    conditions = {item.condition for item in (*collected.results, *collected.missing)}
+    return [
+        Group(
+            condition,
+            tuple(result for result in collected.results if result.condition == condition),
+            tuple(cell for cell in collected.missing if cell.condition == condition),
+        )
+        for condition in sorted(conditions, key=_condition_order)
+    ]
+
+
+def of_task(groups: Sequence[Group], task: str, *, plain: bool = True) -> list[Group]:
+    """Return the groups of a task; with `plain` only those without a shift and without a swapped expert."""
+    return [item for item in groups if item.condition.task == task and (item.condition.plain or not plain)]
+
+
+def best_trained(groups: Sequence[Group]) -> Group | None:
+    """The trained policy with the highest success rate (the first of them), or None."""
+    trained = [item for item in groups if item.condition.trained and item.condition.plain and item.episodes]
+    return max(trained, key=lambda item: item.rate, default=None)

@@ -1,0 +1,78 @@
+"""Pairs: do two conditions differ? Exact McNemar on the same starts, Holm's correction within a task.
+
+Compared are trained conditions of a task that differ in one thing: encoder, views, variant or number of demonstrations;
+and each with pictures against proprioception alone. Episodes are paired by training seed and start. The test speaks of
+the policies that were trained, not of all that the same recipe might give.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from surgicai_vision import names, statistics
+from surgicai_vision.report.groups import Group, of_task
+from surgicai_vision.report.reading import Condition
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two conditions on the same starts.
+
+    Attributes:
+        factor: what they differ in.
+        episodes: paired episodes.
+        first_only: episodes that only the first solved; likewise `second_only`.
+        p: exact two-sided McNemar.
+        adjusted: after Holm, over all pairs of the task.
+    """
+
+    first: Group
+    second: Group
+    factor: str
+    episodes: int
+    first_only: int
+    second_only: int
+    p: float
+    adjusted: float = 1.0
+
+
+def compare(groups: Sequence[Group]) -> list[Pair]:
+    """Return every pair of each task, the smallest p-value first."""
+    pairs: list[Pair] = []
+    for task in names.TASKS:
+        trained = [item for item in of_task(groups, task) if item.condition.trained and item.episodes]
+        candidates = [_pair(*two) for two in itertools.combinations(trained, 2)]
+        found = [pair for pair in candidates if pair is not None]
+        adjusted = statistics.holm([pair.p for pair in found]) if found else []
+        pairs += [replace(pair, adjusted=float(p)) for pair, p in zip(found, adjusted, strict=True)]
+    return sorted(pairs, key=lambda pair: (pair.adjusted, pair.p))
+
+
+def factor(first: Condition, second: Condition) -> str:
+    """Name the one thing two conditions differ in, or ""."""
+    if "state" in (first.encoder, second.encoder):
+        return ""
+    fields = ("encoder", "views", "variant", "demonstrations")
+    differ = [name for name in fields if getattr(first, name) != getattr(second, name)]
+    if not first.views or not second.views:
+        differ = ["pictures" if name == "encoder" else name for name in differ if name != "views"]
+    return differ[0] if len(differ) == 1 else ""
+
+
+def _pair(first: Group, second: Group) -> Pair | None:
+    differs = factor(first.condition, second.condition)
+    if not differs:
+        return None
+    one, other = _outcomes(first), _outcomes(second)
+    common = sorted(one.keys() & other.keys())
+    if not common:
+        return None
+    a, b = [one[key] for key in common], [other[key] for key in common]
+    first_only = sum(x and not y for x, y in zip(a, b, strict=True))
+    second_only = sum(y and not x for x, y in zip(a, b, strict=True))
+    return Pair(first, second, differs, len(common), first_only, second_only, float(statistics.mcnemar(a, b)))
+
+
+def _outcomes(item: Group) -> dict[tuple[int, int], bool]:
+    """Map (training seed, start) to success."""
+    return {(result.seed, row["seed"]): bool(row["success"]) for result in item.results for row in result.rows}

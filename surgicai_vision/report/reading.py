@@ -1,0 +1,295 @@
+"""Reading: a results folder → evaluations, and the cells that have none with the reason why.
+
+A cell is one training: task, inputs, policy, recipe, demonstrations, training seed. Its condition is all of that but
+the training seed, and the shift under which it was evaluated.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision import files, names
+from surgicai_vision.config import TaskConfig, from_mapping
+from surgicai_vision.errors import BadFile
+from surgicai_vision.results import MARKER, find_evaluations, read_rows
+
+RUN_FILE, GRID_FILE, CELL_FILE, FAILED_FILE = "run.json", "sweep.json", "cell.json", "failed.json"
+REFERENCES = ("expert", "random", "zero", "replay")
+"""Policies that were not trained: what the trained ones stand beside."""
+PROBES = ("probes.parquet", "probe.json")
+
+FAILED, NOT_RUN, PENDING = "failed", "not run", "pending"
+PROBLEM = re.compile(r"(failed|not run): (\w+), (.+), seed (\d+): (.*)", re.DOTALL)
+"""A line of `run.json`'s "not_run"."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What was evaluated, but for the training seed.
+
+    Attributes:
+        task: one of `names.TASKS`.
+        encoder: the encoder; without one "proprioception" or "state", or the name of the chain or reference.
+        views: its views.
+        variant: policy, pool and recipe where they are not bc, global and paper.
+        demonstrations: demonstrations asked for, where known.
+        axis: what is shifted in a robustness evaluation, or "".
+        strength: how much.
+        swap: subtask in which the expert acts (chain), or "".
+        trained: whether a policy was trained.
+    """
+
+    task: str
+    encoder: str
+    views: tuple[str, ...] = ()
+    variant: str = ""
+    demonstrations: int | None = None
+    axis: str = ""
+    strength: float = 0.0
+    swap: str = ""
+    trained: bool = True
+
+    @property
+    def policy(self) -> str:
+        """The policy without its views."""
+        return self.encoder + (f" · {self.variant}" if self.variant else "")
+
+    @property
+    def view(self) -> str:
+        """The view set."""
+        return " + ".join(self.views)
+
+    @property
+    def label(self) -> str:
+        """The policy with everything that tells it from its neighbours, but for the task."""
+        parts = [self.policy + (f" on {self.view}" if self.views else "")]
+        parts += [f"{self.axis} {self.strength:g}"] if self.axis else []
+        parts += [f"expert in {self.swap}"] if self.swap else []
+        return ", ".join(parts)
+
+    @property
+    def plain(self) -> bool:
+        """Whether neither the world was shifted nor the expert swapped in."""
+        return not self.axis and not self.swap
+
+
+@dataclass(frozen=True)
+class Result:
+    """One stored evaluation: its folder, its summary, how it was made, its rows, its cell."""
+
+    folder: Path
+    summary: dict[str, Any]
+    about: dict[str, Any]
+    rows: list[dict[str, Any]]
+    cell: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def trained(self) -> bool:
+        """Whether a checkpoint was evaluated."""
+        return self.summary["policy"] not in REFERENCES
+
+    @property
+    def config(self) -> TaskConfig:
+        """The task it was evaluated on."""
+        return from_mapping(TaskConfig, self.about["task_config"])
+
+    @property
+    def checkpoint(self) -> dict[str, Any]:
+        """What is known of the policy evaluated; empty for a reference."""
+        found: dict[str, Any] = self.about.get("checkpoint") or {}
+        return found
+
+    @property
+    def seed(self) -> int:
+        """The training seed."""
+        return int(self.checkpoint.get("seed") or 0)
+
+    @cached_property
+    def condition(self) -> Condition:
+        """What it is an evaluation of."""
+        shift, checkpoint, cell = self.about.get("shift") or {}, self.checkpoint, self.cell
+        pool = cell.get("pool", checkpoint.get("pool", "global"))
+        encoder = self.about.get("encoder") or self.summary["policy"]
+        if checkpoint and not self.about.get("views"):
+            encoder = "state" if "state" in encoder.split("-") else "proprioception"
+        return Condition(
+            task=self.summary["task"],
+            encoder=encoder,
+            views=tuple(self.about.get("views") or ()),
+            variant=_variant(checkpoint.get("policy", "bc"), pool, checkpoint.get("recipe", "paper")),
+            demonstrations=cell.get("demonstrations", checkpoint.get("demonstrations")),
+            axis=str(shift.get("axis") or ""),
+            strength=float(shift.get("strength") or 0.0),
+            swap=str(self.about.get("swap") or ""),
+            trained=self.trained,
+        )
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A cell without an evaluation: failed, not run, or pending, with the reason."""
+
+    condition: Condition
+    seed: int
+    state: str
+    reason: str
+    key: str = ""
+
+
+@dataclass(frozen=True)
+class Collected:
+    """Everything a report is made of."""
+
+    folder: Path
+    results: list[Result]
+    missing: list[Missing]
+    run: dict[str, Any]
+    grid: dict[str, Any]
+    probes: list[dict[str, Any]]
+
+
+def collect(folder: Path, cells: Sequence[Mapping[str, Any]] = ()) -> Collected:
+    """Read the results below `folder`.
+
+    Args:
+        folder: results of quickstart, evaluate, robustness or sweep.
+        cells: the cells of a sweep, as mappings with "key", "state" ("to do" or "not run"), "reason" and the cell's
+            own fields; those that have no result and no record are reported as pending or not run.
+
+    Raises:
+        BadFile: neither an evaluation nor a cell that failed or was not run.
+    """
+    grid = _json(folder / GRID_FILE)
+    run = _json(folder / RUN_FILE)
+    results = read_results(folder, grid, empty=True)
+    missing = _missing(folder, run, grid, cells, results)
+    if not results and not missing:
+        raise BadFile(f"{folder} holds no evaluation; run `surgicai-vision evaluate POLICY --out {folder}` first.")
+    return Collected(folder, results, missing, run, grid, read_probes(folder))
+
+
+def read_results(folder: Path, grid: dict[str, Any] | None = None, empty: bool = False) -> list[Result]:
+    """Read all evaluations below `folder`; trained policies first."""
+    results = []
+    shared = {name: value for name, value in (grid or {}).items() if name == "demonstrations" and _is_one(value)}
+    for place in find_evaluations(folder):
+        stored = files.read_json(place / MARKER)
+        cell = _json(place.parent / CELL_FILE).get("cell", {})
+        mapping = {**shared, **cell} if cell else {}
+        results.append(Result(place, stored["summary"], stored["about"], read_rows(place), mapping))
+    if not results and not empty:
+        raise BadFile(f"{folder} holds no evaluation; run `surgicai-vision evaluate POLICY --out {folder}` first.")
+    return sorted(results, key=_order)
+
+
+def condition_of(cell: Mapping[str, Any]) -> Condition:
+    """Return the condition of a cell that was not evaluated, from its own fields."""
+    recipe = Path(str(cell.get("recipe", "paper"))).stem
+    deviations = cell.get("deviations")
+    switches = [] if deviations is None else list(deviations) or ["none"]
+    epochs = [f"{cell['epochs']}epochs"] if cell.get("epochs") else []
+    demonstrations = cell.get("demonstrations")
+    return Condition(
+        task=str(cell["task"]),
+        encoder=str(cell.get("encoder") or ("state" if cell.get("privileged") else "proprioception")),
+        views=tuple(cell.get("view") or ()),
+        variant=_variant(cell.get("policy", "bc"), cell.get("pool", "global"), "+".join([recipe, *switches, *epochs])),
+        demonstrations=demonstrations if _is_one(demonstrations) else None,
+    )
+
+
+def read_probes(folder: Path) -> list[dict[str, Any]]:
+    """Return the rows of every probe below `folder`."""
+    import pyarrow.parquet as pq
+
+    rows: list[dict[str, Any]] = []
+    for path in sorted(folder.rglob(PROBES[0])):
+        rows += pq.read_table(path).to_pylist()
+    if not rows:
+        for path in sorted(folder.rglob(PROBES[1])):
+            stored = files.read_json(path)
+            rows += stored.get("rows", []) if isinstance(stored, dict) else stored
+    return rows
+
+
+def _missing(
+    folder: Path, run: dict[str, Any], grid: dict[str, Any], cells: Sequence[Mapping[str, Any]], results: list[Result]
+) -> list[Missing]:
+    """Return the cells without a result: what failed, what the plan knows, what the run noted, each once."""
+    shared = {name: grid[name] for name in ("demonstrations",) if _is_one(grid.get(name))}
+    done = {(result.condition, result.seed) for result in results}
+    found: dict[tuple[Condition, int], Missing] = {}
+
+    def add(cell: Mapping[str, Any], state: str, reason: str, key: str) -> None:
+        condition, seed = condition_of({**shared, **_filled(cell)}), int(cell.get("seed") or 0)
+        if (condition, seed) not in done:
+            found.setdefault((condition, seed), Missing(condition, seed, state, reason, key))
+
+    for path in sorted(folder.rglob(FAILED_FILE)):
+        stored = files.read_json(path)
+        add(stored["cell"], FAILED, _last_line(str(stored.get("error", ""))), path.parent.name)
+    for cell in cells:
+        if cell["state"] in ("to do", NOT_RUN, FAILED):
+            state = PENDING if cell["state"] == "to do" else str(cell["state"])
+            reason = str(cell.get("reason") or "the sweep has not come to it yet")
+            add(cell, state, reason, str(cell.get("key", "")))
+    if not cells:
+        for line in run.get("not_run", []):
+            noted = _noted(str(line))
+            if noted and not any(_same(noted, other) for other in found.values()):
+                found[noted.condition, noted.seed] = noted
+    return sorted(found.values(), key=lambda item: (*_condition_order(item.condition), item.seed))
+
+
+def _noted(line: str) -> Missing | None:
+    """Read a line that a run has noted of a cell; its name stays whole, as the policy's."""
+    match = PROBLEM.match(line)
+    if not match:
+        return None
+    state, task, name, seed, reason = match.groups()
+    return Missing(Condition(task, name), int(seed), state, reason)
+
+
+def _same(noted: Missing, other: Missing) -> bool:
+    """Whether a noted line and a known cell are the same one: by task, training seed and state."""
+    return (noted.condition.task, noted.seed, noted.state) == (other.condition.task, other.seed, other.state)
+
+
+def _filled(cell: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in cell.items() if value is not None}
+
+
+def _variant(policy: str, pool: str, recipe: str) -> str:
+    """Name what is not as usual."""
+    parts = ((policy, "bc"), (pool, "global"), (recipe.removeprefix("paper+"), "paper"))
+    return " · ".join(part for part, usual in parts if part != usual)
+
+
+def _order(result: Result) -> tuple[Any, ...]:
+    return (*_condition_order(result.condition), result.seed)
+
+
+def _condition_order(condition: Condition) -> tuple[Any, ...]:
+    """By task; in it trained policies first, by encoder, views and what else they are, then the references."""
+    views = [names.CAMERAS.index(view) if view in names.CAMERAS else len(names.CAMERAS) for view in condition.views]
+    task = names.TASKS.index(condition.task) if condition.task in names.TASKS else len(names.TASKS)
+    more = (condition.variant, condition.demonstrations or 0, condition.axis, condition.strength, condition.swap)
+    return (task, not condition.trained, not views, condition.encoder, len(views), views, *more)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    found: dict[str, Any] = files.read_json(path) if path.exists() else {}
+    return found
+
+
+def _is_one(value: Any) -> bool:
+    return isinstance(value, int)
+
+
+def _last_line(text: str) -> str:
+    """Return the last line of an error: of a traceback the one that names it."""
+    lines = [line.strip() for line in text.strip().splitlines() if line.strip()]
+    return lines[-1] if lines else "no error was kept"

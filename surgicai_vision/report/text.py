@@ -1,0 +1,60 @@
+"""Text: numbers as tables print them. Percentages are whole, intervals in brackets, absent is a dash."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+ABSENT = "–"
+
+
+def percent(rate: float) -> str:
+    """Return 0.654 as "65 %"."""
+    return f"{100 * rate:.0f} %"
+
+
+def interval(bounds: Sequence[float]) -> str:
+    """Return (0.4078, 0.8461) as "41–85 %"."""
+    low, high = bounds
+    return f"{100 * low:.0f}–{100 * high:.0f} %"
+
+
+def mean(value: dict[str, float | None]) -> str:
+    """Return {"mean", "std"} as "41.5 ± 2.0"."""
+    if value["mean"] is None:
+        return ABSENT
+    return f"{value['mean']:.1f}" + (f" ± {value['std']:.1f}" if value["std"] is not None else "")
+
+
+def finite(values: Sequence[float | None]) -> list[float]:
+    """Return the numbers among `values`: neither None nor NaN."""
+    return [float(value) for value in values if value is not None and math.isfinite(value)]
+
+
+def quartiles(values: Sequence[float | None]) -> tuple[float, float, float] | None:
+    """Return lower quartile, median and upper quartile of the numbers among `values`; None without any."""
+    known = finite(values)
+    if not known:
+        return None
+    low, middle, high = np.percentile(known, (25, 50, 75))
+    return float(low), float(middle), float(high)
+
+
+def spread(values: Sequence[float | None], digits: int = 1) -> str:
+    """Return the median and quartiles as "0.8 (0.5–1.2)"; of how many, where some are missing."""
+    found = quartiles(values)
+    if found is None:
+        return ABSENT
+    low, middle, high = (f"{value:.{digits}f}" for value in found)
+    count = len(finite(values))
+    return f"{middle} ({low}–{high})" + (f", n = {count}" if count < len(values) else "")
+
+
+def probability(p: float) -> str:
+    """Return a p-value with two digits that count: "0.031", "< 0.001"."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def plural(count: int, word: str) -> str:
+    """Return "1 cell" or "2 cells"."""
+    return f"{count} {word}" + ("" if count == 1 else "s")
