@@ -1,0 +1,91 @@
+"""Measure random reads of the feature cache: rows of 2,048 float16 values, in random order, as training takes them.
+
+    python benchmarks/cache.py --json
+
+An entry is written by `surgicai_vision.features.encode` itself, with an encoder that costs nothing. Each repetition
+reads batches of 256 rows drawn at random from all of them: as they lie (`float16`), and cast to float32 as `training`
+does. The pages are in memory, as they are from the second epoch on. Every batch is checked to hold the rows asked
+for. Prints one JSON line.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from common import emit, median
+
+from surgicai_vision import registry
+from surgicai_vision.features import encode
+
+DIM = 2048
+
+
+class Source:
+    """A dataset of tiny frames, each another."""
+
+    views = ("back",)
+    fingerprint = "benchmark"
+
+    def __init__(self, length: int):
+        self.length = length
+
+    def frames(self, view: str, start: int, stop: int) -> np.ndarray:
+        """Return frames start..stop; the first value says which."""
+        return np.broadcast_to(np.arange(start, stop)[:, None, None, None], (stop - start, 1, 1, 3))
+
+
+class Filler:
+    """An encoder whose row says which frame it is of."""
+
+    card = registry.encoder_card("random")
+    pool, dim, shape, fingerprint, weights_sha256 = "global", DIM, (DIM,), "filler", ""
+
+    def __call__(self, frames: np.ndarray) -> np.ndarray:
+        """Return (B, DIM) float32 rows."""
+        return np.repeat(frames[:, 0, 0, :1] % 2048, DIM, axis=1).astype(np.float32)
+
+
+def read(rows: np.ndarray, count: int, batch: int, kind: type, generator: np.random.Generator) -> float:
+    """Read `count` rows at random; return rows/s."""
+    order = generator.integers(0, len(rows), (count // batch, batch))
+    began = time.perf_counter()
+    total = 0.0
+    for chosen in order:
+        total += float(rows[chosen].astype(kind, copy=False)[0, 0])
+    seconds = time.perf_counter() - began
+    assert total == float(np.sum(order[:, 0] % 2048)), "another row than asked for"
+    return order.size / seconds
+
+
+def main() -> None:
+    """Write an entry, read it and print the speeds."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", type=int, default=50_000, help="rows of the entry: 4 KiB each")
+    parser.add_argument("--read", type=int, default=200_000, help="rows read in each repetition")
+    parser.add_argument("--batch", type=int, default=256)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the output is always JSON")
+    arguments = parser.parse_args()
+    generator = np.random.default_rng(0)
+    with tempfile.TemporaryDirectory() as folder:
+        entry = encode(Source(arguments.rows), "back", Filler(), Path(folder))  # type: ignore[arg-type]
+        kinds = {"float16": np.float16, "float32": np.float32}
+        rates: dict[str, list[float]] = {name: [] for name in kinds}
+        for _ in range(arguments.repeats):
+            for name, kind in kinds.items():
+                rates[name].append(read(entry.rows, arguments.read, arguments.batch, kind, generator))
+    row = {
+        "rows": arguments.rows,
+        "dim": DIM,
+        "batch": arguments.batch,
+        "repeats": arguments.repeats,
+        "rows_per_s": {name: round(median(values)) for name, values in rates.items()},
+        "slowest_rows_per_s": {name: round(min(values)) for name, values in rates.items()},
+    }
+    emit("cache", row)
+
+
+if __name__ == "__main__":
+    main()
