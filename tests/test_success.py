@@ -202,9 +202,10 @@ def test_a_needle_drawn_back_does_not_count():
 
 
 def test_the_closed_form_is_the_naive_test():
-    """`passage.leaves` equals the crossing of a fine polyline, for needles anywhere about the exit."""
+    """`passage` equals the crossing of a fine polyline, for needles anywhere about the holes."""
     env = start("pullout")
-    rng, found = np.random.default_rng(0), [0, 0]
+    simulation, pair = env.simulation, env.stitch.pair
+    rng, found = np.random.default_rng(0), np.zeros((3, 2), int)
     for _ in range(600):
         pose = env.stitch.on_arc(rng.uniform(-1.0, 2.2))
         pose[:3, :3] = rotvec_to_matrix(rng.normal(scale=0.3, size=3)) @ pose[:3, :3]
@@ -212,10 +213,17 @@ def test_the_closed_form_is_the_naive_test():
         env.simulation.pose_needle(poses.flat(pose))
         env.simulation.refresh()
         line = pose[:3, 3] + needle.polyline(2001) @ pose[:3, :3].T
-        naive = holes.inside(holes.crossing(line, env.stitch.pair.exit, inward=False))
-        assert passage.leaves(env.simulation, env.stitch.pair.exit) == naive
-        found[naive] += 1
-    assert min(found) > 100
+        beyond = ((line - pair.exit.centre) @ pair.exit.rotation)[:, 2]
+        enters = holes.inside(holes.crossing(line, pair.entry, inward=True))
+        leaves = holes.inside(holes.crossing(line, pair.exit, inward=False))
+        out = bool((beyond > 0).all())
+        assert passage.enters(simulation, pair.entry) == enters
+        assert passage.leaves(simulation, pair.exit) == leaves
+        assert passage.in_both(simulation, pair) == (enters and leaves)
+        assert passage.is_out(simulation, pair) == out
+        for row, happened in zip(found, (enters, leaves, out), strict=True):
+            row[int(happened)] += 1
+    assert found.min() > 50
 
 
 # -- grasps -----------------------------------------------------------------------------------------------------------
@@ -338,9 +346,17 @@ def torn(data, body):
     data.qfrc_applied[:] = np.nan
 
 
+def told_nonsense(data, body):
+    data.ctrl[0] = np.nan
+
+
+def told_to_go_far(data, body):
+    data.ctrl[-1] = -np.inf
+
+
 @pytest.mark.parametrize("after", [0, 5])
 @pytest.mark.parametrize("task", ["grasp", "handoff", "suture"])
-@pytest.mark.parametrize("attack", [huge, not_a_number, blown_away, torn])
+@pytest.mark.parametrize("attack", [huge, not_a_number, blown_away, torn, told_nonsense, told_to_go_far])
 def test_divergence_is_an_error_and_never_a_success(task, attack, after, monkeypatch, tmp_path):
     """MuJoCo resets itself silently, even in the first step of an episode."""
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings into the working folder

@@ -50,12 +50,11 @@ class StepSize(NamedTuple):
 
 def moved(pose: Pose, action: list[float], step: StepSize) -> Pose:
     """Return `pose` moved by the first six numbers of `action`."""
-    shift, turn = step.translation, step.rotation
-    rotation = pose[3:]
-    if action[3] or action[4] or action[5]:
-        increment = rotvec_to_matrix_flat(action[3] * turn, action[4] * turn, action[5] * turn)
-        rotation = multiply_flat(increment, rotation)
-    return (pose[0] + action[0] * shift, pose[1] + action[1] * shift, pose[2] + action[2] * shift, *rotation)
+    x, y, z, a, b, c, _ = action
+    shift, turn, rotation = step.translation, step.rotation, pose[3:]
+    if a or b or c:
+        rotation = multiply_flat(rotvec_to_matrix_flat(a * turn, b * turn, c * turn), rotation)
+    return (pose[0] + x * shift, pose[1] + y * shift, pose[2] + z * shift, *rotation)
 
 
 def follow(command: Command, action: list[float], step: StepSize, base: Pose, instrument: str) -> Command:
@@ -68,14 +67,15 @@ def follow(command: Command, action: list[float], step: StepSize, base: Pose, in
         base: T_world_base of the arm.
         instrument: its instrument.
     """
-    jaw = min(max(command.jaw + action[6] * step.jaw, 0.0), JAW_OPEN)
+    jaw = command.jaw + action[6] * step.jaw
+    jaw = 0.0 if jaw < 0.0 else JAW_OPEN if jaw > JAW_OPEN else jaw
     pose = moved(command.pose, action, step)
-    if not in_workspace(pose, base):
-        return Command(command.pose, jaw, command.joints)
-    try:
-        return Command(pose, jaw, inverse_flat(pose, instrument, command.joints))
-    except UnreachablePose:
-        return Command(command.pose, jaw, command.joints)
+    if in_workspace(pose, base):
+        try:
+            return Command(pose, jaw, inverse_flat(pose, instrument, command.joints))
+        except UnreachablePose:
+            pass
+    return Command(command.pose, jaw, command.joints)
 
 
 def in_workspace(pose: Pose, base: Pose) -> bool:

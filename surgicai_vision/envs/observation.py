@@ -13,19 +13,27 @@
 Pictures and proprioception are all that vision types hold: no goal, no needle pose.
 """
 
+import struct
 from dataclasses import dataclass
-from math import pi
+from math import atan2, pi, sqrt
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from surgicai_vision import names
+from surgicai_vision.envs import poses
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.scene.kinematics import STARTS, Pose
-from surgicai_vision.scene.rotations import matrix_to_rotvec_flat, matrix_to_rpy_flat, multiply_flat
+from surgicai_vision.scene.rotations import (
+    GIMBAL,
+    LARGEST_ROLL,
+    matrix_to_rotvec_flat,
+    matrix_to_rpy_flat,
+    multiply_flat,
+)
 
-Rotation = tuple[float, ...]
+_TWENTY_ONE = struct.Struct("21f").pack_into
 
 
 @dataclass(frozen=True)
@@ -120,42 +128,51 @@ def state_vector_in_world(
         desired: where it should be.
         jaw: [rad].
     """
-    b0, b1, b2, b3, b4, b5, b6, b7, b8 = base[3:]
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = achieved[3:]
-    d0, d1, d2, d3, d4, d5, d6, d7, d8 = turn = multiply_flat(desired[3:], (a0, a3, a6, a1, a4, a7, a2, a5, a8))
-    tx, ty, tz = tip[:3]
-    x, y, z = tx - base[0], ty - base[1], tz - base[2]
+    bx, by, bz, b0, b1, b2, b3, b4, b5, b6, b7, b8 = base
+    tx, ty, tz, r0, r1, r2, r3, r4, r5, r6, r7, r8 = tip
+    ax, ay, az, a0, a1, a2, a3, a4, a5, a6, a7, a8 = achieved
+    gx, gy, gz, g0, g1, g2, g3, g4, g5, g6, g7, g8 = desired
+    # The turn from achieved to desired, the tip in the base, the way to the goal in world and in the base.
+    d0, d1, d2 = g0 * a0 + g1 * a1 + g2 * a2, g0 * a3 + g1 * a4 + g2 * a5, g0 * a6 + g1 * a7 + g2 * a8
+    d3, d4, d5 = g3 * a0 + g4 * a1 + g5 * a2, g3 * a3 + g4 * a4 + g5 * a5, g3 * a6 + g4 * a7 + g5 * a8
+    d6, d7, d8 = g6 * a0 + g7 * a1 + g8 * a2, g6 * a3 + g7 * a4 + g8 * a5, g6 * a6 + g7 * a7 + g8 * a8
+    x, y, z = tx - bx, ty - by, tz - bz
     px, py, pz = b0 * x + b3 * y + b6 * z, b1 * x + b4 * y + b7 * z, b2 * x + b5 * y + b8 * z
-    x, y, z = tx - achieved[0], ty - achieved[1], tz - achieved[2]
-    ex = desired[0] + d0 * x + d1 * y + d2 * z - tx
-    ey = desired[1] + d3 * x + d4 * y + d5 * z - ty
-    ez = desired[2] + d6 * x + d7 * y + d8 * z - tz
+    x, y, z = tx - ax, ty - ay, tz - az
+    ex = gx + d0 * x + d1 * y + d2 * z - tx
+    ey = gy + d3 * x + d4 * y + d5 * z - ty
+    ez = gz + d6 * x + d7 * y + d8 * z - tz
     ex, ey, ez = b0 * ex + b3 * ey + b6 * ez, b1 * ex + b4 * ey + b7 * ez, b2 * ex + b5 * ey + b8 * ez
-    vx, vy, vz = matrix_to_rotvec_flat(turn)
+    vx, vy, vz = matrix_to_rotvec_flat((d0, d1, d2, d3, d4, d5, d6, d7, d8))
+    # Of both rotations in the base, what roll, pitch and yaw need: the first column and the end of the last row.
+    cx, cy, cz = b0 * r0 + b3 * r3 + b6 * r6, b1 * r0 + b4 * r3 + b7 * r6, b2 * r0 + b5 * r3 + b8 * r6
+    x, y, z = d0 * r0 + d1 * r3 + d2 * r6, d3 * r0 + d4 * r3 + d5 * r6, d6 * r0 + d7 * r3 + d8 * r6
+    fx, fy, fz = b0 * x + b3 * y + b6 * z, b1 * x + b4 * y + b7 * z, b2 * x + b5 * y + b8 * z
+    x, y, z = b2 * d0 + b5 * d3 + b8 * d6, b2 * d1 + b5 * d4 + b8 * d7, b2 * d2 + b5 * d5 + b8 * d8
+    cos_pitch, goal_cos_pitch = sqrt(cx * cx + cy * cy), sqrt(fx * fx + fy * fy)
+    if cos_pitch < GIMBAL or goal_cos_pitch < GIMBAL:
+        to_base = poses.invert(base)
+        goal = poses.compose(desired, poses.relative(achieved, tip))
+        return state_vector(arm, poses.compose(to_base, tip), poses.compose(to_base, goal), jaw)
     home = STARTS[arm][5] - pi
-    roll, pitch, yaw = _rpy_in_base(base, tip[3:])
-    goal_roll, goal_pitch, goal_yaw = _rpy_in_base(base, multiply_flat(turn, tip[3:]))
-    values = (
-        px * 100.0, py * 100.0, pz * 100.0, roll, pitch, home + (yaw - home) % (2 * pi), jaw,
+    seen = np.empty(21, np.float32)
+    _TWENTY_ONE(
+        seen, 0, px * 100.0, py * 100.0, pz * 100.0,
+        _roll(b2 * r1 + b5 * r4 + b8 * r7, b2 * r2 + b5 * r5 + b8 * r8), atan2(-cz, cos_pitch),
+        home + (atan2(cy, cx) - home) % (2 * pi), jaw,
         (px + ex) * 100.0, (py + ey) * 100.0, (pz + ez) * 100.0,
-        goal_roll, goal_pitch, home + (goal_yaw - home) % (2 * pi), 0.0,
+        _roll(x * r1 + y * r4 + z * r7, x * r2 + y * r5 + z * r8), atan2(-fz, goal_cos_pitch),
+        home + (atan2(fy, fx) - home) % (2 * pi), 0.0,
         ex * 100.0, ey * 100.0, ez * 100.0,
         b0 * vx + b3 * vy + b6 * vz, b1 * vx + b4 * vy + b7 * vz, b2 * vx + b5 * vy + b8 * vz, -jaw,
     )  # fmt: skip
-    return np.array(values, dtype=np.float32)
+    return seen
 
 
-def _rpy_in_base(base: Pose, rotation: Rotation) -> tuple[float, float, float]:
-    """Return roll, pitch, yaw of a rotation in world as seen from the base."""
-    _, _, _, b0, b1, b2, b3, b4, b5, b6, b7, b8 = base
-    r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation
-    return matrix_to_rpy_flat(
-        (
-            b0 * r0 + b3 * r3 + b6 * r6, 0.0, 0.0,
-            b1 * r0 + b4 * r3 + b7 * r6, b1 * r1 + b4 * r4 + b7 * r7, b1 * r2 + b4 * r5 + b7 * r8,
-            b2 * r0 + b5 * r3 + b8 * r6, b2 * r1 + b5 * r4 + b8 * r7, b2 * r2 + b5 * r5 + b8 * r8,
-        )
-    )  # fmt: skip
+def _roll(sine: float, cosine: float) -> float:
+    """Return a roll in (-2π, 0], as `matrix_to_rpy_flat` does."""
+    roll = atan2(sine, cosine)
+    return roll if roll <= 0.0 else max(roll - 2.0 * pi, -LARGEST_ROLL)
 
 
 def goal_vector(pose: Pose, jaw: float) -> np.ndarray:

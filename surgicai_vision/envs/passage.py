@@ -8,11 +8,10 @@ the needle's polyline crosses both planes inside the openings now.
 
 import math
 
-from surgicai_vision.envs import poses
 from surgicai_vision.envs.memory import Memory
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.scene import needle
-from surgicai_vision.scene.holes import OPENING, Hole, HolePair, crossing, inside
+from surgicai_vision.scene.holes import OPENING, Hole, HolePair
 
 JUMP = 0.004
 """Furthest the tip can move in one control step [m]: eight times the default step size."""
@@ -54,45 +53,69 @@ def remember_tip(simulation: Simulation, memory: Memory) -> None:
 
 def in_both(simulation: Simulation, pair: HolePair) -> bool:
     """Say whether the needle lies in both openings now."""
-    pose = poses.square(simulation.needle())
-    line = needle.polyline() @ pose[:3, :3].T + pose[:3, 3]
-    return inside(crossing(line, pair.entry, inward=True)) and inside(crossing(line, pair.exit, inward=False))
+    return enters(simulation, pair.entry) and leaves(simulation, pair.exit)
+
+
+def enters(simulation: Simulation, hole: Hole) -> bool:
+    """Say whether the needle, from base to tip, crosses the hole's plane inwards inside the opening now."""
+    return _crosses(simulation, hole, inward=True)
 
 
 def leaves(simulation: Simulation, hole: Hole) -> bool:
-    """Say whether the needle crosses the hole's plane outwards inside the opening now.
+    """Say whether the needle, from base to tip, crosses the hole's plane outwards inside the opening now."""
+    return _crosses(simulation, hole, inward=False)
 
-    The same as `crossing` on a fine polyline, in closed form for every control step: along the arc the height over
-    the plane is a + R (c sin θ - b cos θ), and it rises through 0 at one angle only.
+
+def _crosses(simulation: Simulation, hole: Hole, *, inward: bool) -> bool:
+    """Do what `holes.crossing` does on a fine polyline, in closed form for every control step.
+
+    Along the arc the height over the plane is a + R (c sin θ - b cos θ) = a + reach sin(θ - φ); it rises through 0
+    at one angle and falls through it at one.
     """
-    cosine, sine = math.cos(hole.tilt), math.sin(hole.tilt)
-    x, y, z = hole.centre
-    px, _, pz, r0, r1, _, _, _, _, r6, r7, _ = simulation.needle()
-    a, b, c = sine * (px - x) + cosine * (pz - z), sine * r0 + cosine * r6, sine * r1 + cosine * r7
-    reach = needle.RADIUS * math.hypot(b, c)
-    if abs(a) >= reach:
+    height, reach, phase = _heights(simulation, hole)
+    if abs(height) >= reach:
         return False
-    angle = math.remainder(math.atan2(b, c) - math.asin(a / reach), 2 * math.pi)
+    rising = math.asin(height / reach)
+    angle = math.remainder(phase + (math.pi + rising if inward else -rising), 2 * math.pi)
     if not 0.0 <= angle <= needle.TIP_ANGLE:
         return False
-    qx, qy, qz = simulation.needle_point(angle)
-    return abs(cosine * (qx - x) - sine * (qz - z)) < OPENING / 2 and abs(qy - y) < OPENING / 2
+    return _within(simulation.needle_point(angle), hole)
 
 
 def is_out(simulation: Simulation, pair: HolePair) -> bool:
-    """Say whether the whole needle is beyond the exit's plane."""
-    pose = poses.square(simulation.needle())
-    line = needle.polyline(13) @ pose[:3, :3].T + pose[:3, 3]
-    return bool((((line - pair.exit.centre) @ pair.exit.rotation)[:, 2] > 0).all())
+    """Say whether the whole needle is beyond the exit's plane: its lowest point is."""
+    height, reach, phase = _heights(simulation, pair.exit)
+    low = math.remainder(phase - math.pi / 2, 2 * math.pi)
+    lowest = -1.0 if 0.0 <= low <= needle.TIP_ANGLE else min(math.sin(-phase), math.sin(needle.TIP_ANGLE - phase))
+    return height + reach * lowest > 0.0
+
+
+def _heights(simulation: Simulation, hole: Hole) -> tuple[float, float, float]:
+    """Return a [m], reach [m] and φ [rad]: a + reach sin(θ - φ) is the height of the needle's point at θ."""
+    cosine, sine = hole.slope
+    x, _, z = hole.centre
+    px, _, pz, r0, r1, _, _, _, _, r6, r7, _ = simulation.needle()
+    b, c = sine * r0 + cosine * r6, sine * r1 + cosine * r7
+    return sine * (px - x) + cosine * (pz - z), needle.RADIUS * math.hypot(b, c), math.atan2(b, c)
+
+
+def _within(point: Point, hole: Hole) -> bool:
+    """Say whether a point of the hole's plane lies in the opening."""
+    (cosine, sine), (x, y, z), (qx, qy, qz) = hole.slope, hole.centre, point
+    return abs(cosine * (qx - x) - sine * (qz - z)) < OPENING / 2 and abs(qy - y) < OPENING / 2
 
 
 def _passes(before: Point, now: Point, hole: Hole, inward: bool) -> bool:
     """Say whether the way from `before` to `now` crosses the hole's plane inside the opening."""
-    cosine, sine = math.cos(hole.tilt), math.sin(hole.tilt)
+    cosine, sine = hole.slope
     x, _, z = hole.centre
     start, end = sine * (before[0] - x) + cosine * (before[2] - z), sine * (now[0] - x) + cosine * (now[2] - z)
     if not (start > 0.0 >= end if inward else start <= 0.0 < end):
         return False
     share = start / (start - end)
-    dx, dy, dz = (b + share * (n - b) - c for b, n, c in zip(before, now, hole.centre, strict=True))
-    return abs(cosine * dx - sine * dz) < OPENING / 2 and abs(dy) < OPENING / 2
+    at = (
+        before[0] + share * (now[0] - before[0]),
+        before[1] + share * (now[1] - before[1]),
+        before[2] + share * (now[2] - before[2]),
+    )
+    return _within(at, hole)

@@ -1,5 +1,7 @@
 """Poses in plain floats: composition and inversion of the twelve-float poses of `scene.kinematics`."""
 
+from math import sqrt
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -61,17 +63,19 @@ def inverse_origin(a: Pose) -> tuple[float, float, float]:
     return -(r0 * x + r3 * y + r6 * z), -(r1 * x + r4 * y + r7 * z), -(r2 * x + r5 * y + r8 * z)
 
 
-def reach(a: Pose, point: tuple[float, float, float]) -> float:
-    """Return how far `a` puts a point of its frame from the parent's origin [m]."""
+def gap(a: Pose, point: tuple[float, float, float], b: Pose) -> float:
+    """Return how far `a` puts a point of its frame from the origin of `b` [m]."""
     x, y, z = point
-    u, v, w, r0, r1, r2, r3, r4, r5, r6, r7, r8 = a
-    u, v, w = u + r0 * x + r1 * y + r2 * z, v + r3 * x + r4 * y + r5 * z, w + r6 * x + r7 * y + r8 * z
-    return (u * u + v * v + w * w) ** 0.5
+    u = a[0] + a[3] * x + a[4] * y + a[5] * z - b[0]
+    v = a[1] + a[6] * x + a[7] * y + a[8] * z - b[1]
+    w = a[2] + a[9] * x + a[10] * y + a[11] * z - b[2]
+    return sqrt(u * u + v * v + w * w)
 
 
 def distance(a: Pose, b: Pose) -> float:
     """Return the distance between two origins [m]."""
-    return ((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2) ** 0.5
+    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return sqrt(x * x + y * y + z * z)
 
 
 def angle(a: Pose, b: Pose) -> float:

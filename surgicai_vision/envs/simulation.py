@@ -15,6 +15,7 @@ gives the same ones, bit for bit. MuJoCo resets itself on divergence; the clock 
 import copy
 import math
 import struct
+from math import isfinite
 
 import mujoco
 import numpy as np
@@ -36,6 +37,7 @@ SUBSTEPS = 10
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 CLOCK_START = 1.0
 """Time at the start of an episode [s]: not 0, so that MuJoCo's own reset to 0 shows in the first step too."""
+_SET_SEVEN = struct.Struct("7d").pack_into
 _THREE, _NINE = struct.Struct("3d").unpack_from, struct.Struct("9d").unpack_from
 """One row of positions, of rotations, as floats: half the time of `array[row].tolist()`."""
 RELEASE_STEPS, RELEASE_JAW, RELEASE_SHIFT = 40, 0.1, 0.001
@@ -65,13 +67,15 @@ class Simulation:
         self.scene, self.latency = scene, latency
         welded = scene.config.grasp == "attach"
         self.model = copy.copy(scene.model) if own_model or welded else scene.model
-        self.data = mujoco.MjData(self.model)
+        self.data = data = mujoco.MjData(self.model)
+        self._ctrl, self._qpos, self._xpos, self._xmat = data.ctrl, data.qpos, data.xpos, data.xmat
         self.draws = randomisation.NOTHING
         self.offsets: dict[str, tuple[float, ...]] = {}
         self._welds = Welds(self.model, self.data) if welded else None
         self._own = own_model
         self._instrument = scene.config.instrument
-        self._arms = dict(scene.arms)
+        self._fingers = {arm: scene.arms[arm].finger_qpos for arm in names.ARMS}
+        self._servos = {arm: self._ctrl.itemsize * scene.arms[arm].actuators.start for arm in names.ARMS}
         self.memory = Memory()
         self.commands: dict[str, Command] = {}
         self._read: dict[str, Pose] | None = None
@@ -81,9 +85,7 @@ class Simulation:
         self._phantom_id = self.model.body("phantom").id
         self._pads = {arm: scene.arms[arm].pads for arm in names.ARMS}
         self._needle_geoms = (scene.needle_geoms.start, scene.needle_geoms.stop)
-        self._ctrl, self._qpos = self.data.ctrl, self.data.qpos
         self._control_time = SUBSTEPS * float(self.model.opt.timestep)
-        self._xpos, self._xmat = self.data.xpos, self.data.xmat
         self._bodies = {arm: scene.arms[arm].tip_body for arm in names.ARMS} | {"needle": self._needle_id}
         self.reset()
 
@@ -147,9 +149,8 @@ class Simulation:
     def command(self, arm: str, command: Command) -> None:
         """Make `command` the arm's present command."""
         self.commands[arm] = command
-        ids = self._arms[arm]
-        self._ctrl[ids.actuators] = self._with_error(arm, command.joints) if self.offsets else command.joints
-        self._ctrl[ids.jaw_actuator] = control.jaw_servo(command.jaw)
+        joints = self._with_error(arm, command.joints) if self.offsets else command.joints
+        _SET_SEVEN(self._ctrl, self._servos[arm], *joints, control.jaw_servo(command.jaw))
 
     def pose_needle(self, pose: Pose) -> None:
         """Put the needle at a pose in world, at rest."""
@@ -173,7 +174,10 @@ class Simulation:
     # -- moving ---------------------------------------------------------------------------------------------------
 
     def advance(self, arm: str, action: list[float], step: StepSize) -> bool:
-        """Take one control step of 20 ms; return False when MuJoCo diverged and reset itself.
+        """Take one control step of 20 ms; return False on a physics error.
+
+        That is: MuJoCo diverged and reset itself, or somebody wrote a command that is not finite into `data.ctrl`,
+        in whose place MuJoCo would take zeros for all servos.
 
         Args:
             arm: the arm the action moves.
@@ -182,10 +186,14 @@ class Simulation:
         """
         if self.latency:
             action = self._delayed(action)
+        data, ctrl = self.data, self._ctrl
+        finite = isfinite(ctrl.dot(ctrl))
+        if not finite:
+            for name, command in self.commands.items():
+                self.command(name, command)
         self.command(arm, control.follow(self.commands[arm], action, step, self.bases[arm], self._instrument))
         if self.memory.release > 0:
             self._let_go()
-        data = self.data
         due = data.time + self._control_time
         mujoco.mj_step2(self.model, data)
         mujoco.mj_step(self.model, data, SUBSTEPS - 1)
@@ -193,7 +201,7 @@ class Simulation:
         self._read = None
         if self._welds:
             self._attach(self._welds)
-        return abs(data.time - due) < 1e-9
+        return finite and abs(data.time - due) < 1e-9
 
     def _delayed(self, action: list[float]) -> list[float]:
         """Queue an action and return the one whose time has come."""
@@ -247,10 +255,7 @@ class Simulation:
         self._read = None
 
     def _body(self, name: str) -> Pose:
-        read = self._read
-        if read is not None and name in read:
-            return read[name]
-        index = self._bodies[name]
+        read, index = self._read, self._bodies[name]
         pose: Pose = (*_THREE(self._xpos, 24 * index), *_NINE(self._xmat, 72 * index))
         if read is not None:
             read[name] = pose
@@ -258,7 +263,8 @@ class Simulation:
 
     def tip(self, arm: str) -> Pose:
         """Return T_world_tip of an arm, measured."""
-        return self._body(arm)
+        read = self._read
+        return read[arm] if read is not None and arm in read else self._body(arm)
 
     def grasp(self, arm: str) -> Pose:
         """Return T_world_grasp: the tip's frame shifted to the jaws' grasp point."""
@@ -272,7 +278,8 @@ class Simulation:
 
     def needle(self) -> Pose:
         """Return T_world_needle, measured."""
-        return self._body("needle")
+        read = self._read
+        return read["needle"] if read is not None and "needle" in read else self._body("needle")
 
     def tip_in_base(self, arm: str) -> Pose:
         """Return T_base_tip as the arm reports it: its kinematics do not know of an error of its joints."""
@@ -299,7 +306,7 @@ class Simulation:
 
     def jaw(self, arm: str) -> float:
         """Return the measured angle of the left finger [rad]."""
-        return float(self._qpos[self._arms[arm].finger_qpos])
+        return self._qpos.item(self._fingers[arm])
 
     def needle_point(self, angle: float) -> tuple[float, float, float]:
         """Return the needle's point at `angle` [rad] in world [m]."""
@@ -312,12 +319,11 @@ class Simulation:
         left, right = self._pads[arm]
         first, last = self._needle_geoms
         found_left = found_right = False
-        for one, other in self.data.contact.geom.tolist():
-            if first <= one < last:
-                one, other = other, one
-            if first <= other < last:
-                found_left = found_left or one == left
-                found_right = found_right or one == right
+        for one, other in self.data.contact.geom.tolist():  # MuJoCo sorts a pair by type: capsules before boxes
+            if other == left:
+                found_left = found_left or first <= one < last
+            elif other == right:
+                found_right = found_right or first <= one < last
         return found_left, found_right
 
     def holds(self, arm: str) -> bool:

@@ -10,6 +10,7 @@ from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.scene.kinematics import Pose
+from surgicai_vision.scene.rotations import geodesic_angle_flat, multiply_flat
 
 Info = dict[str, Any]
 Target = tuple[Pose, Pose]
@@ -54,9 +55,10 @@ def _slip(simulation: Simulation, arm: str, contact: bool) -> NDArray[np.float64
     if not contact:
         memory.held = 0.0
         return np.zeros(2)
-    in_jaws = poses.relative(simulation.grasp(arm), simulation.needle())
+    grasp, lying = simulation.grasp(arm), simulation.needle()
     if memory.held == 0.0:
-        memory.held, memory.hold = 1.0, in_jaws
+        memory.held, memory.hold = 1.0, poses.relative(grasp, lying)
         return np.zeros(2)
-    grasped = poses.inverse_origin(memory.hold)
-    return np.array((poses.reach(in_jaws, grasped), poses.angle(in_jaws, memory.hold)))
+    # The point then grasped is where the needle has `inverse_origin(hold)`; rotations leave its way's length alone.
+    way = poses.gap(lying, poses.inverse_origin(memory.hold), grasp)
+    return np.array((way, geodesic_angle_flat(lying[3:], multiply_flat(grasp[3:], memory.hold[3:]))))

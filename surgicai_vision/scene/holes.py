@@ -8,6 +8,7 @@ Sources: layout `simple` holds the entry and exit poses of SurgicAI's phantom (o
 the wound are ours. The insertion path through `simple` is derived in `envs.geometry`.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -25,6 +26,11 @@ class Hole:
 
     centre: tuple[float, float, float]
     tilt: float
+
+    @functools.cached_property
+    def slope(self) -> tuple[float, float]:
+        """Return cosine and sine of the tilt."""
+        return math.cos(self.tilt), math.sin(self.tilt)
 
     @property
     def rotation(self) -> np.ndarray:

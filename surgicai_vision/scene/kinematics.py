@@ -15,6 +15,7 @@ L = L_tool - L_rcc and s, c for sine and cosine:
 and then the rotation row by row.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 from math import atan2, cos, pi, radians, sin, sqrt
@@ -70,6 +71,11 @@ class Instrument:
     limits: tuple[tuple[float, float], ...]
     jaw: tuple[float, float]
     pitch_to_yaw: float = 0.009
+
+    @functools.cached_property
+    def bounds(self) -> tuple[float, ...]:
+        """Return the lower and upper limit of each joint, `TOLERANCE` wider, in one row."""
+        return tuple(edge for low, high in self.limits for edge in (low - TOLERANCE, high + TOLERANCE))
 
     @property
     def dh(self) -> tuple[Row, ...]:
@@ -227,10 +233,15 @@ def _better(first: Joints, second: Joints, instrument: Instrument, near: Joints 
 
 def _violation(joints: Joints, instrument: Instrument) -> int:
     """Return the index of the first joint outside its limits, -1 for none."""
-    for index, (value, (low, high)) in enumerate(zip(joints, instrument.limits, strict=True)):
-        if not low - TOLERANCE <= value <= high + TOLERANCE:
-            return index
-    return -1
+    a, b, c, d, e, f = joints
+    a0, a1, b0, b1, c0, c1, d0, d1, e0, e1, f0, f1 = instrument.bounds
+    if a0 <= a <= a1 and b0 <= b <= b1 and c0 <= c <= c1 and d0 <= d <= d1 and e0 <= e <= e1 and f0 <= f <= f1:
+        return -1
+    return next(
+        index
+        for index, (value, (low, high)) in enumerate(zip(joints, instrument.limits, strict=True))
+        if not low - TOLERANCE <= value <= high + TOLERANCE
+    )
 
 
 def _checked(joints: Joints, instrument: Instrument) -> Joints:

@@ -18,7 +18,8 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix = NDArray[np.float64]
 
-_LARGEST_ROLL = nextafter(2.0 * pi, 0.0)
+LARGEST_ROLL = nextafter(2.0 * pi, 0.0)
+"""[rad]; so that a roll is above -2π."""
 GIMBAL = 1e-9
 """Below this cosine of the pitch, roll and yaw turn about one axis and the yaw is put to 0."""
 
@@ -45,7 +46,7 @@ def matrix_to_rpy_flat(m: Sequence[float]) -> Vector:
     else:
         roll, yaw = atan2(r21, r22), atan2(r10, r00)
     if roll > 0.0:
-        roll = max(roll - 2.0 * pi, -_LARGEST_ROLL)
+        roll = max(roll - 2.0 * pi, -LARGEST_ROLL)
     return roll, atan2(-r20, cos_pitch), yaw
 
 
