@@ -9,8 +9,8 @@ An episode ends at success, at the task's step limit, or at an error (diverged p
 be made, an action that is not finite). An error is a failure, counted in `errors` as well.
 """
 
-import dataclasses
 import functools
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -19,19 +19,15 @@ from typing import Any, Protocol, final
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision import names
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.errors import InputError, PhysicsError, SurgicaiError
-from surgicai_vision.statistics import clopper_pearson, mean_and_std
+from surgicai_vision.rows import EpisodeRow, failure_kind
 
 BATCH = 8
 """Slots of a process: what an encoder computes at once (`encoders.base`)."""
 
 FILM_FRAMES = 10
 """States kept of each episode, evenly spaced from the first to the last."""
-
-KINDS = ("time", "missed", "dropped", "error")
-"""Kinds of failure: never touched the needle, lost it, held it until the time was over, error."""
 
 Progress = Callable[[int, int], None]
 
@@ -58,35 +54,6 @@ class Agent(Protocol):
 
 MakeAgent = Callable[[], Agent]
 """Makes the agent inside a worker process; must be picklable (a function or a functools.partial)."""
-
-
-@dataclass(frozen=True)
-class EpisodeRow:
-    """One episode.
-
-    Attributes:
-        trajectory_length_mm: path of the measured active tip, Σ‖Δxyz‖ [mm].
-        d_trans_mm: last distance to the goal [mm].
-        d_angle_deg: last angle to the goal [deg].
-        contact: whether the jaws felt the needle at the end.
-        error: what broke the episode off, or "".
-        failure: "" for a success, else one of `KINDS`.
-        stages: subtasks that succeeded in their order, of the whole procedure; 1 for a subtask's own success.
-    """
-
-    task: str
-    policy: str
-    seed: int
-    success: bool
-    steps: int
-    trajectory_length_mm: float
-    d_trans_mm: float
-    d_angle_deg: float
-    contact: bool
-    error: str
-    grasp: str
-    failure: str
-    stages: int = 0
 
 
 @dataclass(frozen=True)
@@ -186,6 +153,7 @@ class _Slot:
     steps: int = 0
     ended: bool = False
     error: str = ""
+    diverged: bool = False
     touched: bool = False
     observation: Any = None
     info: dict[str, Any] = field(default_factory=dict)
@@ -193,6 +161,7 @@ class _Slot:
 
     def __post_init__(self) -> None:
         from surgicai_vision import envs
+        from surgicai_vision.envs.gauge import Gauge
 
         cameras = tuple(self.agent.cameras)
         self.env = envs.make(
@@ -200,13 +169,20 @@ class _Slot:
             obs_type="pixels_agent_pos" if cameras else "state",
             cameras=cameras,
             image_size=self.agent.image_size,
+            depth=getattr(self.agent, "depth", False),
         )
+        self.gauge = Gauge(self.env)
 
     def begin(self, seed: int) -> None:
         """Start the episode of `seed`."""
-        self.seed, self.steps, self.ended, self.error, self.touched, self.states = seed, 0, False, "", False, []
+        self.seed, self.steps, self.states = seed, 0, []
+        self.ended = self.diverged = self.touched = False
+        self.error = ""
+        self.gauge.forget()
         try:
             self.observation, self.info = self.env.reset(seed=seed)
+            self.touched = bool(self.info.get("contact"))
+            self.gauge.begin()
             self.agent.begin(self.index, self.env, seed)
         except PhysicsError as error:
             self.info, self.ended, self.error = {}, True, str(error)
@@ -220,9 +196,11 @@ class _Slot:
         try:
             self.observation, _, terminated, truncated, self.info = self.env.step(action)
         except PhysicsError as error:
-            terminated, truncated, self.error = True, False, str(error)
+            terminated, truncated, self.error, self.diverged = True, False, str(error), True
+        else:
+            self.gauge.look(self.info)
         if self.info.get("physics_error"):
-            self.error = self.error or "the physics diverged"
+            self.error, self.diverged = self.error or "the physics diverged", True
         self.steps += 1
         self.touched = self.touched or bool(self.info.get("contact"))
         self.ended = bool(terminated or truncated or self.error or self.steps >= self.task_config.max_steps)
@@ -234,6 +212,8 @@ class _Slot:
         assert self.seed is not None
         contact = bool(self.info.get("contact", False))
         success = bool(self.info.get("is_success", False)) and not self.error
+        gauge = self.gauge
+        failure = failure_kind(self.error, self.diverged, self.touched, gauge.wrong_hole, contact)
         row = EpisodeRow(
             task=self.task_config.task,
             policy=self.agent.name,
@@ -246,8 +226,13 @@ class _Slot:
             contact=contact,
             error=self.error,
             grasp=self.task_config.scene.grasp,
-            failure="" if success else failure_kind(self.error, self.touched, contact),
+            failure="" if success else failure,
             stages=int(self.info.get("progress", success)),
+            entry_mm=1e3 * gauge.entry_error,
+            exit_mm=1e3 * gauge.exit_error,
+            slip_mm=1e3 * gauge.slip,
+            slip_deg=math.degrees(gauge.turn),
+            tissue_force_n=gauge.tissue_force,
         )
         self.seed = None
         return Episode(row, self._film())
@@ -261,46 +246,6 @@ class _Slot:
             return Film(np.zeros(0, np.int64), np.zeros((0, 0)))
         steps = np.unique(np.linspace(0, len(self.states) - 1, FILM_FRAMES).round().astype(np.int64))
         return Film(steps, np.stack([self.states[step] for step in steps]))
-
-
-def failure_kind(error: str, touched: bool, contact: bool) -> str:
-    """Name why an episode failed, by what the jaws felt."""
-    if error:
-        return "error"
-    if not touched:
-        return "missed"
-    return "time" if contact else "dropped"
-
-
-def summary(rows: Sequence[EpisodeRow]) -> dict[str, Any]:
-    """Return the counts of one policy on one task; lengths and steps are those of successful episodes."""
-    first, successes = rows[0], [row for row in rows if row.success]
-    failures = [row.failure for row in rows if not row.success]
-    return {
-        "task": first.task,
-        "policy": first.policy,
-        "episodes": len(rows),
-        "successes": len(successes),
-        "success_rate": len(successes) / len(rows),
-        "ci95": list(clopper_pearson(len(successes), len(rows))),
-        "trajectory_length_mm": mean_and_std([row.trajectory_length_mm for row in successes]),
-        "time_steps": mean_and_std([float(row.steps) for row in successes]),
-        "grasp": first.grasp,
-        "errors": sum(1 for row in rows if row.error),
-        "failures": {kind: failures.count(kind) for kind in KINDS if kind in failures},
-        "first_seed": min(row.seed for row in rows),
-        **({"reached": _reached(rows)} if first.task == names.SUTURE else {}),
-    }
-
-
-def _reached(rows: Sequence[EpisodeRow]) -> dict[str, int]:
-    """Return how many episodes finished each subtask and all before it."""
-    return {subtask: sum(row.stages > index for row in rows) for index, subtask in enumerate(names.SUBTASKS)}
-
-
-def as_table(rows: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
-    """Return rows as plain data."""
-    return [dataclasses.asdict(row) for row in rows]
 
 
 def _in_processes(jobs: list[Any], progress: Progress | None, total: int) -> list[list[Episode]]:

@@ -13,7 +13,8 @@ import numpy as np
 
 from surgicai_vision import files
 from surgicai_vision.errors import BadFile
-from surgicai_vision.evaluation import Episode, Film, as_table, summary
+from surgicai_vision.evaluation import Episode, Film
+from surgicai_vision.rows import as_table, summary
 
 MARKER = "evaluation.json"
 EPISODES = "episodes.parquet"

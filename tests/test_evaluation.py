@@ -1,16 +1,20 @@
 """Evaluation: rows do not depend on batch or workers; errors are failures; the summary has its keys."""
 
 import functools
+import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from surgicai_vision import cells, envs, names
+from surgicai_vision import cells, envs, names, results
 from surgicai_vision.agents import PolicyAgent, RandomAgent, ZeroAgent
 from surgicai_vision.config import TaskConfig
+from surgicai_vision.envs import gauge
 from surgicai_vision.errors import InputError, PhysicsError
-from surgicai_vision.evaluation import KINDS, evaluate, failure_kind, summary
+from surgicai_vision.evaluation import evaluate
+from surgicai_vision.rows import KINDS, EpisodeRow, as_table, failure_kind, summary
+from surgicai_vision.statistics import clopper_pearson
 
 SHORT = TaskConfig("grasp", max_steps=12)
 
@@ -52,9 +56,29 @@ class FakeEnv:
         self.closed = True
 
 
+class FakeGauge:
+    """Measures what the fake env's count says."""
+
+    def __init__(self, env):
+        self.env = env
+        self.forget()
+
+    def forget(self):
+        self.entry_error = self.exit_error = np.nan
+        self.slip = self.turn = self.tissue_force = 0.0
+        self.wrong_hole = False
+
+    begin = forget
+
+    def look(self, info):
+        self.entry_error = 5e-4
+        self.slip, self.turn, self.tissue_force = 1e-4 * self.env.count, np.pi / 180, 0.1 * self.env.count
+
+
 @pytest.fixture
 def fake_envs(monkeypatch):
     made = []
+    monkeypatch.setattr(gauge, "Gauge", FakeGauge)
 
     def make(config, **_):
         made.append(FakeEnv(config))
@@ -84,9 +108,10 @@ def test_errors_are_failures_and_counted(fake_envs):
     for seed in (97, 98, 99):
         assert not rows[seed].success
         assert rows[seed].error
-        assert rows[seed].failure == "error"
+    # A start that cannot be made is no divergence of the physics.
+    assert [rows[seed].failure for seed in (97, 98, 99)] == ["error", "physics", "physics"]
     result = summary(list(rows.values()))
-    assert (result["successes"], result["errors"], result["failures"]) == (1, 3, {"error": 3})
+    assert (result["successes"], result["errors"], result["failures"]) == (1, 3, {"physics": 2, "error": 1})
 
 
 def test_an_action_that_is_not_finite_is_an_error(fake_envs):
@@ -143,10 +168,45 @@ def test_summary_has_the_promised_keys(fake_envs):
     assert result["first_seed"] == 3
 
 
+def test_rows_and_summary_hold_what_was_measured(fake_envs, tmp_path):
+    episodes = evaluate(ZeroAgent, SHORT, [3, 40, 97], workers=1)
+    rows = {row.seed: row for row in rows_of(episodes)}
+    assert (rows[3].entry_mm, rows[3].slip_mm, rows[3].slip_deg) == pytest.approx((0.5, 0.3, 1.0))
+    assert rows[40].tissue_force_n == pytest.approx(1.2)
+    # Nothing of the episode before is left in one that could not start.
+    assert np.isnan([rows[97].entry_mm, rows[3].exit_mm]).all() and rows[97].slip_mm == 0.0
+    result = results.write_evaluation(tmp_path, episodes, {})
+    assert result["entry_mm"] == {"mean": pytest.approx(0.5), "std": pytest.approx(0.0), "n": 2}
+    assert result["exit_mm"] == {"mean": None, "std": None, "n": 0}
+    assert result["tissue_force_n"]["n"] == 3
+    assert json.loads((tmp_path / results.MARKER).read_text())["summary"] == result
+    assert repr(results.read_rows(tmp_path)) == repr(as_table(rows_of(episodes)))
+
+
 def test_kinds_of_failure():
-    kinds = [failure_kind("x", True, True), failure_kind("", False, False), failure_kind("", True, False)]
-    assert [*kinds, failure_kind("", True, True)] == ["error", "missed", "dropped", "time"]
-    assert set(kinds) <= set(KINDS)
+    assert [failure_kind("x", diverged, True, True, True) for diverged in (True, False)] == ["physics", "error"]
+    assert failure_kind("", False, touched=False, wrong_hole=False, contact=False) == "missed"
+    assert failure_kind("", False, touched=True, wrong_hole=True, contact=False) == "wrong_hole"
+    assert failure_kind("", False, touched=True, wrong_hole=False, contact=False) == "dropped"
+    assert failure_kind("", False, touched=True, wrong_hole=False, contact=True) == "time"
+    assert KINDS == ("missed", "dropped", "wrong_hole", "time", "physics", "error")
+
+
+def test_survival_counts_each_stage_and_all_before_it():
+    rows = [row_with_stages(seed, stages) for seed, stages in enumerate((0, 2, 2, 5))]
+    survival = summary(rows)["survival"]
+    assert [(stage["subtask"], stage["k"]) for stage in survival] == [
+        ("grasp", 3), ("place", 3), ("insert", 1), ("handoff", 1), ("pullout", 1),
+    ]  # fmt: skip
+    assert (survival[0]["low"], survival[0]["high"]) == clopper_pearson(3, 4)
+
+
+def row_with_stages(seed, stages):
+    return EpisodeRow(
+        task="suture", policy="x", seed=seed, success=stages == 5, steps=9, trajectory_length_mm=1.0, d_trans_mm=1.0,
+        d_angle_deg=1.0, contact=True, error="", grasp="friction", failure="" if stages == 5 else "time",
+        stages=stages,
+    )  # fmt: skip
 
 
 def test_real_env_gives_the_same_rows_for_any_batch_and_workers():
@@ -155,7 +215,7 @@ def test_real_env_gives_the_same_rows_for_any_batch_and_workers():
     many = evaluate(RandomAgent, SHORT, seeds, batch=4, workers=1)
     spread = evaluate(RandomAgent, SHORT, seeds, batch=2, workers=2)
     for other in (many, spread):
-        assert rows_of(other) == rows_of(one)
+        assert repr(rows_of(other)) == repr(rows_of(one))
         for mine, theirs in zip(one, other, strict=True):
             np.testing.assert_array_equal(mine.film.states, theirs.film.states)
 
@@ -178,7 +238,7 @@ def test_a_policy_with_pictures_gives_the_same_rows_for_any_batch():
     seeds, config = range(names.TEST_SEED, names.TEST_SEED + 3), TaskConfig("grasp", max_steps=5)
     one = evaluate(pixel_agent, config, seeds, batch=1, workers=1)
     many = evaluate(pixel_agent, config, seeds, batch=3, workers=1)
-    assert rows_of(one) == rows_of(many)
+    assert repr(rows_of(one)) == repr(rows_of(many))
     assert one[0].row.trajectory_length_mm > 0
 
 

@@ -43,15 +43,17 @@ class Gauge:
         self._plate = Plate(env.model)
         self._layout = PAIRS[env.scene.config.layout]
         self._chosen = env.scene.config.hole_pair - 1
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the last episode."""
         self.entry_error = self.exit_error = math.nan
         self.slip = self.turn = self.tissue_force = 0.0
         self.wrong_hole = False
 
     def begin(self) -> None:
-        """Forget the last episode; the env has just been reset."""
-        self.entry_error = self.exit_error = math.nan
-        self.slip = self.turn = self.tissue_force = 0.0
-        self.wrong_hole = False
+        """Start watching; the env has just been reset."""
+        self.forget()
         simulation = self._env.simulation
         self._pairs = [randomisation.shifted(pair, simulation.draws) for pair in self._layout]
         self._through = simulation.memory.passed >= 1.0
