@@ -134,7 +134,7 @@ def _parser(verb: str, text: str, module: Any) -> argparse.ArgumentParser:
     parser = _Parser(
         prog=f"{PROGRAM} {verb}",
         description=f"{text[0].upper()}{text[1:]}.",
-        epilog=f"example:\n  {module.EXAMPLE}",
+        epilog="\n\n".join([f"example:\n  {module.EXAMPLE}", *filter(None, [getattr(module, "NOTES", "")])]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )

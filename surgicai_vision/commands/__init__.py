@@ -1,7 +1,8 @@
 """The verbs, one file each, in the order of the flow.
 
 A verb's module holds `EXAMPLE` (one command line), `Options` (a frozen dataclass: the schema of its
-options and of its `--config` file) and `run(options, console) -> dict` (the result `--json` prints).
+options and of its `--config` file) and `run(options, console) -> dict` (the result `--json` prints). `NOTES`, where
+there are any, stand at the end of its `--help`.
 A verb that has verbs of its own is a folder with its own `VERBS`.
 """
 
@@ -13,6 +14,7 @@ VERBS = MappingProxyType(
         "doctor": "check this machine and say what to do",
         "scene": "show what every camera sees",
         "record-demos": "record demonstrations by the scripted expert",
+        "teleoperate": "record demonstrations by keyboard or gamepad",
         "import-demos": "read demonstrations of the original SurgicAI",
         "render-demos": "render demonstrations into a LeRobot dataset",
         "dataset": "check, repair, reduce or share a dataset",

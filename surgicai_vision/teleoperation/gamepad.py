@@ -1,0 +1,64 @@
+"""Gamepad: axes and buttons in the order of the W3C's standard gamepad become an `Input`.
+
+The same order serves a browser's Gamepad API as it is, and GLFW's gamepads after `window` put them in it.
+"""
+
+from collections.abc import Sequence
+from types import MappingProxyType
+
+from surgicai_vision.teleoperation.commands import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
+
+AXES, BUTTONS = 4, 16
+"""Left stick x y, right stick x y, each in [-1, 1], y downwards; and the buttons of the standard."""
+DEAD = 0.12
+"""Deflection below which a stick is at rest; worn sticks stay up to a tenth off."""
+PRESSED = 0.5
+_X, _LB, _RB, _LT, _RT, _UP, _DOWN = 2, 4, 5, 6, 7, 12, 13
+PRESSES = MappingProxyType({0: JAW, 3: VIEW, 8: STOP, 9: START, 14: DISCARD, 15: KEEP})
+"""Button → event."""
+
+
+class Gamepad:
+    """One gamepad; a `Device`."""
+
+    def __init__(self) -> None:
+        self._axes = [0.0] * AXES
+        self._buttons = [0.0] * BUTTONS
+        self._events: list[str] = []
+
+    def update(self, axes: Sequence[float], buttons: Sequence[float]) -> None:
+        """Take over the present state; shorter lists leave the rest at rest."""
+        self._axes = _filled(axes, AXES)
+        before, self._buttons = self._buttons, _filled(buttons, BUTTONS)
+        for index, event in PRESSES.items():
+            if before[index] < PRESSED <= self._buttons[index]:
+                self._events.append(event)
+
+    def release_all(self) -> None:
+        """Let everything go: the gamepad is away."""
+        self.update((), ())
+
+    def poll(self) -> Input:
+        """Return the present deflections, and the buttons pressed since the last call."""
+        x, y, across, upright = map(curve, self._axes)
+        button = self._buttons
+        events, self._events = tuple(self._events), []
+        down = [value >= PRESSED for value in button]
+        return Input(
+            move=(x, y, curve(button[_RT]) - curve(button[_LT])),
+            turn=(-upright, across, float(down[_RB]) - float(down[_LB])),
+            jaw=float(down[_UP]) - float(down[_DOWN]),
+            fine=down[_X],
+            events=events,
+        )
+
+
+def curve(deflection: float) -> float:
+    """Return the speed of a deflection: nothing near the middle, gentle beyond it, 1 at the end."""
+    share = max(0.0, (min(abs(deflection), 1.0) - DEAD) / (1.0 - DEAD))
+    return share * share if deflection > 0 else -share * share
+
+
+def _filled(values: Sequence[float], count: int) -> list[float]:
+    given = [float(value) for value in values[:count]]
+    return given + [0.0] * (count - len(given))

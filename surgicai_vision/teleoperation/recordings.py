@@ -1,0 +1,117 @@
+"""Recordings: the folder that teleoperation fills, an episode at a time.
+
+A folder of demonstrations like any other (`demos.store`), complete after every episode. `demos.json` also says which
+seeds were kept and which were given up; an episode whose entry a kill prevented is found by its file. The folder is
+locked while a session runs, so that two cannot write the same numbers.
+"""
+
+import fcntl
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision.config import TaskConfig, to_mapping
+from surgicai_vision.demos.store import MARKER, Demo, list_demos, read_demo, read_marker, write_demo, write_marker
+from surgicai_vision.errors import OutputExists, SurgicaiError
+from surgicai_vision.files import TEMPORARY, check_output, code_version
+
+SOURCE = "teleoperate"
+
+
+class Recordings:
+    """The episodes of one folder; made by `open_recordings`.
+
+    Args:
+        folder: where they lie.
+        request: what the folder is for; kept in its marker.
+        seeds: of the episodes that lie there, in their order.
+        skipped: seeds given up, {"seed", "reason"}.
+    """
+
+    def __init__(self, folder: Path, request: Mapping[str, Any], seeds: list[int], skipped: list[dict[str, Any]]):
+        self.folder, self._request = folder, request
+        self.seeds, self.skipped = seeds, skipped
+
+    @property
+    def next_seed(self) -> int:
+        """Return the first seed after all that were kept or given up."""
+        gone = [*self.seeds, *(row["seed"] for row in self.skipped)]
+        return max(gone, default=int(self._request["seed"]) - 1) + 1
+
+    def keep(self, demo: Demo) -> Path:
+        """Write an episode, whole or not at all."""
+        path = write_demo(self.folder, len(self.seeds), demo)
+        self.seeds.append(demo.seed)
+        self._note()
+        return path
+
+    def skip(self, seed: int, reason: str) -> None:
+        """Write down that no episode is wanted from `seed`."""
+        self.skipped.append({"seed": seed, "reason": reason})
+        self._note()
+
+    def _note(self) -> None:
+        details = {"request": self._request, "seeds": self.seeds, "skipped": self.skipped, "episodes": len(self.seeds)}
+        write_marker(self.folder, self._request["task"]["task"], SOURCE, code=code_version(), **details)
+
+
+@contextmanager
+def open_recordings(
+    folder: Path, config: TaskConfig, scene_hash: str, seed: int | None = None
+) -> Iterator[Recordings]:
+    """Open a folder to add episodes to, and keep others out of it meanwhile.
+
+    Args:
+        folder: made if it does not exist; removed again if nothing came into it.
+        config: the task; a folder holds one.
+        scene_hash: hash of the compiled scene.
+        seed: first seed of a new folder, 0 by default; an old one goes on where it is.
+
+    Raises:
+        OutputExists: the folder holds something else.
+        SurgicaiError: another session has it open.
+        BadFile: damaged episodes or marker.
+    """
+    check_output(folder, may_resume=MARKER)
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        _lock(descriptor, folder)
+        for leftover in folder.glob(f"{TEMPORARY}*"):
+            leftover.unlink(missing_ok=True)
+        recordings = _read(folder, config, scene_hash, seed)
+        yield recordings
+    finally:
+        os.close(descriptor)
+        if not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def _lock(descriptor: int, folder: Path) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise SurgicaiError(f"--out {folder}: another session is recording there; give another folder.") from None
+
+
+def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -> Recordings:
+    """Return what lies in a folder; an empty one begins at `seed`."""
+    request = {"task": to_mapping(config), "source": SOURCE, "scene": scene_hash, "seed": seed or 0}
+    if not (folder / MARKER).exists() and not any(folder.glob("episode_*")):
+        return Recordings(folder, request, [], [])
+    marker = read_marker(folder)
+    before = marker.get("request")
+    if seed is None and isinstance(before, dict):
+        request["seed"] = before.get("seed", 0)
+    if before != request:
+        raise OutputExists(
+            f"--out {folder} holds demonstrations of another command, task or scene (see {folder / MARKER}); "
+            "give another folder."
+        )
+    paths = list_demos(folder) if any(folder.glob("episode_*")) else []
+    seeds = list(marker["seeds"])
+    if len(seeds) != len(paths):  # killed between an episode and its entry
+        seeds = [read_demo(path).seed for path in paths]
+    return Recordings(folder, request, seeds, list(marker["skipped"]))
