@@ -20,7 +20,7 @@ class EncoderCard:
         source: hub repository, package or "seed" the weights come from.
         revision: revision of that repository, version of that package, or the seed.
         filename: the weights file's name there; None where no file exists.
-        sha256: the file's hash where it is known beforehand.
+        sha256: the file's hash; None is said as "unpinned": the hub's own hash is taken.
         licence: SPDX name of the weights' licence.
         offline: True when no download is ever needed.
         input_size: side of the square picture the network takes [px].

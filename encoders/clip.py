@@ -24,9 +24,9 @@ CARD = EncoderCard(
     name="clip",
     architecture="open_clip ViT-B-32, QuickGELU",
     source="timm/vit_base_patch32_clip_224.openai",
-    revision="main",
+    revision="a6f597a30f7b82c51704746581f9a4e41421e878",
     filename="open_clip_model.safetensors",
-    sha256=None,
+    sha256="e6d1bd7789aa45192b3bf90570a789b478bae1b74ebcce7eddd908e83a2b7c31",
     licence="MIT",
     offline=False,
     input_size=224,
@@ -38,7 +38,13 @@ CARD = EncoderCard(
     paper="Radford et al., CLIP, ICML 2021",
 )
 RN50 = replace(
-    CARD, name="clip-rn50", architecture="open_clip RN50, QuickGELU", source="timm/resnet50_clip.openai", dim=1024
+    CARD,
+    name="clip-rn50",
+    architecture="open_clip RN50, QuickGELU",
+    source="timm/resnet50_clip.openai",
+    revision="ec3d92cf63a5f9d591f0d611b736895966c73076",
+    sha256="da0baa37fb2211eee5729ab69ed587eb10d48f5b7076ceeed01552fc3d4cb4ee",
+    dim=1024,
 )
 
 ARCHIVES = MappingProxyType(

@@ -23,9 +23,9 @@ CARD = EncoderCard(
     name="imagenet",
     architecture="timm resnet50",
     source="timm/resnet50.tv_in1k",
-    revision="main",
+    revision="78f3ecfdb38e06d9b8397f662e7ab8fee96026fa",
     filename="model.safetensors",
-    sha256=None,
+    sha256="5d061a3c593d795bfe682d9b152bafbcf550579873492def3515b46db1189888",
     licence="BSD-3-Clause",
     offline=False,
     input_size=224,
@@ -62,6 +62,9 @@ class Variant:
 
 
 VARIANTS = (
+    Variant(
+        "model.safetensors", str(CARD.sha256), "timm resnet50.tv_in1k (torchvision IMAGENET1K_V1)", "BSD-3-Clause"
+    ),
     Variant("resnet50-0676ba61.pth", "0676ba61", "torchvision ResNet50_Weights.IMAGENET1K_V1", "BSD-3-Clause"),
     Variant("resnet50-11ad3fa6.pth", "11ad3fa6", "torchvision ResNet50_Weights.IMAGENET1K_V2", "BSD-3-Clause"),
     Variant(
@@ -107,7 +110,7 @@ def classifier(card: EncoderCard, path: Path) -> "tuple[EncoderCard, nn.Module]"
         licence=variant.licence,
         mean=variant.mean,
         interpolation=variant.interpolation,
-        note="" if variant is VARIANTS[0] else "Not the weights of the paper (torchvision V1).",
+        note="" if variant in VARIANTS[:2] else "Not the weights of the paper (torchvision V1).",
     ), network
 
 

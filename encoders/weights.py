@@ -3,9 +3,9 @@
 Interface:
 
 * `find(card, weights, accept_licence) -> Path | None`: in this order: the file given, the folder of
-  `SURGICAI_VISION_WEIGHTS`, the hub's cache, a download (resumed where one was broken off). Whatever was
-  not handed over by name is checked against the card's hash. Without a network it raises `MissingWeights`
-  within seconds.
+  `SURGICAI_VISION_WEIGHTS`, the hub's cache, a download into our own cache (resumed where one was broken off).
+  Whatever was not handed over by name is checked against the card's hash; a card without one ("unpinned") takes
+  the hash the hub itself gives. Without a network it raises `MissingWeights` within seconds.
 
 In the folder of `SURGICAI_VISION_WEIGHTS` a file is looked for as `<encoder>/<filename>`,
 `<encoder>.<suffix>` and `<filename>`.
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from encoders.card import EncoderCard
 from surgicai_vision.errors import BadFile, InputError, MissingWeights
-from surgicai_vision.files import sha256_file
+from surgicai_vision.files import cache_root, sha256_file
 
 FOLDER_VARIABLE = "SURGICAI_VISION_WEIGHTS"
 NON_COMMERCIAL = "-NC"
@@ -57,19 +57,21 @@ def find(
     if card.filename is None or card.source.startswith("PyPI"):
         return None
     wanted = {card.filename: card.sha256, **(known or {})}
-    found = _in_folder(card, wanted) or _in_hub_cache(card) or _downloaded(card)
+    found, problem = _in_folder(card, wanted) or _in_hub_cache(card), ""
     if found is None:
-        raise MissingWeights(missing_line(card, offline_encoders))
+        found, problem = _downloaded(card)
+    if found is None:
+        raise MissingWeights(missing_line(card, offline_encoders, problem))
     return found
 
 
-def missing_line(card: EncoderCard, offline_encoders: tuple[str, ...]) -> str:
-    """Say in one line which file is wanted, from where, and what works without it."""
+def missing_line(card: EncoderCard, offline_encoders: tuple[str, ...], problem: str = "") -> str:
+    """Say in one line which file is wanted, from where, what went wrong, and what works without it."""
     return (
         f"Encoder '{card.name}' needs {card.filename} of the hub repository {card.source} "
-        f"(revision {card.revision}, sha256 {card.sha256 or 'not known beforehand'}), and it is neither here nor "
-        f"downloadable; hand it over with --weights FILE or put it in the folder ${FOLDER_VARIABLE}. "
-        f"Encoders that work offline: {', '.join(offline_encoders)}."
+        f"(revision {card.revision}, sha256 {card.sha256 or 'unpinned'}), and it is neither here nor "
+        f"downloadable{f' ({problem})' if problem else ''}; hand it over with --weights FILE or put it in the folder "
+        f"${FOLDER_VARIABLE}. Encoders that work offline: {', '.join(offline_encoders)}."
     )
 
 
@@ -112,22 +114,31 @@ def _in_hub_cache(card: EncoderCard) -> Path | None:
     """Look in the hub's cache; nothing is requested."""
     from huggingface_hub import try_to_load_from_cache
 
-    found = try_to_load_from_cache(card.source, str(card.filename))
-    return _check_blob(card, Path(found)) if isinstance(found, str) else None
+    for revision in (card.revision, None):
+        found = try_to_load_from_cache(card.source, str(card.filename), revision=revision)
+        if isinstance(found, str):
+            return _check_blob(card, Path(found))
+    return None
 
 
-def _downloaded(card: EncoderCard) -> Path | None:
-    """Fetch from the hub when it answers at all; the client resumes a broken-off download."""
-    from huggingface_hub import hf_hub_download
+def _downloaded(card: EncoderCard) -> tuple[Path | None, str]:
+    """Return what was downloaded before, or fetch it when the hub answers at all; else None and why."""
+    from encoders.download import BrokenOff, fetch
 
+    folder = cache_root() / "weights" / card.source.replace("/", "--") / card.revision
+    target = folder / str(card.filename)
+    if target.is_file():
+        return check_hash(target, card.sha256), ""
     if not hub_answers():
-        return None
+        return None, ""
     try:
-        return _check_blob(card, Path(hf_hub_download(card.source, str(card.filename))))
+        return fetch(card.source, card.revision, str(card.filename), card.sha256, folder), ""
     except BadFile:
         raise
-    except Exception:  # whatever the network did, the answer to the user is the same line
-        return None
+    except BrokenOff as error:
+        return None, f"{error}; what has come is kept, and the same command goes on"
+    except Exception as error:  # whatever the network did, the answer to the user is the same line
+        return None, (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
 
 
 @functools.cache

@@ -254,12 +254,13 @@ def probe_encoders() -> Finding:
     found: Finding = {}
     for name in registry.encoder_names():
         card = registry.encoder_card(name)
+        unpinned = "" if card.sha256 else " (unpinned: the hub's own hash is taken)"
         try:
             path = registry.find_weights(name, accept_licence=True)
             detail = str(path) if path else f"{card.source} {card.revision}, always at hand"
-            found[name] = {"at_hand": True, "detail": detail}
+            found[name] = {"at_hand": True, "detail": f"{detail}{unpinned if path else ''}"}
         except MissingWeights:
-            found[name] = {"at_hand": False, "detail": f"{card.filename} of {card.source} is not here"}
+            found[name] = {"at_hand": False, "detail": f"{card.filename} of {card.source} is not here{unpinned}"}
         except SurgicaiError as error:
             found[name] = {"at_hand": False, "detail": str(error)}
     return found

@@ -19,12 +19,11 @@ A process killed at any moment leaves `progress.json` behind its rows, and the n
 """
 
 import fcntl
-import os
 import shutil
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,9 +32,8 @@ import numpy as np
 from surgicai_vision import __version__
 from surgicai_vision.config import digest, to_mapping
 from surgicai_vision.errors import BadFile, InputError, SurgicaiError, UnknownName
-from surgicai_vision.files import read_json, write_json
+from surgicai_vision.files import CACHE_VARIABLE, cache_root, read_json, write_json
 
-CACHE_VARIABLE = "SURGICAI_VISION_CACHE"
 FORMAT = 1
 CHUNK = 256  # frames per progress step: 38 MB of pictures at 224 × 224
 MANIFEST, PROGRESS, ROWS = "manifest.json", "progress.json", "features.npy"
@@ -100,10 +98,13 @@ class Features:
         """Length of one row."""
         return self.rows.shape[1]
 
+    def first(self, length: int, dataset: str) -> "Features":
+        """Return the first `length` rows as the features of that part, whose fingerprint is `dataset`; no copy."""
+        manifest = {**self.manifest, "length": length, "dataset": dataset}
+        return replace(self, manifest=manifest, rows=self.rows[:length])
 
-def default_cache_root() -> Path:
-    """Return $SURGICAI_VISION_CACHE, or ~/.cache/surgicai-vision."""
-    return Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "surgicai-vision")
+
+default_cache_root = cache_root
 
 
 def entry_key(dataset: FrameSource, view: str, encoder: FrameEncoder) -> str:
@@ -140,8 +141,9 @@ def encode(
         InputError: a cache folder that cannot be written.
         SurgicaiError: a feature that is not finite.
     """
-    if view not in dataset.views:
-        raise UnknownName("view of this dataset", view, dataset.views)
+    sights = getattr(dataset, "sights", dataset.views)
+    if view not in sights:
+        raise UnknownName("view of this dataset", view, sights)
     if not dataset.length:
         raise InputError("The dataset holds no frames; record and render some first.")
     folder = (cache_root or default_cache_root()) / "features" / entry_key(dataset, view, encoder)

@@ -18,6 +18,7 @@ from typing import Any
 from surgicai_vision import __version__
 from surgicai_vision.errors import BadFile, InputError, OutputExists
 
+CACHE_VARIABLE = "SURGICAI_VISION_CACHE"
 TEMPORARY = ".partial-"
 """Prefix of temporary names; anything so named may be deleted when no process writes."""
 
@@ -135,6 +136,11 @@ def code_version(*stages: str) -> str:
         if not stages or stage in (*stages, "names", "config"):
             digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes() + b"\0")
     return f"{__version__}+{digest.hexdigest()[:12]}"
+
+
+def cache_root() -> Path:
+    """Return $SURGICAI_VISION_CACHE, or ~/.cache/surgicai-vision."""
+    return Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "surgicai-vision")
 
 
 def configs_folder() -> Path:
