@@ -141,7 +141,7 @@ class PolicyAgent:
         name: how tables call it.
         policy: has `act(features (B, F) or None, agent_pos (B, 7)) -> (B, 7)`.
         encoder: frames (B, H, W, 3) → features (B, dim), or None for a policy without pictures.
-        cameras: the policy's views, in the order of its features.
+        views: the policy's views, in the order of its features.
         image_size: height and width the policy was trained on [px].
         vector: what it is fed beside its features, a key of `VECTORS`.
     """
@@ -151,11 +151,13 @@ class PolicyAgent:
         name: str,
         policy: Any,
         encoder: Any,
-        cameras: tuple[str, ...],
+        views: tuple[str, ...],
         image_size: int,
         vector: str = names.STATE,
     ):
-        self.name, self.cameras, self.image_size = name, cameras, image_size
+        self.name, self.views, self.image_size = name, views, image_size
+        self.cameras = tuple(dict.fromkeys(map(names.camera_of, views)))
+        self.depth = any(view in names.DEPTH_VIEWS for view in views)
         self._policy, self._encoder, self._vector = policy, encoder, VECTORS[vector]
         self._shared: Shared | None = None
 
@@ -182,15 +184,25 @@ class PolicyAgent:
             return None
         if self._shared is None:
             return self._encode(observations)
-        known = self._shared.setdefault((self._encoder.fingerprint, self.cameras), {})
+        known = self._shared.setdefault((self._encoder.fingerprint, self.views), {})
         new = [observation for observation in observations if id(observation) not in known]
         if new:
             known.update(zip(map(id, new), self._encode(new), strict=True))
         return np.stack([known[id(observation)] for observation in observations])
 
     def _encode(self, observations: Sequence[Any]) -> NDArray[np.float32]:
-        frames = np.stack([o["pixels"][view] for o in observations for view in self.cameras])
+        frames = np.stack([_frame(o, view) for o in observations for view in self.views])
         return np.asarray(self._encoder(frames), np.float32).reshape(len(observations), -1)
+
+
+def _frame(observation: Any, view: str) -> NDArray[np.uint8]:
+    """Return what a policy sees of a view, (H, W, 3)."""
+    if view in names.DEPTH_VIEWS:
+        from surgicai_vision.dataset.pictures import grey
+
+        return grey(observation["depth"][names.camera_of(view)])
+    frame: NDArray[np.uint8] = observation["pixels"][view]
+    return frame
 
 
 @final
@@ -204,6 +216,7 @@ class NoisyAgent:
 
     def __init__(self, agent: Any, noise: float):
         self.name, self.cameras, self.image_size = agent.name, agent.cameras, agent.image_size
+        self.depth = agent.depth
         self._agent, self._noise = agent, noise
         self._generators: dict[int, np.random.Generator] = {}
 

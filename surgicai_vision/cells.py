@@ -16,11 +16,14 @@ from surgicai_vision.agents import BASELINES, NoisyAgent, PolicyAgent, ReplayAge
 from surgicai_vision.config import DEVIATIONS, Deviations, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.evaluation import Agent, MakeAgent, evaluate
+from surgicai_vision.executor import LOCAL, Engine
 from surgicai_vision.provenance import command_line, provenance
 from surgicai_vision.results import MARKER, write_evaluation
 
 Stage = Callable[[str, str], AbstractContextManager[Callable[..., None]]]
 """stage(title, unit) is a context that yields progress(done, total): a bar on the console, or nothing."""
+OWN = "own"
+"""Stands for an encoder: a network of the policy's own, trained with it on the pictures."""
 ROUNDS = 3
 """Evaluations of one trained policy in the released code, 20 episodes each."""
 
@@ -31,7 +34,8 @@ class Cell:
 
     Attributes:
         task: one of `names.TASKS`.
-        encoder: encoder's name, or None for a policy without pictures.
+        encoder: encoder's name; `OWN` for a policy that trains a network of its own on the pictures; None for a policy
+            without pictures.
         view: its views, in the order of the features; empty without pictures.
         seed: training seed.
         policy: policy's name.
@@ -40,6 +44,9 @@ class Cell:
         privileged: see the goal in place of all else: the ceiling.
         epochs: passes over the training frames; None takes the recipe's.
         deviations: switches of `config.Deviations` that are on; None takes the recipe's.
+        demonstrations: train on the first so many demonstrations; None takes all.
+        chain: how subtasks end, where this is a high-level policy over a policy a subtask (`chain.TERMINATIONS`).
+        swap: the subtask of such a chain that the expert does.
     """
 
     task: str
@@ -52,11 +59,18 @@ class Cell:
     privileged: bool = False
     epochs: int | None = None
     deviations: tuple[str, ...] | None = None
+    demonstrations: int | None = None
+    chain: str | None = None
+    swap: str | None = None
 
     def __post_init__(self) -> None:
         check_name("task", self.task, names.TASKS)
+        if self.chain and any(view in names.DEPTH_VIEWS for view in self.view):
+            raise InputError(f"A chain sees no depth views ({', '.join(self.view)}); give views in colour.")
+        if self.swap:
+            check_name("subtask", self.swap, names.SUBTASKS)
         for view in self.view:
-            check_name("view", view, names.CAMERAS)
+            check_name("view", view, names.VIEWS)
         if (self.encoder is None) != (not self.view):
             raise InputError(f"encoder '{self.encoder}' with views {list(self.view)}; give both or neither.")
         for switch in self.deviations or ():
@@ -65,7 +79,9 @@ class Cell:
     @property
     def name(self) -> str:
         """How tables and folders call the policy."""
-        return policy_name(self.encoder, self.view, self.pool, self.privileged, self.policy, self.recipe_label)
+        name = policy_name(self.encoder, self.view, self.pool, self.privileged, self.policy, self.recipe_label)
+        chain = f"chain-{self.chain}-" if self.chain else ""
+        return f"{chain}{name}" + (f"-swap-{self.swap}" if self.swap else "")
 
     @property
     def changes(self) -> dict[str, Any]:
@@ -80,9 +96,10 @@ class Cell:
     @property
     def recipe_label(self) -> str:
         """The recipe's name and what is changed in it."""
-        epochs = () if self.epochs is None else (f"{self.epochs}epochs",)
+        counts = ((self.epochs, "epochs"), (self.demonstrations, "demos"))
+        changed = tuple(f"{count}{unit}" for count, unit in counts if count is not None)
         switches = ("none",) if self.deviations == () else self.deviations or ()
-        return "+".join((Path(self.recipe).stem, *switches, *epochs))
+        return "+".join((Path(self.recipe).stem, *switches, *changed))
 
 
 @dataclass(frozen=True)
@@ -128,17 +145,20 @@ def prepare_dataset(
     size: int,
     depth: bool,
     workers: int,
+    engine: Engine = LOCAL,
 ) -> Path:
     """Record demonstrations into `folder`/demos and render them into `folder`/dataset; return the latter."""
     from surgicai_vision.dataset import render_demos
     from surgicai_vision.demos.record import record
 
     with stage(f"demos: {demonstrations} of {config.task}", "episodes") as progress:
-        record(config, episodes=demonstrations, out=folder / "demos", workers=workers, progress=progress)
+        record(
+            config, episodes=demonstrations, out=folder / "demos", workers=workers, engine=engine, progress=progress
+        )
     with stage(f"dataset: {', '.join(views)} at {size} px", "frames") as progress:
         render_demos(
             folder / "demos", folder / "dataset", views=views, size=size, depth=depth, workers=workers,
-            progress=progress,
+            engine=engine, progress=progress,
         )  # fmt: skip
     return folder / "dataset"
 
@@ -169,23 +189,43 @@ def train_cell(
         log: called with (epoch, losses by name).
     """
     from surgicai_vision import registry
-    from surgicai_vision.features import encode
+    from surgicai_vision.dataset.part import first_episodes
     from surgicai_vision.training import train
 
-    recipe, features = registry.load_recipe(cell.policy, cell.recipe, cell.changes), []
+    recipe = registry.load_recipe(cell.policy, cell.recipe, cell.changes)
     begin = registry.load_policy(start) if start else None
-    beside: dict[str, bytes] = {}
-    if cell.encoder:
-        encoder, beside = _encoder(cell, recipe.deviations, dataset, stage, weights, accept_licence)
-        for view in cell.view:
-            with stage(f"features: {cell.encoder}, {view}", "frames") as progress:
-                features.append(encode(dataset, view, encoder, progress=progress))
+    features, beside = encode_cell(cell, dataset, stage, weights, accept_licence=accept_licence)
+    if cell.demonstrations is not None:
+        dataset = first_episodes(dataset, cell.demonstrations)
+        features = [entry.first(dataset.length, dataset.fingerprint) for entry in features]
     with stage(f"policy: {cell.name}", "epochs") as progress:
         plugin = registry.policy_plugin(cell.policy)
         train(
             dataset, features, plugin, recipe, seed=cell.seed, out=out, progress=progress,
             recipe_name=cell.recipe_label, start=begin, save_every=save_every, log=log, beside=beside,
         )  # fmt: skip
+
+
+def encode_cell(
+    cell: Cell, dataset: Any, stage: Stage, weights: str | None = None, *, accept_licence: bool = False
+) -> tuple[list[Any], dict[str, bytes]]:
+    """Encode the cell's views, all frames of the dataset, or find them in the cache.
+
+    Returns:
+        The features of each view, and what of the encoder the checkpoint has to keep.
+    """
+    if not cell.encoder:
+        return [], {}
+    from surgicai_vision import registry
+    from surgicai_vision.features import encode
+
+    deviations = registry.load_recipe(cell.policy, cell.recipe, cell.changes).deviations
+    encoder, beside = _encoder(cell, deviations, dataset, stage, weights, accept_licence)
+    features = []
+    for view in cell.view:
+        with stage(f"features: {cell.encoder}, {view}", "frames") as progress:
+            features.append(encode(dataset, view, encoder, progress=progress))
+    return features, beside
 
 
 def _encoder(
@@ -246,11 +286,11 @@ def evaluate_into(
     cuts = range(0, len(wins), size)
     rounds = {"rounds": [sum(wins[at : at + size]) for at in cuts]} if subject.rounds > 1 else {}
     about = {
+        "command": command_line(),
+        "provenance": provenance(),
         **subject.about,
         **rounds,
         "task_config": to_mapping(subject.config),
-        "command": command_line(),
-        "provenance": provenance(),
     }
     return {**write_evaluation(out, episodes, about), **rounds}
 

@@ -32,6 +32,9 @@ ACTIVE_ARM = MappingProxyType({"grasp": PSM2, "place": PSM2, "insert": PSM2, "ha
 """Subtask → the arm its action moves."""
 
 CAMERAS = ("front", "front_right", "back", "wrist_psm1", "wrist_psm2")
+DEPTH_VIEWS = tuple(f"{camera}_depth" for camera in CAMERAS)
+"""What a policy may see of a camera in the place of colours: its depth as a grey picture (`dataset.pictures.grey`)."""
+VIEWS = (*CAMERAS, *DEPTH_VIEWS)
 RGB, DEPTH, SEGMENTATION = "rgb", "depth", "segmentation"
 MODALITIES = (RGB, DEPTH, SEGMENTATION)
 PARTS = ("background", "phantom", "needle", "thread", "psm1", "psm2")
@@ -70,6 +73,11 @@ FPS = 50
 
 TRAIN_SEED, VALIDATION_SEED, TEST_SEED = 0, 500_000, 900_000
 """First seed of each bank of start states; the banks never meet (fewer than 400,000 seeds each)."""
+
+
+def camera_of(view: str) -> str:
+    """Return the camera of a view."""
+    return view.removesuffix("_depth")
 
 
 def image_key(view: str) -> str:

@@ -7,11 +7,11 @@ from typing import Any
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import option, positive, read_yaml
+from surgicai_vision.commands.options import address_option, executor_option, option, positive, read_yaml
 from surgicai_vision.config import from_mapping
 from surgicai_vision.errors import BadFile, UnknownName
 from surgicai_vision.files import configs_folder
-from surgicai_vision.sweep import Grid
+from surgicai_vision.sweep import AXES, Grid
 
 EXAMPLE = "surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/smoke --json"
 
@@ -24,26 +24,27 @@ class Options:
     out: str | None = option(
         None, "folder to make or to continue", metavar="DIR", default_text="outputs/sweeps/<name of the grid>"
     )
-    dry_run: bool = option(False, "list the cells and do no work")
-    workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
+    dry_run: bool = option(False, "list the cells, what is there already and about how long the rest takes; no work")
+    workers: int = option(
+        folders.CORES, "cells at a time; the results do not depend on it", check=positive, metavar="N"
+    )
+    attempts: int = option(3, "how often a cell is started whose process is killed", check=positive, metavar="N")
+    executor: str = executor_option()
+    address: str | None = address_option()
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Run the sweep, or list its cells."""
-    from surgicai_vision.sweep import plan, run_sweep
+    from surgicai_vision.executor import Engine
+    from surgicai_vision.sweep import run_sweep
 
     path = grid_file(options.grid)
     grid = read_grid(path)
     out = Path(options.out) if options.out else folders.OUTPUTS / "sweeps" / path.stem
+    engine = Engine(options.executor, options.address)
     if options.dry_run:
-        states = plan(grid, out)
-        for state in states:
-            line = f"{state.state:<8} {state.key}  {state.cell.task}, {state.cell.name}, seed {state.cell.seed}"
-            console.say(f"{line}: {state.reason}" if state.reason else line)
-        known = ("to do", "cached", "not run")
-        counts = {name.replace(" ", "_"): sum(state.state == name for state in states) for name in known}
-        return {"cells": len(states), **counts, "dry_run": True}
-    result = run_sweep(grid, out, console.stage, options.workers)
+        return _list(grid, out, options.workers, console)
+    result = run_sweep(grid, out, console.stage, options.workers, engine, options.attempts)
     for line in result.pop("problems"):
         console.say(line)
     told = ", ".join(f"{result[name]} {name.replace('_', ' ')}" for name in ("done", "cached", "failed", "not_run"))
@@ -51,10 +52,38 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     return {**result, "exit_code": 1 if result["failed"] else 0}
 
 
+def _list(grid: Grid, out: Path, workers: int, console: Console) -> dict[str, Any]:
+    """Say what each cell is, and how long the rest takes."""
+    from surgicai_vision.sweep import estimate, plan
+
+    states = plan(grid, out)
+    for state in states:
+        line = f"{state.state:<8} {state.key}  {state.where}"
+        console.say(f"{line}: {state.reason}" if state.reason else line)
+    counts = {name.replace(" ", "_"): sum(state.state == name for state in states) for name in STATES}
+    time = estimate(grid, out, states, workers)
+    console.say(
+        f"{len(states)} cells: {', '.join(f'{counts[key]} {key.replace("_", " ")}' for key in counts)}; about "
+        f"{_duration(time['seconds'])} with {workers} workers ({time['source']})."
+    )
+    return {"cells": len(states), **counts, "seconds": time["seconds"], "dry_run": True}
+
+
+STATES = ("to do", "cached", "not run")
+
+
+def _duration(seconds: float) -> str:
+    """Write a duration as people do."""
+    for size, unit in ((86400, "days"), (3600, "hours"), (60, "minutes")):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} seconds"
+
+
 def grid_file(given: str) -> Path:
     """Find a grid: a file, or the name or repository path of a shipped one."""
     path, folder = Path(given), configs_folder() / "sweep"
-    if path.exists():
+    if path.is_file():
         return path
     shipped = {file.stem: file for file in folder.glob("*.yaml")}
     if given in (path.stem, f"configs/sweep/{path.name}") and path.stem in shipped:
@@ -65,10 +94,13 @@ def grid_file(given: str) -> Path:
 
 
 def read_grid(path: Path) -> Grid:
-    """Read a grid; a view set may be written as a list or as "front,back"."""
+    """Read a grid; a view set may be written as a list or as "front,back", an axis of one value without brackets."""
     table = read_yaml(path)
     if isinstance(table.get("view"), list):
         table["view"] = [view.split(",") if isinstance(view, str) else view for view in table["view"]]
+    for name in AXES:
+        if name in table and isinstance(table[name], (str, int)):
+            table[name] = [table[name]]
     for name in ("task", "encoder", "view"):
         table.setdefault(name, [])
     return from_mapping(Grid, table, str(path))

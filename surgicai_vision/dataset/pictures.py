@@ -24,6 +24,17 @@ def encode(frame: np.ndarray) -> bytes:
     return content.tobytes()
 
 
+DEPTH_NEAR, DEPTH_FAR = 0.02, 0.22
+"""Depths that a grey picture tells apart [m], in steps of 0.8 mm: all of the needle, the instruments and the phantom's
+middle in every camera (measured: 0.029 to 0.163 m)."""
+
+
+def grey(depth: np.ndarray) -> np.ndarray:
+    """Return depth (…, 1) float32 [m] as a picture (…, 3) uint8 of three equal channels, near is dark."""
+    share = (depth - DEPTH_NEAR) * (255 / (DEPTH_FAR - DEPTH_NEAR))
+    return np.repeat(np.clip(np.rint(share), 0, 255).astype(np.uint8), 3, axis=-1)
+
+
 def decode(content: Any, where: str) -> np.ndarray:
     """Decode the buffer of a picture to (H, W, 3) uint8 RGB or (H, W, 1) float32.
 

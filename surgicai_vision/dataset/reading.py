@@ -101,6 +101,12 @@ class Dataset:
         return self._column("episode_index")
 
     @property
+    def sights(self) -> tuple[str, ...]:
+        """What `frames` shows: the views, and their depth views where depth was rendered."""
+        depth = tuple(view for view in names.DEPTH_VIEWS if names.camera_of(view) in self.views)
+        return self.views + (depth if self.has_depth else ())
+
+    @property
     def video_keys(self) -> frozenset[str]:
         """Picture columns that are videos."""
         return frozenset(map(names.image_key, self.views)) if self.video else frozenset()
@@ -115,7 +121,9 @@ class Dataset:
         return {key: self._column(key) for key in (*layout.COLUMNS, "frame_index", "timestamp", "index")}
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Return the RGB pictures of a view, (stop - start, H, W, 3) uint8."""
+        """Return the RGB pictures of a view, or a depth view's grey ones, (stop - start, H, W, 3) uint8."""
+        if view in names.DEPTH_VIEWS:
+            return pictures.grey(self.depth(names.camera_of(view), start, stop))
         return self._pictures(names.image_key(self._view(view)), start, stop)
 
     def depth(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:

@@ -30,12 +30,21 @@ class JobKind:
     packages: tuple[str, ...] = ("mujoco", "numpy")
 
 
+_DATA = ("scene", "envs", "demos", "dataset")
+_LEARN = (*_DATA, "features", "released", "training", "checkpoint", "registry", "cells", "encoders", "policies")
+_CELL = (*_LEARN, "sweep", "agents", "evaluation", "chain", "lerobot_agent")
+_NUMERIC = ("mujoco", "numpy", "torch", "timm", "lerobot")
+
 JOBS: Mapping[str, JobKind] = MappingProxyType(
     {
         "record-episode": JobKind("surgicai_vision.demos.record:record_episode", ("scene", "envs", "demos")),
         "render-episode": JobKind(
             "surgicai_vision.dataset.rendering:render_episode", ("scene", "envs", "demos", "dataset")
         ),
+        "sweep-features": JobKind("surgicai_vision.sweep.jobs:encode_features", _LEARN, _NUMERIC),
+        "sweep-policy": JobKind("surgicai_vision.sweep.jobs:train_policy", _LEARN, _NUMERIC),
+        "sweep-cell": JobKind("surgicai_vision.sweep.jobs:run_cell", _CELL, _NUMERIC),
+        "sweep-reference": JobKind("surgicai_vision.sweep.jobs:run_reference", _CELL, _NUMERIC),
     }
 )
 

@@ -11,7 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, final
@@ -101,10 +101,8 @@ class _Worker:
     def begin(self, key: str, function: str, arguments: dict[str, Any], destination: Path) -> None:
         """Hand it a job."""
         self.key = key
-        try:
+        with suppress(OSError):  # dead already: `result` says so
             self.connection.send((function, arguments, destination))
-        except OSError:  # dead already; `result` says so
-            pass
 
     def result(self) -> tuple[int, str, str] | None:
         """Return what the job reported and free the worker; `EOFError` where the process died."""

@@ -1,0 +1,163 @@
+"""Grid: what a sweep's YAML file says, and the cells it stands for."""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from surgicai_vision import names, registry
+from surgicai_vision.cells import OWN, Cell
+from surgicai_vision.chain import TERMINATIONS
+from surgicai_vision.config import digest, to_mapping
+from surgicai_vision.errors import InputError, check_name
+from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES
+
+AXES = ("task", "encoder", "view", "recipe", "policy", "deviation", "demonstrations", "seed", "chain")
+"""Keys of a grid that hold lists; one value alone may be written without brackets."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A sweep's configuration: every combination of its axes, and what all cells share.
+
+    Attributes:
+        task: tasks.
+        encoder: encoders; `own` for policies that train a network of their own on the pictures (`act`, `diffusion`).
+        view: view sets, each a list of views.
+        seed: training seeds.
+        policy: policies: those of `train`, and LeRobot's `act` and `diffusion`.
+        recipe: recipes of the former.
+        pool: what is taken from the encoders.
+        deviation: sets of `config.Deviations` switches to be on; none takes the recipe's.
+        demonstrations: numbers of the expert's demonstrations of each task; the smaller set lies within the larger.
+        chain: add, for the whole procedure, a high-level policy over a policy for each subtask, by how subtasks end:
+            `privileged` or `learned`.
+        swap: add each such chain with the expert in the place of each subtask's policy.
+        accept_licence: accept weights under a non-commercial licence.
+        proprioception: add a cell without pictures for each task and seed.
+        state: add a cell that sees the state with the goal, the ceiling, for each task and seed.
+        expert: evaluate the expert on each task beside the cells.
+        replay: evaluate blind replay of the mean demonstration too.
+        probe: probe the encoders' features for the needle's pose, where the command `probe` is there.
+        epochs: passes over the frames; none takes the recipe's.
+        steps: updates of LeRobot's policies.
+        batch: their batch size.
+        episodes: held-out starts of each evaluation.
+        size: height and width of pictures [px].
+        depth: render depth beside RGB; done by itself where a view is a depth view.
+    """
+
+    task: tuple[str, ...]
+    encoder: tuple[str, ...]
+    view: tuple[tuple[str, ...], ...]
+    seed: tuple[int, ...] = (0,)
+    policy: tuple[str, ...] = ("bc",)
+    recipe: tuple[str, ...] = ("paper",)
+    pool: str = "global"
+    deviation: tuple[tuple[str, ...], ...] = ()
+    demonstrations: tuple[int, ...] = (50,)
+    chain: tuple[str, ...] = ()
+    swap: bool = False
+    accept_licence: bool = False
+    proprioception: bool = False
+    state: bool = False
+    expert: bool = True
+    replay: bool = False
+    probe: bool = False
+    epochs: int | None = None
+    steps: int = 2000
+    batch: int = 8
+    episodes: int = 20
+    size: int = 224
+    depth: bool = False
+
+    def __post_init__(self) -> None:
+        for name in self.encoder:
+            if name != OWN:
+                registry.check_encoder_name(name)
+        for name in self.policy:
+            check_name("policy", name, (*registry.POLICIES, *LEROBOT_POLICIES))
+        for name in self.chain:
+            check_name("termination", name, TERMINATIONS)
+        numbers = [(name, getattr(self, name)) for name in ("episodes", "size", "steps", "batch")]
+        for name, number in [*numbers, *(("demonstrations", number) for number in self.demonstrations)]:
+            if number < 1:
+                raise InputError(f"{name} is {number}; it must be at least 1.")
+        if not self.demonstrations:
+            raise InputError("demonstrations is empty; give at least one number.")
+        if not self.cells or len(set(self.cells)) != len(self.cells):
+            raise InputError(f"The grid has {len(self.cells)} cells, {len(set(self.cells))} of them different.")
+
+    @property
+    def cells(self) -> list[Cell]:
+        """The cells, in the order of the grid."""
+        cells: list[Cell] = []
+        for task, seed, count in itertools.product(self.task, self.seed, self.demonstrations):
+            common: dict[str, Any] = {"seed": seed, "epochs": self.epochs}
+            if len(self.demonstrations) > 1:
+                common["demonstrations"] = count
+            for policy in self.policy:
+                cells += self._of_policy(policy, task, common)
+            if task == names.SUTURE:
+                cells += self._chains(common)
+        return cells
+
+    def _of_policy(self, policy: str, task: str, common: dict[str, Any]) -> Iterator[Cell]:
+        """Yield the cells of a policy on a task."""
+        ours = policy not in LEROBOT_POLICIES
+        recipes = self.recipe if ours else ("paper",)
+        switches = self.deviation if ours and self.deviation else (None,)
+        for encoder, view, recipe, on in itertools.product(self.encoder, self.view, recipes, switches):
+            if ours and encoder == OWN:
+                continue  # `own` is for policies that see pictures themselves
+            pool = self.pool if ours else "global"
+            yield Cell(task, encoder, view, policy=policy, recipe=recipe, pool=pool, deviations=on, **common)
+        for recipe in recipes if ours else ():
+            if self.proprioception:
+                yield Cell(task, None, (), policy=policy, recipe=recipe, **common)
+            if self.state:
+                yield Cell(task, None, (), policy=policy, recipe=recipe, privileged=True, **common)
+
+    def _chains(self, common: dict[str, Any]) -> Iterator[Cell]:
+        """Yield the chains over the whole procedure."""
+        encoders = [encoder for encoder in self.encoder if encoder != OWN]
+        for end, encoder, view, recipe in itertools.product(self.chain, encoders, self.view, self.recipe):
+            whole = Cell(names.SUTURE, encoder, view, recipe=recipe, pool=self.pool, chain=end, **common)
+            yield whole
+            if self.swap:
+                yield from (replace(whole, swap=subtask) for subtask in names.SUBTASKS)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Every view some cell needs."""
+        return tuple(view for view in names.VIEWS if any(view in view_set for view_set in self.view))
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Every camera that is rendered."""
+        needed = {names.camera_of(view) for view in self.views}
+        return tuple(camera for camera in names.CAMERAS if camera in needed)
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth is rendered."""
+        return self.depth or any(view in names.DEPTH_VIEWS for view in self.views)
+
+    @property
+    def recorded(self) -> int:
+        """Demonstrations recorded of each task: the largest number; cells with fewer train on the first of them."""
+        return max(self.demonstrations)
+
+    def key(self, cell: Cell) -> str:
+        """Return the digest of everything that decides what a cell is."""
+        lerobot = {"steps": self.steps, "batch": self.batch} if cell.policy in LEROBOT_POLICIES else {}
+        shared = {name: getattr(self, name) for name in ("episodes", "size", "depth")}
+        shared |= {"views": list(self.views), "demonstrations": self.recorded, **lerobot}
+        return digest({"cell": to_mapping(cell), **shared})[:16]
+
+
+def chain_parts(cell: Cell) -> dict[str, Cell]:
+    """Return the policies a chain is made of: "hlp" and those of its subtasks but for the one swapped."""
+    alone = replace(cell, chain=None, swap=None)
+    low = {subtask: replace(alone, task=subtask) for subtask in names.SUBTASKS if subtask != cell.swap}
+    return {"hlp": replace(alone, policy="hlp"), **low}

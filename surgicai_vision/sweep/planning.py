@@ -1,0 +1,199 @@
+"""Planning: which cells there are, what stands in the folder already, and the job that makes each."""
+
+import functools
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision import names, registry
+from surgicai_vision.cells import OWN, Cell
+from surgicai_vision.config import TaskConfig, digest, to_mapping
+from surgicai_vision.errors import BadFile, MissingWeights
+from surgicai_vision.executor import Job
+from surgicai_vision.files import read_json
+from surgicai_vision.sweep.grid import Grid, chain_parts
+from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES
+
+GRID_FILE, CELL_FILE, FAILED_FILE, REFERENCE_FILE = "sweep.json", "cell.json", "failed.json", "reference.json"
+CACHED, TO_DO, NOT_RUN = "cached", "to do", "not run"
+FEATURE_SWITCHES = ("preprocessing", "batch_norm_drift", "bgr")
+"""Deviations that change features."""
+
+
+@dataclass(frozen=True)
+class CellState:
+    """A cell and what is known of it.
+
+    Attributes:
+        cell: the cell.
+        key: its folder's name.
+        state: "cached", "to do" or "not run".
+        reason: why it is not run, or why it is done again.
+    """
+
+    cell: Cell
+    key: str
+    state: str
+    reason: str = ""
+
+    @property
+    def where(self) -> str:
+        """The cell in words."""
+        return f"{self.cell.task}, {self.cell.name}, seed {self.cell.seed}"
+
+
+def plan(grid: Grid, out: Path) -> list[CellState]:
+    """Return every cell of `grid` with its state in the folder `out`; does no work."""
+    jobs = Jobs(grid, out)
+    missing = functools.lru_cache(functools.partial(_missing, accept_licence=grid.accept_licence))
+    return [_state(grid.key(cell), cell, jobs, missing) for cell in grid.cells]
+
+
+def _missing(encoder: str, accept_licence: bool) -> str:
+    """Return why an encoder's weights cannot be had, or "" where they are at hand."""
+    try:
+        registry.find_weights(encoder, accept_licence=accept_licence)
+    except MissingWeights as error:
+        return str(error)
+    return ""
+
+
+def _state(key: str, cell: Cell, jobs: "Jobs", missing: Any) -> CellState:
+    path = jobs.cell_folder(key) / CELL_FILE
+    made = path.exists()
+    if made and read_json(path).get("job") == jobs.cell_key(cell):
+        return CellState(cell, key, CACHED)
+    lack = missing(cell.encoder) if cell.encoder and cell.encoder != OWN else ""
+    if lack:
+        return CellState(cell, key, NOT_RUN, lack)
+    return CellState(cell, key, TO_DO, "made by other code or other data" if made else "")
+
+
+class Jobs:
+    """The jobs of a grid in the folder `out`.
+
+    Args:
+        grid: the grid.
+        out: the sweep's folder.
+        command: the command to be named beside each result.
+        environment: variables for the workers, where an engine does not hand ours on.
+    """
+
+    def __init__(self, grid: Grid, out: Path, command: str = "", environment: Mapping[str, str] | None = None):
+        self.grid, self.out = grid, out
+        self._where = {"command": command, "environment": dict(environment or {})}
+        self._digests: dict[str, str | None] = {}
+
+    def cell_folder(self, key: str) -> Path:
+        """Return where a cell's result is filed."""
+        return self.out / "cells" / key
+
+    def data_folder(self, task: str) -> Path:
+        """Return where a task's demonstrations and dataset are."""
+        return self.out / "data" / task
+
+    def policy_folder(self, part: Cell) -> Path:
+        """Return where a policy that chains share is filed."""
+        return self.out / "policies" / self.grid.key(part)
+
+    def dataset_digest(self, task: str) -> str | None:
+        """Return the digest of a task's dataset; None where it is not made yet."""
+        if task not in self._digests:
+            try:
+                self._digests[task] = str(read_json(self.data_folder(task) / "dataset" / names.META_FILE)["digest"])
+            except BadFile:
+                self._digests[task] = None
+        return self._digests[task]
+
+    def tasks(self, cell: Cell) -> tuple[str, ...]:
+        """Return the tasks whose datasets a cell needs."""
+        return tuple(part.task for part in chain_parts(cell).values()) if cell.chain else (cell.task,)
+
+    def cell_key(self, cell: Cell) -> str | None:
+        """Return the key of a cell's job; None where it cannot be known yet."""
+        return self.cell(cell).key() if all(map(self.dataset_digest, self.tasks(cell))) else None
+
+    def cell(self, cell: Cell) -> Job:
+        """Return the job that trains and evaluates a cell, or evaluates the chain of policies made before."""
+        parts = chain_parts(cell) if cell.chain else {}
+        final = self.cell_folder(self.grid.key(cell))
+        inputs = [self.policy(part).key() for part in parts.values()] if parts else self._inputs(cell)
+        arguments = {
+            "cell": to_mapping(cell),
+            "episodes": self.grid.episodes,
+            "final": str(final.absolute()),
+            "policies": {name: str(self.policy_folder(part).absolute()) for name, part in parts.items()},
+            **self._common(cell),
+        }
+        return Job("sweep-cell", arguments, tuple(inputs), label=(*LABELS, "final", "policies"))
+
+    def policy(self, part: Cell) -> Job:
+        """Return the job that trains one policy of a chain."""
+        arguments = {"cell": to_mapping(part), **self._common(part)}
+        return Job("sweep-policy", arguments, tuple(self._inputs(part)), label=LABELS)
+
+    def features(self, cell: Cell) -> list[Job]:
+        """Return the jobs that encode what a cell, or a chain's policies, see."""
+        if cell.chain:
+            return [job for part in chain_parts(cell).values() for job in self.features(part)]
+        if not cell.encoder or cell.encoder == OWN:
+            return []
+        jobs = []
+        for seen in _seen(cell):
+            arguments = {"cell": to_mapping(seen), **self._common(seen)}
+            jobs.append(Job("sweep-features", arguments, tuple(self._inputs(seen)), label=LABELS))
+        return jobs
+
+    def reference(self, name: str, task: str) -> Job:
+        """Return the job that evaluates the expert, or blind replay, on a task."""
+        dataset = str((self.data_folder(task) / "dataset").absolute())
+        arguments = {"name": name, "task": task, "episodes": self.grid.episodes, "dataset": dataset, **self._where}
+        inputs = (self.dataset_digest(task) or "",) if name == "replay" else (digest(TaskConfig(task)),)
+        return Job("sweep-reference", arguments, inputs, label=LABELS)
+
+    def _common(self, cell: Cell) -> dict[str, Any]:
+        lerobot = {"steps": self.grid.steps, "batch": self.grid.batch} if cell.policy in LEROBOT_POLICIES else {}
+        return {
+            "dataset": str((self.data_folder(cell.task) / "dataset").absolute()),
+            "accept_licence": self.grid.accept_licence,
+            "options": lerobot,
+            **self._where,
+        }
+
+    def _inputs(self, cell: Cell) -> list[str]:
+        """Return hashes of what a cell reads: its dataset, its encoder, its recipe."""
+        inputs = [self.dataset_digest(cell.task) or ""]
+        if cell.encoder and cell.encoder != OWN:
+            inputs.append(_card_digest(cell.encoder))
+        if cell.policy not in LEROBOT_POLICIES:
+            inputs.append(_recipe_digest(cell.policy, cell.recipe, json.dumps(cell.changes)))
+        return inputs
+
+
+LABELS = ("dataset", "accept_licence", "command", "environment")
+"""Arguments that change where and how a job is done, and not its result."""
+
+
+def _seen(cell: Cell) -> list[Cell]:
+    """Return what a cell sees, view by view where that is possible, so that cells share it."""
+    on: tuple[str, ...] = ()
+    if cell.policy not in LEROBOT_POLICIES:
+        deviations = registry.load_recipe(cell.policy, cell.recipe, cell.changes).deviations
+        on = tuple(switch for switch in FEATURE_SWITCHES if getattr(deviations, switch))
+    common: dict[str, Any] = {"pool": cell.pool, "deviations": on}
+    if "batch_norm_drift" in on:  # the statistics are of these views and this seed
+        return [Cell(cell.task, cell.encoder, cell.view, cell.seed, **common)]
+    return [Cell(cell.task, cell.encoder, (view,), **common) for view in cell.view]
+
+
+@functools.cache
+def _card_digest(encoder: str) -> str:
+    """Hash an encoder's card, which names its weights by their sha256."""
+    return digest(to_mapping(registry.encoder_card(encoder)))
+
+
+@functools.cache
+def _recipe_digest(policy: str, recipe: str, changes: str) -> str:
+    return digest(to_mapping(registry.load_recipe(policy, recipe, json.loads(changes))))
