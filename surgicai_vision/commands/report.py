@@ -1,34 +1,64 @@
-"""`report`: write the page of stored results."""
+"""`report`: write the page and the tables of stored results."""
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import option
+from surgicai_vision.commands.options import not_negative, option
 from surgicai_vision.errors import BadFile
 
 EXAMPLE = "surgicai-vision report outputs/quickstart"
+STRIPS = 160
 
 
 @dataclass(frozen=True)
 class Options:
     """Options of `report`."""
 
-    dir: str = option(dataclasses.MISSING, "folder with results of quickstart, evaluate or sweep", metavar="DIR")
-    out: str | None = option(None, "where to write the page", metavar="FILE.html", default_text="DIR/report.html")
+    dir: str = option(
+        dataclasses.MISSING, "folder with results of quickstart, evaluate, robustness or sweep", metavar="DIR"
+    )
+    out: str | None = option(
+        None, "where to write the page; tables/ stands beside it", metavar="FILE.html", default_text="DIR/report.html"
+    )
+    strips: int = option(STRIPS, "film strips at most, as far as the page's budget allows", check=not_negative)
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
-    """Write the page and say where it is."""
-    from surgicai_vision.report import read_results, write_report
+    """Write page and tables and say where they are."""
+    from surgicai_vision.report import collect, write_report
+    from surgicai_vision.report.tables import FOLDER
 
     folder = Path(options.dir)
     if not folder.is_dir():
         raise BadFile(f"{folder} is no folder; give one that quickstart, evaluate or sweep has written.")
-    read_results(folder)
+    cells = _cells(folder)
+    found = collect(folder, cells)
     with console.stage("report", "parts") as progress:
-        page = write_report(folder, Path(options.out) if options.out else None, progress)
+        out = Path(options.out) if options.out else None
+        page = write_report(folder, out, progress, cells=cells, strips=options.strips)
+    tables = page.parent / FOLDER
     console.say(f"report: {page}")
-    return {"report": str(page)}
+    console.say(f"tables: {tables}")
+    counts = {"evaluations": len(found.results), "missing": len(found.missing)}
+    return {"report": str(page), "tables": str(tables), **counts, "bytes": page.stat().st_size}
+
+
+def _cells(folder: Path) -> Sequence[Mapping[str, Any]]:
+    """Return every cell of the sweep in `folder` with its state; nothing where it is no sweep."""
+    from surgicai_vision.config import from_mapping, to_mapping
+    from surgicai_vision.files import read_json
+    from surgicai_vision.report import GRID_FILE
+    from surgicai_vision.sweep import Grid, plan
+
+    path = folder / GRID_FILE
+    if not path.exists():
+        return ()
+    grid = from_mapping(Grid, read_json(path), str(path))
+    states = plan(grid, folder)
+    return [
+        {**to_mapping(state.cell), "key": state.key, "state": state.state, "reason": state.reason} for state in states
+    ]

@@ -13,7 +13,7 @@ import numpy as np
 
 from surgicai_vision import statistics
 from surgicai_vision.report import text
-from surgicai_vision.report.reading import Collected, Condition, Missing, Result
+from surgicai_vision.report.reading import Collected, Condition, Missing, Result, order
 
 KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
 """Kinds of failure in the order in which charts stack them."""
@@ -110,16 +110,15 @@ class Group:
 
 def group(collected: Collected) -> list[Group]:
     """Return one group for each condition, in the order of the results, those without any at their places."""
-    from surgicai_vision.report.reading import _condition_order
-
-    conditions = {item.condition for item in (*collected.results, *collected.missing)}
+    conditions = {result.condition for result in collected.results}
+    conditions |= {cell.condition for cell in collected.missing}
     return [
         Group(
             condition,
             tuple(result for result in collected.results if result.condition == condition),
             tuple(cell for cell in collected.missing if cell.condition == condition),
         )
-        for condition in sorted(conditions, key=_condition_order)
+        for condition in sorted(conditions, key=order)
     ]
 
 

@@ -1,8 +1,8 @@
 """Pairs: do two conditions differ? Exact McNemar on the same starts, Holm's correction within a task.
 
-Compared are trained conditions of a task that differ in one thing: encoder, views, variant or number of demonstrations;
-and each with pictures against proprioception alone. Episodes are paired by training seed and start. The test speaks of
-the policies that were trained, not of all that the same recipe might give.
+Compared are trained conditions of a task that differ in one thing: encoder, views, variant or number of
+demonstrations; and each with pictures against proprioception alone. Episodes are paired by training seed and start.
+The test speaks of the policies that were trained, not of all that the same recipe might give.
 """
 
 import itertools

@@ -6,7 +6,7 @@ the training seed, and the shift under which it was evaluated.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -105,26 +105,33 @@ class Result:
     @property
     def seed(self) -> int:
         """The training seed."""
-        return int(self.checkpoint.get("seed") or 0)
+        return int(self.cell.get("seed") or self.checkpoint.get("seed") or 0)
 
     @cached_property
     def condition(self) -> Condition:
-        """What it is an evaluation of."""
-        shift, checkpoint, cell = self.about.get("shift") or {}, self.checkpoint, self.cell
-        pool = cell.get("pool", checkpoint.get("pool", "global"))
+        """What it is an evaluation of: by its cell where it is one of a sweep, else by what is known of the policy."""
+        shift = self.about.get("shift") or {}
+        base = condition_of(self.cell) if self.cell else self._condition()
+        return replace(
+            base,
+            axis=str(shift.get("axis") or ""),
+            strength=float(shift.get("strength") or 0.0),
+            swap=str(self.about.get("swap") or base.swap),
+            trained=self.trained,
+        )
+
+    def _condition(self) -> Condition:
+        checkpoint = self.checkpoint
         encoder = self.about.get("encoder") or self.summary["policy"]
         if checkpoint and not self.about.get("views"):
             encoder = "state" if "state" in encoder.split("-") else "proprioception"
+        recipe, pool = checkpoint.get("recipe", "paper"), checkpoint.get("pool", "global")
         return Condition(
             task=self.summary["task"],
             encoder=encoder,
             views=tuple(self.about.get("views") or ()),
-            variant=_variant(checkpoint.get("policy", "bc"), pool, checkpoint.get("recipe", "paper")),
-            demonstrations=cell.get("demonstrations", checkpoint.get("demonstrations")),
-            axis=str(shift.get("axis") or ""),
-            strength=float(shift.get("strength") or 0.0),
-            swap=str(self.about.get("swap") or ""),
-            trained=self.trained,
+            variant=_variant(checkpoint.get("policy", "bc"), pool, recipe),
+            demonstrations=checkpoint.get("demonstrations"),
         )
 
 
@@ -174,15 +181,15 @@ def collect(folder: Path, cells: Sequence[Mapping[str, Any]] = ()) -> Collected:
 def read_results(folder: Path, grid: dict[str, Any] | None = None, empty: bool = False) -> list[Result]:
     """Read all evaluations below `folder`; trained policies first."""
     results = []
-    shared = {name: value for name, value in (grid or {}).items() if name == "demonstrations" and _is_one(value)}
+    shared = _shared(grid or {})
     for place in find_evaluations(folder):
         stored = files.read_json(place / MARKER)
         cell = _json(place.parent / CELL_FILE).get("cell", {})
-        mapping = {**shared, **cell} if cell else {}
+        mapping = {**shared, **_filled(cell)} if cell else {}
         results.append(Result(place, stored["summary"], stored["about"], read_rows(place), mapping))
     if not results and not empty:
         raise BadFile(f"{folder} holds no evaluation; run `surgicai-vision evaluate POLICY --out {folder}` first.")
-    return sorted(results, key=_order)
+    return sorted(results, key=lambda result: (*order(result.condition), result.seed))
 
 
 def condition_of(cell: Mapping[str, Any]) -> Condition:
@@ -191,13 +198,15 @@ def condition_of(cell: Mapping[str, Any]) -> Condition:
     deviations = cell.get("deviations")
     switches = [] if deviations is None else list(deviations) or ["none"]
     epochs = [f"{cell['epochs']}epochs"] if cell.get("epochs") else []
-    demonstrations = cell.get("demonstrations")
+    chain = f"chain, {cell['chain']} end" if cell.get("chain") else ""
+    variant = _variant(cell.get("policy", "bc"), cell.get("pool", "global"), "+".join([recipe, *switches, *epochs]))
     return Condition(
         task=str(cell["task"]),
         encoder=str(cell.get("encoder") or ("state" if cell.get("privileged") else "proprioception")),
         views=tuple(cell.get("view") or ()),
-        variant=_variant(cell.get("policy", "bc"), cell.get("pool", "global"), "+".join([recipe, *switches, *epochs])),
-        demonstrations=demonstrations if _is_one(demonstrations) else None,
+        variant=" · ".join(part for part in (chain, variant) if part),
+        demonstrations=cell.get("demonstrations"),
+        swap=str(cell.get("swap") or ""),
     )
 
 
@@ -219,7 +228,7 @@ def _missing(
     folder: Path, run: dict[str, Any], grid: dict[str, Any], cells: Sequence[Mapping[str, Any]], results: list[Result]
 ) -> list[Missing]:
     """Return the cells without a result: what failed, what the plan knows, what the run noted, each once."""
-    shared = {name: grid[name] for name in ("demonstrations",) if _is_one(grid.get(name))}
+    shared = _shared(grid)
     done = {(result.condition, result.seed) for result in results}
     found: dict[tuple[Condition, int], Missing] = {}
 
@@ -241,7 +250,7 @@ def _missing(
             noted = _noted(str(line))
             if noted and not any(_same(noted, other) for other in found.values()):
                 found[noted.condition, noted.seed] = noted
-    return sorted(found.values(), key=lambda item: (*_condition_order(item.condition), item.seed))
+    return sorted(found.values(), key=lambda item: (*order(item.condition), item.seed))
 
 
 def _noted(line: str) -> Missing | None:
@@ -268,13 +277,9 @@ def _variant(policy: str, pool: str, recipe: str) -> str:
     return " · ".join(part for part, usual in parts if part != usual)
 
 
-def _order(result: Result) -> tuple[Any, ...]:
-    return (*_condition_order(result.condition), result.seed)
-
-
-def _condition_order(condition: Condition) -> tuple[Any, ...]:
+def order(condition: Condition) -> tuple[Any, ...]:
     """By task; in it trained policies first, by encoder, views and what else they are, then the references."""
-    views = [names.CAMERAS.index(view) if view in names.CAMERAS else len(names.CAMERAS) for view in condition.views]
+    views = [names.VIEWS.index(view) if view in names.VIEWS else len(names.VIEWS) for view in condition.views]
     task = names.TASKS.index(condition.task) if condition.task in names.TASKS else len(names.TASKS)
     more = (condition.variant, condition.demonstrations or 0, condition.axis, condition.strength, condition.swap)
     return (task, not condition.trained, not views, condition.encoder, len(views), views, *more)
@@ -285,8 +290,11 @@ def _json(path: Path) -> dict[str, Any]:
     return found
 
 
-def _is_one(value: Any) -> bool:
-    return isinstance(value, int)
+def _shared(grid: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a cell has of its grid where it says nothing itself: of several demonstration counts the largest."""
+    counts = grid.get("demonstrations")
+    counts = [counts] if isinstance(counts, int) else list(counts or ())
+    return {"demonstrations": max(counts)} if counts else {}
 
 
 def _last_line(text: str) -> str:

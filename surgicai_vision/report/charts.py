@@ -1,0 +1,174 @@
+"""Charts: small SVG drawings with their intervals visible, in colours a colour-blind reader can tell apart.
+
+Series have Okabe and Ito's colours and a marker of their own, so that no chart rests on colour alone. Colours of text
+and axes come from the page's style sheet.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup, escape
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#7a5195", "#666666")
+"""Okabe and Ito, "Color Universal Design" (2008), the yellow darkened; two more for the seventh and eighth series."""
+
+KIND_COLOURS = {
+    "success": "#0072b2",
+    "missed": "#999999",
+    "dropped": "#e69f00",
+    "wrong_hole": "#cc79a7",
+    "time": "#56b4e9",
+    "physics": "#d55e00",
+    "error": "#333333",
+}
+"""Outcome of an episode → its colour; an unknown kind is drawn as "error"."""
+
+_HEAT = ((247, 251, 255), (198, 219, 239), (107, 174, 214), (33, 113, 181), (8, 48, 107))
+"""Brewer's sequential blues at 0, ¼, ½, ¾ and 1: lightness alone carries the value."""
+
+_MARKERS = ("circle", "square", "triangle", "diamond")
+WIDTH, HEIGHT = 340, 210
+LEFT, RIGHT, TOP, BOTTOM = 38, 12, 10, 40
+"""Size and margins of a curve's drawing, in its own units."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A success rate at x, with its interval and the words a reader hears."""
+
+    x: float
+    rate: float
+    low: float
+    high: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Series:
+    """One line of a chart."""
+
+    name: str
+    points: tuple[Point, ...]
+
+
+def heat(rate: float) -> tuple[str, str]:
+    """Return background and text colour of a rate."""
+    at = min(max(rate, 0.0), 1.0) * (len(_HEAT) - 1)
+    low = min(int(at), len(_HEAT) - 2)
+    share = at - low
+    red, green, blue = (round((1 - share) * a + share * b) for a, b in zip(_HEAT[low], _HEAT[low + 1], strict=True))
+    dark = 0.299 * red + 0.587 * green + 0.114 * blue < 140
+    return f"#{red:02x}{green:02x}{blue:02x}", "#ffffff" if dark else "#10202c"
+
+
+def interval(rate: float, low: float, high: float, label: str, paper: float | None = None) -> Markup:
+    """Draw a rate with its interval on an axis from 0 to 1; the paper's rate as a hollow diamond."""
+    x = [8 + 160 * value for value in (low, high, rate)]
+    diamond = ""
+    if paper is not None:
+        at = 8 + 160 * paper
+        diamond = f'<path class="paper" d="M{at:.1f} 5 l6 7 l-6 7 l-6 -7 z"/>'
+    return Markup(
+        f'<svg class="interval" viewBox="0 0 176 24" role="img" aria-label="{escape(label)}">'
+        '<line class="axis" x1="8" x2="168" y1="12" y2="12"/><line class="axis" x1="8" x2="8" y1="6" y2="18"/>'
+        '<line class="axis" x1="88" x2="88" y1="9" y2="15"/><line class="axis" x1="168" x2="168" y1="6" y2="18"/>'
+        f'<line class="range" x1="{x[0]:.1f}" x2="{x[1]:.1f}" y1="12" y2="12"/>'
+        f'<circle class="point" cx="{x[2]:.1f}" cy="12" r="5"/>{diamond}</svg>'
+    )
+
+
+def outcomes(successes: int, failures: dict[str, int]) -> Markup:
+    """Draw how episodes ended as one stacked bar."""
+    total, at, parts = successes + sum(failures.values()), 0.0, []
+    for kind, count in {"success": successes, **failures}.items():
+        width = 160 * count / total
+        colour = KIND_COLOURS.get(kind, KIND_COLOURS["error"])
+        title = f"<title>{escape(kind.replace('_', ' '))}: {count} of {total}</title>"
+        parts.append(f'<rect x="{at:.2f}" y="1" width="{width:.2f}" height="12" fill="{colour}">{title}</rect>')
+        at += width
+    words = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in failures.items())
+    label = escape(f"{successes} of {total} succeeded" + (f"; {words}" if words else ""))
+    return Markup(f'<svg class="outcomes" viewBox="0 0 160 14" role="img" aria-label="{label}">{"".join(parts)}</svg>')
+
+
+def curves(series: Sequence[Series], x_name: str, *, logarithmic: bool = False, label: str = "") -> Markup:
+    """Draw success against x, one line a series, intervals as bars at the points."""
+    from math import log
+
+    xs = sorted({point.x for line in series for point in line.points})
+    scale = log if logarithmic else float
+    low, high = scale(xs[0]), scale(xs[-1])
+    span = (high - low) or 1.0
+
+    def place(x: float, rate: float) -> tuple[float, float]:
+        return LEFT + (WIDTH - LEFT - RIGHT) * (scale(x) - low) / span, TOP + (HEIGHT - TOP - BOTTOM) * (1 - rate)
+
+    parts = [_axes(xs, place, x_name)]
+    for index, line in enumerate(series):
+        shift = 3.0 * (index - (len(series) - 1) / 2) / max(1, len(series) - 1) if len(series) > 1 else 0.0
+        parts.append(_line(line, index, shift, place))
+    body = "".join(parts)
+    return Markup(
+        f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(label or x_name)}">'
+        f"{body}</svg>"
+    )
+
+
+def key(names: Sequence[str]) -> Markup:
+    """Draw the legend of the series called `names`."""
+    items = []
+    for index, name in enumerate(names):
+        colour = COLOURS[index % len(COLOURS)]
+        marker = _marker(index, 10, 8, colour)
+        line = f'<line x1="0" x2="20" y1="8" y2="8" stroke="{colour}" stroke-width="2"/>'
+        sign = f'<svg class="sign" viewBox="0 0 20 16" aria-hidden="true">{line}{marker}</svg>'
+        items.append(f"<span>{sign}{escape(name)}</span>")
+    return Markup(f'<p class="key">{"".join(items)}</p>')
+
+
+def _axes(xs: Sequence[float], place: object, x_name: str) -> str:
+    assert callable(place)
+    parts = []
+    for rate in (0.0, 0.25, 0.5, 0.75, 1.0):
+        y = place(xs[0], rate)[1]
+        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{100 * rate:.0f}</text>')
+    last = -1e9
+    for x in xs:
+        at = place(x, 0.0)[0]
+        if at - last < 26:
+            continue
+        last = at
+        parts.append(f'<text x="{at:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{x:g}</text>')
+    middle = LEFT + (WIDTH - LEFT - RIGHT) / 2
+    parts.append(f'<text class="name" x="{middle:.1f}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_name)}</text>')
+    return "".join(parts)
+
+
+def _line(line: Series, index: int, shift: float, place: object) -> str:
+    """Draw one series; `shift` moves it sideways, so that intervals at one x stand beside each other."""
+    assert callable(place)
+    colour, path, parts = COLOURS[index % len(COLOURS)], [], []
+    for point in line.points:
+        x, y = place(point.x, point.rate)
+        top, bottom = place(point.x, point.high)[1], place(point.x, point.low)[1]
+        x += shift
+        path.append(f"{x:.1f},{y:.1f}")
+        bar = f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{top:.1f}" y2="{bottom:.1f}" stroke-width="1.6" opacity=".6"/>'
+        title = escape(f"{line.name}: {point.text}")
+        parts.append(f"<g><title>{title}</title>{bar}{_marker(index, x, y, colour)}</g>")
+    joined = f'<polyline points="{" ".join(path)}" fill="none" stroke-width="1.8"/>'
+    return f'<g stroke="{colour}">{joined}{"".join(parts)}</g>'
+
+
+def _marker(index: int, x: float, y: float, colour: str) -> str:
+    """Draw a point; beyond four series the markers are hollow."""
+    fill = colour if index < len(_MARKERS) else "var(--card)"
+    style = f'fill="{fill}" stroke="{colour}" stroke-width="1.5"'
+    shape = _MARKERS[index % len(_MARKERS)]
+    if shape == "circle":
+        return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.6" {style}/>'
+    if shape == "square":
+        return f'<rect x="{x - 3.3:.1f}" y="{y - 3.3:.1f}" width="6.6" height="6.6" {style}/>'
+    steps = "l4 7 h-8 z" if shape == "triangle" else "l4.4 4.4 l-4.4 4.4 l-4.4 -4.4 z"
+    return f'<path d="M{x:.1f} {y - 4.3:.1f} {steps}" {style}/>'

@@ -1,0 +1,217 @@
+"""Curves: success against demonstrations, against the strength of a shift, along the chain, and beside the probe."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from surgicai_vision import names, statistics
+from surgicai_vision.report import charts, text
+from surgicai_vision.report.charts import Point, Series
+from surgicai_vision.report.groups import Group
+from surgicai_vision.report.reading import Collected
+
+MOST = len(charts.COLOURS)
+"""Series in one drawing; what is beyond stands in the table alone."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A drawing with its title, legend and the numbers behind it."""
+
+    title: str
+    drawing: Markup
+    key: Markup
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    more: str = ""
+
+
+def data_curves(groups: Sequence[Group]) -> list[Chart]:
+    """Success against the number of demonstrations, one chart a task, where a policy has several numbers."""
+    found = []
+    for task in names.TASKS:
+        candidates = [item for item in groups if _evaluated(item, task) and item.condition.plain]
+        candidates = [item for item in candidates if item.condition.demonstrations]
+        lines = _series(
+            candidates,
+            lambda item: replace(item.condition, demonstrations=None),
+            lambda item: float(item.condition.demonstrations or 0),
+        )
+        if lines:
+            found.append(_chart(task, lines, "demonstrations", logarithmic=True))
+    return found
+
+
+def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
+    """Success against the strength of each shift, with the area under the curve; one chart a task and axis."""
+    found = []
+    for task in names.TASKS:
+        mine = [item for item in groups if _evaluated(item, task) and not item.condition.swap]
+        for axis in dict.fromkeys(item.condition.axis for item in mine if item.condition.axis):
+            lines = _with_zero(mine, axis)
+            if lines:
+                areas = {line.name: _area(line) for line in lines}
+                title = f"{task}: {axis.replace('_', ' ')}"
+                found.append(_chart(title, lines, "strength", extra=("area", areas)))
+    return found
+
+
+def _with_zero(groups: Sequence[Group], axis: str) -> list[Series]:
+    """Return the curves of one axis; an evaluation without a shift is strength 0 where none was made."""
+    of_axis = [item for item in groups if item.condition.axis == axis]
+    bases = {replace(item.condition, axis="", strength=0.0) for item in of_axis}
+    have_zero = {_base(item) for item in of_axis if item.condition.strength == 0}
+    plain = [
+        item for item in groups if item.condition.plain and item.condition in bases and _base(item) not in have_zero
+    ]
+    return _series([*plain, *of_axis], _base, lambda item: item.condition.strength)
+
+
+def _base(item: Group) -> Any:
+    return replace(item.condition, axis="", strength=0.0)
+
+
+def _area(line: Series) -> str:
+    rates = [point.rate for point in line.points]
+    return f"{statistics.area_under_curve([point.x for point in line.points], rates):.2f}"
+
+
+def _series(groups: Sequence[Group], same: Callable[[Group], Any], x: Callable[[Group], float]) -> list[Series]:
+    """Join the groups that are the `same` but for x; lines of a single point are no curves."""
+    lines: dict[Any, list[Group]] = {}
+    for item in groups:
+        lines.setdefault(same(item), []).append(item)
+    found = []
+    for condition, members in lines.items():
+        points = tuple(_point(x(item), item) for item in sorted(members, key=x))
+        if len({point.x for point in points}) > 1:
+            found.append(Series(condition.label, points))
+    return found
+
+
+def _point(x: float, item: Group) -> Point:
+    count = f"{item.successes}/{item.episodes}"
+    return Point(x, item.rate, *item.interval, f"{count}, {text.percent(item.rate)} ({text.interval(item.interval)})")
+
+
+def _chart(
+    title: str,
+    lines: list[Series],
+    x_name: str,
+    *,
+    logarithmic: bool = False,
+    extra: tuple[str, dict[str, str]] | None = None,
+) -> Chart:
+    xs = sorted({point.x for line in lines for point in line.points})
+    rows = []
+    for line in lines:
+        known = {point.x: point.text for point in line.points}
+        rows.append((line.name, *(known.get(x, text.ABSENT) for x in xs), *((extra[1][line.name],) if extra else ())))
+    drawn = lines[:MOST]
+    more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
+    drawing = charts.curves(drawn, x_name, logarithmic=logarithmic, label=f"{title}: success [%] against {x_name}")
+    head = ("policy", *(f"{x:g}" for x in xs), *((extra[0],) if extra else ()))
+    return Chart(title, drawing, charts.key([line.name for line in drawn]), head, tuple(rows), more)
+
+
+def survival(groups: Sequence[Group]) -> Chart | None:
+    """How many episodes of the whole procedure finished each subtask and all before it."""
+    lines, rows = [], []
+    for item in groups:
+        if not _evaluated(item, names.SUTURE, trained=False):
+            continue
+        stages = [int(row.get("stages") or 0) for row in item.rows]
+        counts = [sum(stage > index for stage in stages) for index in range(len(names.SUBTASKS))]
+        bounds = [statistics.clopper_pearson(count, item.episodes) for count in counts]
+        texts = [f"{count}/{item.episodes} ({text.interval(b)})" for count, b in zip(counts, bounds, strict=True)]
+        points = [
+            Point(index + 1, count / item.episodes, *b, words)
+            for index, (count, b, words) in enumerate(zip(counts, bounds, texts, strict=True))
+        ]
+        lines.append(Series(item.condition.label, tuple(points)))
+        rows.append((item.condition.label, *texts))
+    if not lines:
+        return None
+    drawn = lines[:MOST]
+    title = "subtasks finished: " + ", ".join(f"{index + 1} {name}" for index, name in enumerate(names.SUBTASKS))
+    drawing = charts.curves(drawn, title, label="survival along the chain")
+    more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
+    key = charts.key([line.name for line in drawn])
+    return Chart("", drawing, key, ("policy", *names.SUBTASKS), tuple(rows), more)
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Probe errors beside success, and how the two go together."""
+
+    rows: tuple[dict[str, Any], ...]
+    correlation: str
+
+
+def probes(collected: Collected, groups: Sequence[Group]) -> Probes | None:
+    """Set each probe beside the success of the policies with its encoder, view and task."""
+    if not collected.probes:
+        return None
+    rows = []
+    for probe in collected.probes:
+        mine = [item for item in groups if _matches(probe, item)]
+        k, n = sum(item.successes for item in mine), sum(item.episodes for item in mine)
+        rows.append(
+            {
+                "task": probe.get("task") or (mine[0].condition.task if mine else text.ABSENT),
+                "encoder": str(probe.get("encoder")),
+                "view": _view(probe),
+                "tip_mm": _number(probe.get("tip_mm")),
+                "angle_deg": _number(probe.get("angle_deg")),
+                "n": probe.get("n", text.ABSENT),
+                "success": f"{k}/{n}" if n else text.ABSENT,
+                "rate": text.percent(k / n) if n else "",
+                "pair": (float(probe["tip_mm"]), k / n) if n and text.finite([probe.get("tip_mm")]) else None,
+            }
+        )
+    return Probes(tuple(rows), _correlation([row["pair"] for row in rows if row["pair"]]))
+
+
+def _matches(probe: dict[str, Any], item: Group) -> bool:
+    condition = item.condition
+    if not (item.episodes and condition.trained and condition.plain):
+        return False
+    if probe.get("task") and probe["task"] != condition.task:
+        return False
+    pool = probe.get("pool") or "global"
+    pooled = pool == "global" or pool in condition.variant.split(" · ")
+    return pooled and probe.get("encoder") == condition.encoder and _view(probe) == condition.view
+
+
+def _view(probe: dict[str, Any]) -> str:
+    view = probe.get("view") or ()
+    views = view.replace("+", ",").split(",") if isinstance(view, str) else view
+    return " + ".join(str(name).strip() for name in views)
+
+
+def _number(value: Any) -> str:
+    known = text.finite([value])
+    return f"{known[0]:.2f}" if known else text.ABSENT
+
+
+def _correlation(pairs: Sequence[tuple[float, float]]) -> str:
+    """Describe Spearman's rank correlation of tip error and success."""
+    if len(pairs) < 4:
+        return f"{text.plural(len(pairs), 'pair')} of probe and success: too few for a correlation."
+    errors, rates = np.array(pairs).T
+    if len(set(errors)) == 1 or len(set(rates)) == 1:
+        return f"All {len(pairs)} pairs are alike in one of the two, so there is no correlation to speak of."
+    from scipy.stats import spearmanr
+
+    found = spearmanr(errors, rates)
+    return (
+        f"Spearman's rank correlation of tip error and success over {len(pairs)} pairs: {found.statistic:.2f} "
+        f"(p = {text.probability(float(found.pvalue))}); below 0 a better probe goes with more successes."
+    )
+
+
+def _evaluated(item: Group, task: str, trained: bool = True) -> bool:
+    return bool(item.episodes and item.condition.task == task and (item.condition.trained or not trained))

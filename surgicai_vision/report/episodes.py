@@ -1,0 +1,131 @@
+"""Episodes: what a click on a cell shows. Every episode's outcome, the commands, hashes and film strips."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+from surgicai_vision.report import text
+from surgicai_vision.report.charts import KIND_COLOURS
+from surgicai_vision.report.films import Reel, Strip
+from surgicai_vision.report.groups import MEASURES, Group
+from surgicai_vision.report.reading import Result
+
+LETTERS = {"": "s", "missed": "m", "dropped": "d", "wrong_hole": "w", "time": "t", "physics": "p", "error": "e"}
+"""Outcome of an episode → its letter in the page's data."""
+
+_DARK_TEXT = ("dropped", "time", "missed")
+"""Outcomes whose colour is too light for white letters."""
+
+
+def letters() -> Markup:
+    """Return what each letter means and its colour, as JSON for a script element."""
+    kinds = {
+        letter: {
+            "name": (kind or "success").replace("_", " "),
+            "colour": KIND_COLOURS[kind or "success"],
+            "dark": kind in _DARK_TEXT,
+        }
+        for kind, letter in LETTERS.items()
+    }
+    return Markup(json.dumps(kinds))
+
+
+def film_id(identity: tuple[str, int]) -> str:
+    """Return the name of an episode's film on the page."""
+    return "film-" + hashlib.sha256(repr(identity).encode()).hexdigest()[:12]
+
+
+def group_details(
+    item: Group, reel: Reel, commands: dict[str, list[str]], on_page: set[tuple[str, int]]
+) -> dict[str, Any]:
+    """Return one condition: its cells with their episodes, its films, what was measured, what is missing.
+
+    Args:
+        item: the condition.
+        reel: all strips of the page.
+        commands: folder of a result → the commands that make its number again.
+        on_page: episodes whose frames stand in the page itself; here they are only named.
+    """
+    films = []
+    for index, result in enumerate(item.results):
+        for row in result.rows:
+            strip = reel.strips.get((str(result.folder), row["seed"]))
+            if strip is not None:
+                films.append({"cell": index, "start": row["seed"], **_film(strip, on_page)})
+    return {
+        "title": item.condition.label,
+        "task": item.condition.task,
+        "count": f"{item.successes}/{item.episodes}" if item.episodes else "",
+        "interval": text.interval(item.interval) if item.episodes else "",
+        "across": item.across_text() if item.across else "",
+        "cells": [_cell(result, commands.get(str(result.folder), [])) for result in item.results],
+        "measures": _measures(item) if item.episodes else [],
+        "missing": [{"seed": cell.seed, "state": cell.state, "reason": cell.reason} for cell in item.missing],
+        "films": films,
+    }
+
+
+def _cell(result: Result, commands: Sequence[str]) -> dict[str, Any]:
+    """Return one training seed: counts, episodes in short form, facts."""
+    from surgicai_vision.statistics import clopper_pearson
+
+    rows, k = result.rows, sum(bool(row["success"]) for row in result.rows)
+    return {
+        "seed": result.seed if result.trained else None,
+        "count": f"{k}/{len(rows)}",
+        "interval": text.interval(clopper_pearson(k, len(rows))),
+        "starts": _starts([row["seed"] for row in rows]),
+        "outcomes": "".join("s" if row["success"] else LETTERS.get(row["failure"], "?") for row in rows),
+        "steps": [row["steps"] for row in rows],
+        "mm": [_rounded(row.get("d_trans_mm")) for row in rows],
+        "deg": [_rounded(row.get("d_angle_deg")) for row in rows],
+        "commands": list(commands),
+        "facts": _facts(result),
+    }
+
+
+def _starts(seeds: Sequence[int]) -> int | list[int]:
+    """Return the first of starts that follow each other, else all of them."""
+    in_a_row = list(seeds) == list(range(seeds[0], seeds[0] + len(seeds)))
+    return seeds[0] if in_a_row else list(seeds)
+
+
+def _facts(result: Result) -> list[tuple[str, str]]:
+    checkpoint = result.checkpoint
+    facts = (
+        ("encoder weights, sha256", checkpoint.get("weights_sha256")),
+        ("policy, sha256", checkpoint.get("policy_sha256")),
+        ("dataset fingerprint", checkpoint.get("dataset") or result.about.get("dataset")),
+        ("scene, sha256", result.about.get("scene_hash")),
+        ("demonstrations trained on", checkpoint.get("demonstrations")),
+        ("rounds", result.about.get("rounds")),
+    )
+    return [(name, str(value)) for name, value in facts if value]
+
+
+def _measures(item: Group) -> list[tuple[str, str]]:
+    """Return what was measured: lengths and steps of successes, medians of the rest."""
+    spread = [
+        ("trajectory length of successes [mm]", text.mean(item.on_successes("trajectory_length_mm"))),
+        ("time steps of successes", text.mean(item.on_successes("steps"))),
+    ]
+    for column, what, unit, _ in MEASURES:
+        words = text.spread(item.values(column), 2 if unit == "N" else 1)
+        if words != text.ABSENT:
+            spread.append((f"{what} [{unit}], median (quartiles)", words))
+    return spread
+
+
+def _film(strip: Strip, on_page: set[tuple[str, int]]) -> dict[str, Any]:
+    known = {"id": film_id(strip.choice.identity), "view": strip.view, "outcome": strip.outcome}
+    if strip.choice.identity in on_page:
+        return known
+    return {**known, "steps": list(strip.steps), "frames": list(strip.frames)}
+
+
+def _rounded(value: Any) -> float | None:
+    known = text.finite([value])
+    return round(known[0], 1) if known else None
