@@ -1,0 +1,98 @@
+"""Measure closed-loop evaluation: what `evaluate` does by default against one env at a time in one process.
+
+    python benchmarks/evaluate.py
+    python benchmarks/evaluate.py --episodes 8 --steps 40 --repeats 1
+
+The policy sees one view through imagenet-lite; its head is a fixed random matrix, so that no training is needed and
+every episode takes all its steps. One env at a time: one process, one slot (the encoder sees one frame). Default: a
+process for each core, eight slots in each (the encoder sees up to eight frames at once). Start-up of processes and the
+loading of the encoder count on both sides. Both must give the same row for every seed, and the same states.
+
+A and B take turns; figures are medians over the turns, ratios medians of the turns' ratios.
+"""
+
+import argparse
+import os
+import time
+from typing import Any
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import numpy as np
+from common import emit, median
+
+from surgicai_vision import names
+from surgicai_vision.agents import PolicyAgent
+from surgicai_vision.config import TaskConfig
+from surgicai_vision.evaluation import Agent, Episode, evaluate
+
+ENCODER, VIEW, SIZE = "imagenet-lite", "front", 224
+
+
+class Head:
+    """A policy that turns features and proprioception into actions by a fixed random matrix."""
+
+    def __init__(self, dim: int):
+        self._weights = np.random.default_rng(0).normal(0, 0.05, (dim + 7, 7))
+
+    def act(self, features: np.ndarray, agent_pos: np.ndarray) -> np.ndarray:
+        """Return actions (n, 7)."""
+        inputs = np.concatenate([features, agent_pos], axis=1).astype(np.float64)
+        return np.tanh(np.einsum("bi,ia->ba", inputs, self._weights)).astype(np.float32)
+
+
+def make_agent() -> Agent:
+    """Make the agent (in a worker process)."""
+    from surgicai_vision.registry import load_encoder
+
+    encoder = load_encoder(ENCODER)
+    return PolicyAgent("benchmark", Head(encoder.dim), encoder, (VIEW,), SIZE)
+
+
+def same(one: list[Episode], other: list[Episode]) -> int:
+    """Return how many episodes have the same row (NaN equals NaN) and the same states on both sides."""
+    pairs = zip(one, other, strict=True)
+    return sum(repr(a.row) == repr(b.row) and np.array_equal(a.film.states, b.film.states) for a, b in pairs)
+
+
+def measure(episodes: int, steps: int, repeats: int) -> dict[str, Any]:
+    """Time both and compare them row by row."""
+    config, seeds = TaskConfig("grasp", max_steps=steps), range(names.TEST_SEED, names.TEST_SEED + episodes)
+    kinds: tuple[dict[str, Any], ...] = ({"batch": 1, "workers": 1}, {})
+    times: tuple[list[float], list[float]] = ([], [])
+    equal = episodes
+    for turn in range(repeats):
+        found: dict[int, list[Episode]] = {}
+        for index in (0, 1) if turn % 2 else (1, 0):
+            start = time.perf_counter()
+            found[index] = evaluate(make_agent, config, seeds, **kinds[index])
+            times[index].append(time.perf_counter() - start)
+        equal = min(equal, same(found[0], found[1]))
+    total = sum(episode.row.steps for episode in found[0])
+    return {
+        "one_env_at_a_time_s": median(times[0]),
+        "default_s": median(times[1]),
+        "one_env_at_a_time_steps_per_s": round(total / median(times[0], 9), 1),
+        "default_steps_per_s": round(total / median(times[1], 9), 1),
+        "times_as_fast": median([a / b for a, b in zip(*times, strict=True)]),
+        "paired_rows": episodes,
+        "equal_rows": equal,
+    }
+
+
+def main() -> None:
+    """Measure and print one JSON line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--steps", type=int, default=200, help="of each episode")
+    parser.add_argument("--repeats", type=int, default=3)
+    chosen = parser.parse_args()
+    cores = len(os.sched_getaffinity(0))
+    row = {**vars(chosen), "encoder": ENCODER, "view": VIEW, "cores": cores}
+    row |= measure(chosen.episodes, chosen.steps, chosen.repeats)
+    row["load_average"] = [round(value, 2) for value in os.getloadavg()]
+    emit("evaluate", row, render=True)
+
+
+if __name__ == "__main__":
+    main()
