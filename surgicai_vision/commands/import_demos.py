@@ -1,6 +1,7 @@
-"""`import-demos`: read demonstrations of the original SurgicAI."""
+"""`import-demos`: read demonstrations of the original SurgicAI, and bags of ROS 1 and ROS 2."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,28 +9,66 @@ from typing import Any
 from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import one_of, option
-from surgicai_vision.errors import InputError
+from surgicai_vision.commands.options import config_only, one_of, option
+from surgicai_vision.demos.bag_config import CONVENTIONS, SEGMENTATIONS, BagConfig, Topics, bags_in, is_bag
+from surgicai_vision.errors import BadFile, InputError, check_name
 
 EXAMPLE = "surgicai-vision import-demos regrasp_all_episodes_merged.pkl --task handoff --out outputs/demos/surgicai"
+ROLES = tuple(field.name for field in dataclasses.fields(Topics))
+NOTES = f"""\
+A bag is a .bag, .db3 or .mcap file, or a folder of ROS 2; a folder of bags is read whole:
+  surgicai-vision import-demos trial.bag --topic needle=/needle/pose --out outputs/demos/trial
+Roles of --topic: {", ".join(ROLES)}.
+Without --task every subtask that is found gets a folder below --out. Frames, units, labels and more stand in the table
+`bag` of a --config file, the scene in the table `env`; see docs/demos.md."""
 
 
 @dataclass(frozen=True)
 class Options:
     """Options of `import-demos`."""
 
-    file: str = option(dataclasses.MISSING, "a pickle as SurgicAI writes it", metavar="FILE.pkl")
+    file: str = option(
+        dataclasses.MISSING, "a pickle as SurgicAI writes it, an npz of its arrays, a bag, or a folder of bags"
+    )
     task: str | None = option(
         None,
         f"what it shows: {', '.join(names.SUBTASKS)}",
         check=one_of("task", names.SUBTASKS),
-        default_text="none: say it",
+        default_text="none: say it; of a bag all that is found",
     )
-    out: str | None = option(None, "folder to make", metavar="DIR", default_text="outputs/demos/surgicai-<task>")
+    out: str | None = option(
+        None, "folder to make", metavar="DIR", default_text="outputs/demos/surgicai-<task> or outputs/demos/bag"
+    )
+    topic: tuple[str, ...] = option((), "topics of a bag that differ, as ROLE=/TOPIC,ROLE=/TOPIC", metavar="LIST")
+    convention: str | None = option(
+        None,
+        f"whose topics a bag has: {', '.join(CONVENTIONS)}",
+        check=one_of("convention", CONVENTIONS),
+        default_text="dvrk",
+    )
+    segmentation: str | None = option(
+        None,
+        f"what cuts a bag into subtasks: {', '.join(SEGMENTATIONS)}",
+        check=one_of("segmentation", SEGMENTATIONS),
+        default_text="auto",
+        metavar="WAY",
+    )
+    bag: BagConfig | None = config_only()
+    env: dict | None = config_only()
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Import and say where the demonstrations are."""
+    path = Path(options.file)
+    if is_bag(path) or path.is_dir():
+        return _import_bags(path, options, console)
+    given = [name for name in ("topic", "convention", "segmentation", "bag", "env") if getattr(options, name)]
+    if given:
+        raise InputError(f"--{given[0]} is of bags, and {path} is none (*.bag, *.db3, *.mcap, a folder of ROS 2).")
+    return _import_surgicai(path, options, console)
+
+
+def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str, Any]:
     from surgicai_vision.demos.importing import import_demos
 
     if options.task is None:
@@ -37,7 +76,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     out = Path(options.out) if options.out else folders.demos_folder(f"surgicai-{options.task}")
     folders.check_folder(out, "demos.json")
     with console.stage(f"importing {options.task}", "episodes") as progress:
-        summary = import_demos(Path(options.file), task=options.task, out=out, progress=progress)
+        summary = import_demos(path, task=options.task, out=out, progress=progress)
     console.say(f"{len(summary.paths)} demonstrations of {options.task}, {summary.steps} steps: {out}")
     if summary.skipped:
         console.say(f"{len(summary.skipped)} episodes could not be replayed; {out}/demos.json says why.")
@@ -49,3 +88,59 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         "skipped": len(summary.skipped),
         "demos": str(out),
     }
+
+
+def _import_bags(path: Path, options: Options, console: Console) -> dict[str, Any]:
+    from surgicai_vision.demos.bag_import import import_bags
+
+    bags = bags_in(path)
+    if not bags:
+        raise BadFile(f"Cannot read {path}: it is a folder without bags (*.bag, *.db3, *.mcap, folders of ROS 2).")
+    out = Path(options.out) if options.out else folders.demos_folder("bag")
+    with console.stage(f"importing {path.name}", "demonstrations") as progress:
+        summaries = import_bags(
+            bags, task=options.task, out=out, config=_config(options), env=options.env, progress=progress
+        )
+    rows = {}
+    for made in summaries:
+        kept = len(made.paths)
+        console.say(
+            f"{kept} demonstrations of {made.task}, {made.steps} steps; {made.succeeded} of {kept} end as a success "
+            f"by our tolerances: {made.out}"
+        )
+        if made.skipped:
+            console.say(f"{len(made.skipped)} parts could not be replayed; {made.out}/demos.json says why.")
+        if made.clipped:
+            console.say(f"{made.clipped} steps are faster than step preset '{made.step}' and were clipped.")
+        rows[made.task] = {
+            "episodes": kept,
+            "steps": made.steps,
+            "step": made.step,
+            "clipped": made.clipped,
+            "pauses": made.pauses,
+            "succeeded": made.succeeded,
+            "skipped": len(made.skipped),
+            "demos": str(made.out),
+        }
+    return {"bags": len(bags), "tasks": rows}
+
+
+def _config(options: Options) -> BagConfig:
+    """Return the table `bag` with the command line's options put over it."""
+    config = options.bag or BagConfig()
+    changes: dict[str, Any] = {
+        name: value for name in ("convention", "segmentation") if (value := getattr(options, name))
+    }
+    topics = dataclasses.replace(config.topics, **_topics(options.topic))
+    return dataclasses.replace(config, topics=topics, **changes)
+
+
+def _topics(given: Sequence[str]) -> dict[str, str]:
+    """Return role → topic of the texts "role=topic"."""
+    topics = {}
+    for text in given:
+        role, equals, topic = text.partition("=")
+        if not equals:
+            raise InputError(f"--topic is '{text}'; write ROLE=/TOPIC, with ROLE one of {', '.join(ROLES)}.")
+        topics[check_name("role", role, ROLES)] = topic
+    return topics

@@ -6,10 +6,10 @@ The library `rosbags` opens the containers: `.bag`, a ROS 2 folder (`metadata.ya
 single `.db3` or `.mcap`. Messages are decoded by `ros_messages`, never by code made from the bag's own definitions.
 Runs where `foreign` puts it.
 
-Returned per topic that is there, N messages in the order of the bag: `<role>.time` when received and `<role>.stamp`
-in the header (0 where there is none), both (N,) int64 [ns]; `<role>.value`; `<role>.type` and `<role>.frame`, one text
-each. Values: poses (N, 7), x y z in the recording's unit and a unit quaternion w x y z; joints (N, 6); jaw (N,); label
-(N,) texts.
+Returned is `topics`, what there is, and per role whose topic is there, of N messages in the order of the bag:
+`<role>.time` when received and `<role>.stamp` in the header (0 where there is none), both (N,) int64 [ns];
+`<role>.value`; `<role>.type` and `<role>.frame`, one text each. Values: poses (N, 7), x y z in the recording's unit
+and a unit quaternion w x y z; joints (N, 6); jaw (N,); label (N,) texts.
 """
 
 import bz2
@@ -28,11 +28,9 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import reader as ros2_reader
 from rosbags.rosbag2 import storage_mcap
 
+from surgicai_vision.demos.bag_config import ENDINGS, METADATA, is_bag
 from surgicai_vision.demos.ros_messages import AMBF, WHOLE_NUMBERS, Layout, decode, layout_of
 from surgicai_vision.errors import BadFile, InputError
-
-METADATA = "metadata.yaml"
-ENDINGS = (".bag", ".db3", ".mcap")
 
 POSES = (
     "geometry_msgs/PoseStamped",
@@ -55,6 +53,8 @@ ROLES = ("psm1_pose", "psm1_jaw", "psm1_joints", "psm2_pose", "psm2_jaw", "psm2_
 MAX_MESSAGES, MAX_MESSAGE, MAX_CHUNK, MAX_METADATA = 5_000_000, 2**20, 2**26, 2**20
 """What is read at most: messages of all roles, bytes of a message, of an unpacked chunk, of a ROS 2 folder's text.
 ROS packs chunks of 768 KB; one picture makes them larger."""
+MAX_LISTED, MAX_NAME = 60, 160
+"""Topics of a bag that are named, and characters of each."""
 UNIT = 0.01
 """Furthest a quaternion's length may be from 1."""
 _POSE_FIELDS = (
@@ -63,11 +63,6 @@ _POSE_FIELDS = (
     ("transform.translation", "transform.rotation"),
     ("translation", "rotation"),
 )
-
-
-def is_bag(path: Path) -> bool:
-    """Say whether a path names a bag, by its ending or, for a folder, by its `metadata.yaml`."""
-    return (path / METADATA).is_file() if path.is_dir() else path.suffix in ENDINGS
 
 
 def read(path: Path, topics: Mapping[str, str], needed: Collection[str] = ()) -> dict[str, np.ndarray]:
@@ -96,16 +91,18 @@ def read(path: Path, topics: Mapping[str, str], needed: Collection[str] = ()) ->
 def _read(reader: Any, path: Path, topics: Mapping[str, str], needed: Collection[str]) -> dict[str, np.ndarray]:
     ros1 = isinstance(reader, Reader1)
     there = {connection.topic: _plain(connection.msgtype) for connection in reader.connections}
+    listed = [f"{topic} ({kind})"[:MAX_NAME] for topic, kind in sorted(there.items())][:MAX_LISTED]
     missing = [role for role in needed if topics[role] not in there]
     if missing:
-        listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there.items())) or "no topic"
-        raise InputError(f"{path} has no topic {topics[missing[0]]} ({missing[0]}); it has {listed[:1500]}.")
+        raise InputError(
+            f"{path} has no topic {topics[missing[0]]} ({missing[0]}); it has {', '.join(listed) or 'none at all'}."
+        )
     wanted = [connection for connection in reader.connections if connection.topic in topics.values()]
     layouts = {}
     for connection in wanted:
         _check_kind(connection, topics)
         layouts[connection.topic] = layout_of(_plain(connection.msgtype), ros1=ros1, text=connection.msgdef.data)
-    arrays: dict[str, np.ndarray] = {}
+    arrays = {"topics": np.array(listed, dtype=str)}
     rows = _rows(reader, wanted, layouts, path, ros1) if wanted else {}
     for role, topic in topics.items():
         if rows.get(topic):

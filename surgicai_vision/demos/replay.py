@@ -21,6 +21,7 @@ The first transition of a pullout episode is dropped: a jump from the start pose
 """
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -134,13 +135,40 @@ def grip_error(episode: Episode, task: str) -> float:
 
 def actions(episode: Episode, step: str) -> tuple[np.ndarray, int]:
     """Return the motion as actions of our envs, (T, 7) float32, and how many had to be clipped to [-1, 1]."""
-    metres, degrees, jaw = STEPS[step]
-    rotations = np.stack([pose_matrix(row)[:3, :3] for row in episode.pose])
-    turns = [matrix_to_rotvec(after @ before.T) for before, after in itertools.pairwise(rotations)]
-    moves = np.diff(episode.pose, axis=0)
-    values = np.column_stack([moves[:, :3] / metres, np.stack(turns) / np.radians(degrees), moves[:, 6] / jaw])
+    return moves(np.stack([pose_matrix(row) for row in episode.pose]), episode.pose[:, 6], step)
+
+
+def moves(tip: np.ndarray, jaw: np.ndarray, step: str) -> tuple[np.ndarray, int]:
+    """Return a motion as actions, (T, 7) float32, and how many had to be clipped to [-1, 1].
+
+    Args:
+        tip: T_base_tip (T + 1, 4, 4).
+        jaw: (T + 1,) [rad].
+        step: a key of `STEPS`.
+    """
+    metres, degrees, opening = STEPS[step]
+    turns = [matrix_to_rotvec(after[:3, :3] @ before[:3, :3].T) for before, after in itertools.pairwise(tip)]
+    shifts = np.diff(tip[:, :3, 3], axis=0)
+    values = np.column_stack([shifts / metres, np.stack(turns) / np.radians(degrees), np.diff(jaw) / opening])
     inside = np.clip(values, -1.0, 1.0)
     return inside.astype(np.float32), int((np.abs(values - inside) > 1e-4).any(axis=1).sum())
+
+
+@dataclass(frozen=True)
+class Track:
+    """Where everything is in each of T + 1 states.
+
+    Attributes:
+        arms: arm → T_base_tip (T + 1, 4, 4) and jaw (T + 1,) [rad]; others stand at their start.
+        needle: T_world_needle (T + 1, 4, 4).
+        grasp_angle: the needle's point that is grasped [rad], where the task has one.
+        passed: `Memory.passed` in each state, (T + 1,), or None: as the task's start has it.
+    """
+
+    arms: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    needle: np.ndarray
+    grasp_angle: float
+    passed: np.ndarray | None = None
 
 
 class Replay:
@@ -158,33 +186,60 @@ class Replay:
         Raises:
             UnreachablePose: a pose outside the arms' joint limits.
         """
-        from surgicai_vision.envs.posing import pose_scene
-
-        task, env = self.config.task, self._env
-        arm = names.ACTIVE_ARM[task]
-        needles = needle_path(episode, task)
-        env.reset(seed=0)
-        others = {"psm2": self._hold(needles[0])} if task == "handoff" else {}
-        states, contact = [], []
-        for seven, needle_pose in zip(episode.pose, needles, strict=True):
-            pose_scene(env, **{arm: (pose_matrix(seven), float(seven[6])), **others}, T_world_needle=needle_pose)
-            states.append(env.get_state())
-            contact.append(bool(env.measure()["contact"]))
+        task = self.config.task
+        tips = np.stack([pose_matrix(row) for row in episode.pose])
+        track = Track(
+            {names.ACTIVE_ARM[task]: (tips, episode.pose[:, 6])},
+            needle_path(episode, task),
+            GRASP_ANGLE if task == "grasp" else 0.0,
+        )
+        states, infos = self.play(track)
         action, clipped = actions(episode, self.config.step)
-        demo = Demo(
-            config=self.config,
-            seed=-1,
-            source="surgicai",
-            scene_hash=env.scene.hash,
-            code_version=code_version(),
-            state=np.stack(states),
+        demo = self.as_demo(
+            "surgicai",
+            states,
             action=action,
-            phase=np.full(len(action), names.SUBTASKS.index(task), np.int8),
             reward=episode.reward.astype(np.float32),
             success=episode.success,
-            contact=np.array(contact[1:]),
+            contact=np.array([info["contact"] for info in infos[1:]]),
         )
         return demo, clipped
+
+    def play(self, track: Track) -> tuple[np.ndarray, list[dict[str, Any]]]:
+        """Pose the scene state by state; return the states (T + 1, n) and what is measured in each.
+
+        Raises:
+            UnreachablePose: a pose outside the arms' joint limits.
+        """
+        from surgicai_vision.envs.posing import pose_scene
+
+        env = self._env
+        env.reset(seed=0)
+        arms = dict(track.arms)
+        if self.config.task == "handoff" and names.PSM2 not in arms:
+            tip, jaw = self._hold(track.needle[0])
+            arms[names.PSM2] = np.broadcast_to(tip, track.needle.shape), np.full(len(track.needle), jaw)
+        states, infos = [], []
+        for index, needle_pose in enumerate(track.needle):
+            poses = {arm: (tip[index], float(jaw[index])) for arm, (tip, jaw) in arms.items()}
+            pose_scene(env, **poses, T_world_needle=needle_pose)
+            memory = env.simulation.memory
+            memory.grasp_angle = track.grasp_angle or memory.grasp_angle
+            if track.passed is not None:
+                memory.passed = float(track.passed[index])
+            infos.append(env.measure())
+            states.append(env.get_state())
+        return np.stack(states), infos
+
+    def reward(self, success: bool, info: Mapping[str, Any]) -> float:
+        """Return the env's reward of a state that is judged a success or none."""
+        return self._env.reward({**info, "is_success": success})
+
+    def as_demo(self, source: str, states: np.ndarray, **columns: np.ndarray) -> Demo:
+        """Return states and the columns `action`, `reward`, `success`, `contact` as a demonstration."""
+        phase = np.full(len(states) - 1, names.SUBTASKS.index(self.config.task), np.int8)
+        scene = self._env.scene.hash
+        return Demo(self.config, -1, source, scene, code_version(), states, phase=phase, **columns)
 
     def _hold(self, needle_pose: np.ndarray) -> tuple[np.ndarray, float]:
         """Return PSM2's pose (T_base_tip, jaw) that holds the needle near its base."""
