@@ -105,13 +105,16 @@ def key_name(code: str) -> str:
     return _NAMES.get(code, code.removeprefix("Key"))
 
 
-def row_names(row: Row) -> str:
-    """Return the names of a row's keys: "W S"."""
-    return " ".join(dict.fromkeys(map(key_name, row.codes)))
+def key_names(row: Row) -> tuple[str, ...]:
+    """Return the names of a row's keys, each once: W, S."""
+    return tuple(dict.fromkeys(map(key_name, row.codes)))
 
 
 def key_table() -> str:
     """Return the key table as text."""
-    rows = [("key", "gamepad", "what it does"), *((row_names(row), row.gamepad, row.meaning) for row in TABLE)]
+    rows = [
+        ("key", "gamepad", "what it does"),
+        *((" ".join(key_names(row)), row.gamepad, row.meaning) for row in TABLE),
+    ]
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     return "\n".join(f"  {key:<{widths[0]}}  {pad:<{widths[1]}}  {meaning}" for key, pad, meaning in rows)

@@ -206,7 +206,7 @@ class Session:
         elif event == STOP:
             self._stop()
         elif event == START and self._state == WAITING:
-            self._state, self._message = DRIVING, "recording"
+            self._state, self._message = DRIVING, "Recording."
         elif event == DISCARD and self._state != WAITING:
             self.discarded += 1
             self._begin(self._attempt.seed, "Discarded. The same start again.")
@@ -238,7 +238,7 @@ class Session:
         moves = given.moves and self._rested
         self._rested = self._rested or not given.moves
         if moves or JAW in given.events:
-            self._state, self._message = DRIVING, "recording"
+            self._state, self._message = DRIVING, "Recording."
 
     def _drive(self, given: Input) -> None:
         """Take a step and judge the episode if that ended it."""

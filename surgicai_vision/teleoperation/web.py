@@ -32,7 +32,7 @@ from surgicai_vision.errors import InputError
 from surgicai_vision.teleoperation.commands import Input, merged
 from surgicai_vision.teleoperation.driving import Pictures
 from surgicai_vision.teleoperation.gamepad import Gamepad
-from surgicai_vision.teleoperation.keyboard import TABLE, Keyboard, key_name
+from surgicai_vision.teleoperation.keyboard import TABLE, Keyboard, key_names
 from surgicai_vision.teleoperation.session import Status
 
 HOST, PORT = "127.0.0.1", 8765
@@ -351,4 +351,4 @@ def _page(views: tuple[str, ...], title: str) -> bytes:
     loader = jinja2.FileSystemLoader(FOLDER)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     template = environment.get_template("page.html.j2")
-    return template.render(views=views, title=title, rows=TABLE, key_name=key_name).encode()
+    return template.render(views=views, title=title, rows=TABLE, key_names=key_names).encode()

@@ -98,7 +98,7 @@ for (const button of buttons) {
 }
 for (const figure of document.querySelectorAll("figure")) {
   figure.addEventListener("click", () => {
-    if (!figure.classList.contains("lead")) { press("KeyV"); release("KeyV"); }
+    if (figure.parentElement.id === "others") { press("KeyV"); release("KeyV"); }
   });
 }
 setInterval(() => { element("gamepad").textContent = gamepads().name ? `Found: ${gamepads().name}` : ""; }, 1000);
@@ -120,7 +120,7 @@ async function draw(figure, picture) {
 function tell(status) {
   const text = {
     episode: status.episode, seed: status.seed, subtask: `${status.subtask}, ${status.arm}`,
-    time: `${(status.steps / 50).toFixed(1)} s`, distance: `${(status.distance * 1000).toFixed(1)} mm`,
+    time: `${(status.steps / 50).toFixed(1)} of ${status.limit / 50} s`, distance: `${(status.distance * 1000).toFixed(1)} mm`,
     angle: `${(status.angle * 180 / Math.PI).toFixed(0)}°`, contact: status.contact ? "yes" : "no",
     counts: `${status.kept} / ${status.discarded}`, text: status.message,
     state: status.fine ? `${status.state}, fine` : status.state,
@@ -128,7 +128,11 @@ function tell(status) {
   for (const [id, value] of Object.entries(text)) if (element(id).textContent !== String(value)) element(id).textContent = value;
   element("message").className = status.state === "judged" ? (status.success ? "good" : "bad") : status.state;
   document.body.className = status.state;
-  for (const figure of document.querySelectorAll("figure")) figure.classList.toggle("lead", figure.dataset.view === status.view);
+  const [before, lead] = [document.querySelector("#lead figure"), document.querySelector(`figure[data-view="${status.view}"]`)];
+  if (before !== lead) {
+    element("others").append(before);
+    element("lead").append(lead);
+  }
   stopped = status.state === "stopped";
 }
 
