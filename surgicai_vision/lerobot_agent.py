@@ -210,14 +210,17 @@ def _load(folder: Path, weights: str | None) -> tuple[Any, Any, Any]:
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
     from lerobot.utils.import_utils import register_third_party_plugins
 
+    from surgicai_vision import registry
+
     register_third_party_plugins()
     try:
         config = PreTrainedConfig.from_pretrained(folder)
         # The checkpoint holds the backbone; LeRobot would download it first, only to overwrite it.
         if getattr(config, "pretrained_backbone_weights", None):
             config.pretrained_backbone_weights = None  # type: ignore[attr-defined]
-        if weights and hasattr(config, "encoder_weights"):
-            config.encoder_weights = weights
+        own = registry.weights_of(str(getattr(config, "encoder", None)), weights)
+        if own and hasattr(config, "encoder_weights"):
+            config.encoder_weights = str(own)
         with contextlib.redirect_stdout(sys.stderr):  # LeRobot prints; our standard output is the result
             policy = get_policy_class(config.type).from_pretrained(folder, config=config)
         overrides = {"device_processor": {"device": config.device}}

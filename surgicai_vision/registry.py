@@ -22,7 +22,7 @@ from typing import Any
 import yaml
 
 from surgicai_vision.config import Deviations, from_mapping
-from surgicai_vision.errors import BadFile, UnknownName, check_name
+from surgicai_vision.errors import BadFile, InputError, UnknownName, check_name
 
 ENCODERS: Mapping[str, str] = MappingProxyType(
     {
@@ -103,8 +103,8 @@ def load_encoder(
 
     Args:
         name: one of `encoder_names()`.
-        weights: a weights file; without it the folder $SURGICAI_VISION_WEIGHTS, the hub's cache and a
-            download are tried, in this order.
+        weights: a weights file, as `weights_of` takes it; without it the folder $SURGICAI_VISION_WEIGHTS, the
+            hub's cache and a download are tried, in this order.
         pool: "global", "spatial" or "tokens".
         accept_licence: accept weights under a non-commercial licence.
         deviations: use it as the released code did.
@@ -165,7 +165,34 @@ def find_weights(name: str, weights: Path | str | None = None, accept_licence: b
     """Find an encoder's weights file without loading it (or torch); see `load_encoder` for the errors."""
     plugin = encoder_plugin(name)
     lookup = importlib.import_module("encoders.weights")
-    return lookup.find(plugin.card, weights, accept_licence, OFFLINE_ENCODERS, plugin.known)
+    return lookup.find(plugin.card, weights_of(name, weights), accept_licence, OFFLINE_ENCODERS, plugin.known)
+
+
+def weights_of(name: str, given: Path | str | None) -> Path | None:
+    """Return the weights file that is meant for encoder `name`, or None.
+
+    Args:
+        name: an encoder.
+        given: FILE (for every encoder that has none of its own), NAME=FILE (for that encoder alone), or several of
+            them between commas.
+
+    Raises:
+        UnknownName: a NAME that no encoder has.
+        InputError: two files for the same encoder.
+    """
+    if given is None or isinstance(given, Path) or Path(given).is_file():
+        return Path(given) if given is not None else None
+    files: dict[str, Path] = {}
+    for part in given.split(","):
+        owner, equals, path = part.partition("=")
+        if not equals or "/" in owner:
+            owner, path = "", part
+        else:
+            check_encoder_name(owner)
+        if owner in files:
+            raise InputError(f"--weights names two files for {f'encoder {owner!r}' if owner else 'every encoder'}.")
+        files[owner] = Path(path)
+    return files.get(name, files.get(""))
 
 
 def policy_plugin(name: str) -> Any:

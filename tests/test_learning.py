@@ -86,6 +86,29 @@ def test_open_names_pools_and_licences(capsys: pytest.CaptureFixture[str]) -> No
     assert "Did you mean 'spatial'" in fails(capsys, "encode", "--encoder", "random", "--pool", "spacial")
 
 
+def test_weights_are_given_for_all_or_for_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    of = registry.weights_of
+    assert of("r3m", None) is None
+    assert of("r3m", "a.bin") == of("r3m", Path("a.bin")) == Path("a.bin")
+    both = "imagenet=a.pth,timm:resnet18.a1_in1k=b.pth,c.bin"
+    assert [of(name, both) for name in ("imagenet", "timm:resnet18.a1_in1k", "r3m")] == [
+        Path("a.pth"), Path("b.pth"), Path("c.bin")
+    ]  # fmt: skip
+    assert of("clip", "imagenet=a.pth") is None
+    assert of("clip", "some/x=1.pth") == Path("some/x=1.pth")
+    odd = tmp_path / "a,clip=b.bin"
+    odd.write_bytes(b"")
+    assert of("clip", str(odd)) == odd
+    with pytest.raises(UnknownName, match="Did you mean 'imagenet'"):
+        of("imagenet", "imagnet=a.pth")
+    for twice in ("imagenet=a,imagenet=b", "a,b"):
+        with pytest.raises(InputError, match="two files"):
+            of("imagenet", twice)
+    given = ("--weights", "imagenet=a.pth", "--weights", "r3m-18=none.bin")
+    assert "none.bin is not a file" in fails(capsys, "encode", "--encoder", "r3m-18", *given)
+    assert "a.pth is not a file" in fails(capsys, "encode", "--encoder", "imagenet", *given)
+
+
 def test_cache_lists_measures_and_prunes(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(capsys, "cache", "list")["entries"] == []
     run(capsys, "encode", "--encoder", "tiny")

@@ -7,7 +7,7 @@ from typing import Any
 from surgicai_vision import names, registry
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import many_of, one_of, option
+from surgicai_vision.commands.options import many_of, one_of, option, weights_option
 from surgicai_vision.errors import InputError
 from surgicai_vision.files import check_output
 
@@ -28,7 +28,7 @@ class Options:
     view: tuple[str, ...] = option(
         ("front", "back"), "views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]"
     )
-    weights: str | None = option(None, "file with the encoder's pretrained weights", metavar="FILE")
+    weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
     pool: str = option("global", f"what is taken: {', '.join(registry.POOLS)}", check=one_of("pool", registry.POOLS))
     export: str | None = option(

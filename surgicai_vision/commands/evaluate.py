@@ -16,6 +16,7 @@ from surgicai_vision.commands.options import (
     positive,
     read_yaml,
     task_config,
+    weights_option,
 )
 from surgicai_vision.config import from_mapping
 from surgicai_vision.errors import InputError, UnknownName
@@ -47,7 +48,7 @@ class Options:
     dataset: str | None = option(
         None, "dataset whose mean demonstration replay plays", metavar="DIR", default_text="outputs/datasets/<task>"
     )
-    weights: str | None = option(None, "file with the encoder's pretrained weights", metavar="FILE")
+    weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
     out: str | None = option(
         None,

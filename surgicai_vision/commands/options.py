@@ -18,7 +18,15 @@ T = TypeVar("T")
 Check = Callable[[str, Any], None]
 
 
-def option(default: Any, text: str, *, check: Check | None = None, metavar: str = "", default_text: str = "") -> Any:
+def option(
+    default: Any,
+    text: str,
+    *,
+    check: Check | None = None,
+    metavar: str = "",
+    default_text: str = "",
+    repeat: bool = False,
+) -> Any:
     """Declare an option.
 
     Args:
@@ -27,8 +35,9 @@ def option(default: Any, text: str, *, check: Check | None = None, metavar: str 
         check: called with the option's name and value; raises `InputError`.
         metavar: how `--help` names its value.
         default_text: what `--help` says of a default that depends on other options.
+        repeat: it may be given again: the texts are joined by commas.
     """
-    metadata = {"text": text, "check": check, "metavar": metavar, "default_text": default_text}
+    metadata = {"text": text, "check": check, "metavar": metavar, "default_text": default_text, "repeat": repeat}
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
@@ -107,6 +116,7 @@ def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
             keywords["action"] = argparse.BooleanOptionalAction
         else:
             keywords["type"] = _READERS.get(hint, _names)
+            keywords["action"] = _Joined if meta.get("repeat") else "store"
             keywords["metavar"] = meta["metavar"] or field.name.upper()
         if field.default is dataclasses.MISSING:
             parser.add_argument(field.name, **keywords)
@@ -118,6 +128,16 @@ def executor_option() -> Any:
     """Declare `executor`: what runs a verb's jobs."""
     return option(
         "local", "what runs the processes: local, or ray", check=one_of("executor", ("local", "ray")), metavar="NAME"
+    )
+
+
+def weights_option() -> Any:
+    """Declare `weights`: the files of pretrained weights; `registry.weights_of` reads it."""
+    return option(
+        None,
+        "file with the encoder's pretrained weights; NAME=FILE for the encoder NAME alone, once for each encoder",
+        metavar="[NAME=]FILE",
+        repeat=True,
     )
 
 
@@ -156,7 +176,10 @@ def _read(cls: type, path: Path) -> dict[str, Any]:
     hints = typing.get_type_hints(cls)
     for key, value in table.items():
         if key in hints and typing.get_origin(hints[key]) is tuple and isinstance(value, str):
-            table[key] = list(_names(value))
+            try:
+                table[key] = list(_READERS.get(hints[key], _names)(value))
+            except argparse.ArgumentTypeError as error:
+                raise InputError(f"{path}: {key}: {error}.") from None
     return table
 
 
@@ -182,15 +205,28 @@ def nearest_option(given: str, parser: argparse.ArgumentParser) -> UnknownName:
     return UnknownName("option", given.split("=")[0], parser._option_string_actions)
 
 
+class _Joined(argparse.Action):
+    """An option that may be given again."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        """Join the texts by commas."""
+        before = getattr(namespace, self.dest, None)
+        setattr(namespace, self.dest, values if before is None else f"{before},{values}")
+
+
 def _help(field: "dataclasses.Field[Any]") -> str:
     """An option's help with its default."""
     text = field.metadata["text"]
     shown = field.metadata["default_text"]
     if not shown and field.default is not dataclasses.MISSING and field.default is not None:
         default = field.default
-        shown = ",".join(default) if isinstance(default, tuple) else str(default)
+        shown = ",".join(map(_shown, default)) if isinstance(default, tuple) else str(default)
         shown = {"True": "on", "False": "off"}.get(shown, shown)
     return (f"{text} (default: {shown})" if shown else text).replace("%", "%%")
+
+
+def _shown(item: Any) -> str:
+    return f"{item:g}" if isinstance(item, float) else str(item)
 
 
 def _plain(hint: Any) -> Any:
@@ -224,4 +260,11 @@ def _names(text: str) -> tuple[str, ...]:
     return parts
 
 
-_READERS: Mapping[Any, Callable[[str], Any]] = types.MappingProxyType({int: _whole, float: _number, str: str})
+def _numbers(text: str) -> tuple[float, ...]:
+    """Read a comma list of numbers."""
+    return tuple(map(_number, _names(text)))
+
+
+_READERS: Mapping[Any, Callable[[str], Any]] = types.MappingProxyType(
+    {int: _whole, float: _number, str: str, tuple[float, ...]: _numbers}
+)

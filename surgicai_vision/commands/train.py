@@ -8,7 +8,7 @@ from surgicai_vision import names, registry
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.logs import LOGS, open_log
-from surgicai_vision.commands.options import many_of, not_negative, one_of, option, positive
+from surgicai_vision.commands.options import many_of, not_negative, one_of, option, positive, weights_option
 from surgicai_vision.config import DEVIATIONS
 from surgicai_vision.errors import InputError
 
@@ -40,7 +40,7 @@ class Options:
         metavar="VIEW[,VIEW]",
         default_text="front,back",
     )
-    weights: str | None = option(None, "file with the encoder's pretrained weights", metavar="FILE")
+    weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
     pool: str = option("global", f"what is taken: {', '.join(registry.POOLS)}", check=one_of("pool", registry.POOLS))
     policy: str = option("bc", f"one of {', '.join(registry.POLICIES)}", check=one_of("policy", registry.POLICIES))
