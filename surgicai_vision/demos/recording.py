@@ -78,8 +78,8 @@ def recording_of(arrays: Arrays, config: BagConfig, instrument: str) -> Recordin
     """
     times = _times(arrays, config)
     roles = _roles(arrays, config)
-    begin = max(times[role][0] for role in roles)
-    end = min(times[role][-1] for role in roles)
+    begin = max(times[role].min() for role in roles)
+    end = min(times[role].max() for role in roles)
     if not begin < end <= begin + LONGEST * 1e9 * config.speed:
         raise InputError(
             f"The topics overlap in {(end - begin) / 1e9:.1f} s; that must be above 0 and at most {LONGEST:.0f} s."

@@ -122,7 +122,7 @@ def _by_events(recording: Recording, pair: HolePair) -> list[Segment]:
         entered = _next(inside, taken)
         placed = taken if entered > taken and inside[entered] and _near_entry(lying[taken], pair) else entered
         given = _next(first, _next(passed >= 2.0, placed))
-        there = _arrival(lying, placed, given)
+        there = _arrival(lying, placed, given) if first[given] else given
         end = _release(first, lying, given) if first[given] else given
         cuts = [start, taken, placed, there, given, end]
         happened = [second[taken] or inside[taken], True, True, first[given], True]

@@ -1,0 +1,556 @@
+"""Bags of ROS 1 and ROS 2: our own expert's motions go out and come back; what is wrong is told in one line."""
+
+import dataclasses
+import itertools
+import json
+import sys
+
+import numpy as np
+import pytest
+import yaml
+from bag_writer import FORMATS, START, TOPICS, TYPES, shown, streams, write_bag
+from scipy.spatial.transform import Rotation
+
+import surgicai_vision.envs as envs
+from surgicai_vision import names
+from surgicai_vision.cli import main
+from surgicai_vision.demos import bags, segments
+from surgicai_vision.demos.bag_config import BagConfig, Frames, Topics
+from surgicai_vision.demos.bag_import import import_bags
+from surgicai_vision.demos.lesson import learn_lesson
+from surgicai_vision.demos.recording import recording_of
+from surgicai_vision.demos.store import read_demo, read_marker
+from surgicai_vision.envs import poses
+from surgicai_vision.errors import BadFile, InputError, OutputExists, UnknownName
+from surgicai_vision.scene import kinematics
+from surgicai_vision.scene.holes import PAIRS
+from surgicai_vision.scene.rotations import geodesic_angle
+
+WHOLE = BagConfig(drop_pauses=False)
+PAIR = PAIRS["simple"][0]
+
+
+def recorded(path, config=WHOLE):
+    return recording_of(bags.read(path, config.all_topics), config, "400006")
+
+
+# -- the round trip ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_what_was_recorded_stands_where_it_stood(tmp_path, form):
+    motion = shown("suture")
+    bag = write_bag(tmp_path / "trial", form, streams(motion))
+    made = import_bags([bag], task=None, out=tmp_path / "demos", config=WHOLE)
+    assert [row.task for row in made] == list(names.SUBTASKS)
+    assert all((row.skipped, row.succeeded) == ((), 1) for row in made)
+    for row in made:
+        demo = read_demo(row.paths[0])
+        env = envs.make(demo.config)
+        phase = names.SUBTASKS.index(row.task)
+        first = int(np.argmax(motion.phase == phase))
+        assert abs(len(demo) - (motion.phase == phase).sum()) <= 1
+        assert (demo.source, demo.seed, set(demo.phase)) == ("bag", -1, {phase})
+        for index, state in enumerate(demo.state):
+            env.set_state_vector(state)
+            for arm in names.ARMS:
+                tip = poses.square(env.simulation.tip_in_base(arm))
+                np.testing.assert_allclose(tip, motion.tip[arm][first + index], atol=2e-5)
+                assert abs(env.simulation.jaw(arm) - motion.jaw[arm][first + index]) < 0.05
+            lying = poses.square(env.simulation.needle())
+            np.testing.assert_allclose(lying, motion.needle[first + index], atol=1e-6)
+
+
+def test_the_three_formats_and_single_files_say_the_same(tmp_path):
+    found = streams(shown("grasp"))
+    paths = [write_bag(tmp_path / form, form, found) for form in FORMATS]
+    paths += [tmp_path / "db3/db3.db3", tmp_path / "mcap/mcap.mcap"]
+    first, *others = (bags.read(path, BagConfig().all_topics) for path in paths)
+    for other in others:
+        assert set(other) == set(first)
+        assert all((other[key] == first[key]).all() for key in first)
+
+
+def test_actions_carry_the_arm_along_the_recorded_path(tmp_path):
+    from surgicai_vision.envs.control import StepSize, moved
+
+    motion = shown("pullout")
+    bag = write_bag(tmp_path / "trial", "mcap", streams(motion))
+    (made,) = import_bags([bag], task="pullout", out=tmp_path / "demos", config=WHOLE)
+    demo = read_demo(made.paths[0])
+    assert made.clipped == 0
+    pose = poses.flat(motion.tip["psm1"][0])
+    for row, wanted in zip(demo.action, motion.tip["psm1"][1:], strict=False):
+        pose = moved(pose, row.astype(float).tolist(), StepSize.of(made.step))
+        np.testing.assert_allclose(poses.square(pose), wanted, atol=1e-4)
+
+
+def test_an_imported_bag_teaches_a_movement_primitive(tmp_path):
+    bag = write_bag(tmp_path / "trial", "bag", streams(shown("place")))
+    (made,) = import_bags([bag], task="place", out=tmp_path / "demos")
+    lesson = learn_lesson("place", [read_demo(path) for path in made.paths])
+    assert len(lesson.parts) == 1
+
+
+def test_the_same_import_again_does_nothing_and_another_is_refused(tmp_path):
+    bag = write_bag(tmp_path / "trial", "bag", streams(shown("grasp")))
+    first = import_bags([bag], task="grasp", out=tmp_path / "demos")
+    before = first[0].paths[0].stat().st_mtime_ns
+    assert import_bags([bag], task="grasp", out=tmp_path / "demos") == first
+    assert first[0].paths[0].stat().st_mtime_ns == before
+    with pytest.raises(OutputExists, match="another command"):
+        import_bags([bag], task="grasp", out=tmp_path / "demos", config=WHOLE)
+
+
+def test_several_bags_become_one_folder(tmp_path):
+    found = [write_bag(tmp_path / f"trial{seed}", "mcap", streams(shown("grasp", seed))) for seed in (0, 3)]
+    (made,) = import_bags(found, task="grasp", out=tmp_path / "demos")
+    assert (made.task, len(made.paths), made.succeeded) == ("grasp", 2, 2)
+
+
+# -- time -------------------------------------------------------------------------------------------------------------
+
+
+def swinging(seconds):
+    """Return T_base_tip (N, 4, 4) that swings about the start: ±5 mm and ±40° at 1 Hz, a smooth known motion."""
+    phase = 2 * np.pi * np.asarray(seconds)
+    motion = np.tile(kinematics.start_in_base("psm2"), (len(phase), 1, 1))
+    turn = Rotation.from_rotvec(np.radians(40.0) * np.sin(phase)[:, None] * np.array([0.0, 0.6, 0.8]))
+    motion[:, :3, :3] = turn.as_matrix() @ motion[:, :3, :3]
+    motion[:, :3, 3] += 0.005 * np.column_stack([np.sin(phase), np.cos(phase), np.sin(2 * phase)])
+    return motion
+
+
+def irregular(rate, seconds, seed, lost=0.0):
+    """Return message times [ns] with ±40 % jitter, some of them lost."""
+    rng = np.random.default_rng(seed)
+    count = int(rate * seconds)
+    times = (np.arange(count) + rng.uniform(-0.4, 0.4, count)) / rate
+    times = np.sort(np.abs(times))[rng.random(count) >= lost]
+    return (times * 1e9).astype(np.int64)
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+@pytest.mark.parametrize("late", [0, 8_000_000])
+def test_jitter_and_lost_messages_do_not_show_after_resampling(tmp_path, lost, late):
+    pose, jaw = irregular(170, 4, 1, lost), irregular(90, 4, 2, lost)
+    found = {
+        "psm2_pose": (pose, swinging(pose / 1e9)),
+        "psm2_jaw": (jaw, 0.4 + 0.2 * np.sin(jaw / 1e9)),
+    }
+    bag = write_bag(tmp_path / "trial", "mcap", found, late=late)
+    recording = recorded(bag)
+    assert recording.valid.all()
+    np.testing.assert_allclose(np.diff(recording.time), 1 / names.FPS, atol=1e-9)
+    seconds = recording.time + max(pose[0], jaw[0]) / 1e9
+    wanted = swinging(seconds)
+    tip = recording.arms["psm2"].tip
+    # A chord over dt misses a swing of 5 mm at 2 Hz by up to A (2 π f dt)² / 8: 0.3 mm over five lost messages.
+    assert np.linalg.norm(tip[:, :3, 3] - wanted[:, :3, 3], axis=1).max() < 0.4e-3
+    assert np.median(np.linalg.norm(tip[:, :3, 3] - wanted[:, :3, 3], axis=1)) < 0.03e-3
+    angles = [geodesic_angle(a[:3, :3], b[:3, :3]) for a, b in zip(tip, wanted, strict=True)]
+    assert max(angles) < np.radians(1.0)
+    np.testing.assert_allclose(recording.arms["psm2"].jaw, 0.5 * (0.4 + 0.2 * np.sin(seconds)), atol=1e-3)
+
+
+def test_without_stamps_the_time_of_reception_counts(tmp_path):
+    times = irregular(200, 2, 3)
+    bag = write_bag(tmp_path / "trial", "bag", {"psm2_pose": (times, swinging(times / 1e9))}, stamped=False)
+    tip = recorded(bag).arms["psm2"].tip
+    wanted = swinging(recorded(bag).time + times[0] / 1e9)
+    assert np.linalg.norm(tip[:, :3, 3] - wanted[:, :3, 3], axis=1).max() < 0.1e-3
+    with pytest.raises(InputError, match="no stamps"):
+        recorded(bag, BagConfig(clock="stamp"))
+
+
+def test_labels_without_stamps_agree_with_poses_that_have_them(tmp_path):
+    """A constant delay between stamp and reception does not shift the labels against the poses."""
+    motion = shown("suture")
+    found = streams(motion)
+    bag = write_bag(tmp_path / "trial", "mcap", found)
+    arrays = bags.read(bag, WHOLE.all_topics)
+    for key in arrays:
+        if key.endswith(".time"):
+            arrays[key] = arrays[key] + 70_000_000
+    delayed = recording_of(arrays, WHOLE, "400006")
+    assert (delayed.label == recorded(bag).label).all()
+
+
+def test_messages_out_of_order_and_repeated_are_put_right(tmp_path):
+    times = irregular(200, 2, 4)
+    bag = write_bag(tmp_path / "trial", "mcap", {"psm2_pose": (times, swinging(times / 1e9))})
+    arrays = bags.read(bag, WHOLE.all_topics)
+    order = np.random.default_rng(0).permutation(np.append(np.arange(len(times)), [5, 5, 9]))
+    mixed = {key: array[order] if array.ndim and key != "topics" else array for key, array in arrays.items()}
+    one, other = (recording_of(some, WHOLE, "400006").arms["psm2"].tip for some in (arrays, mixed))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_a_gap_costs_the_part_it_lies_in(tmp_path):
+    motion = shown("suture")
+    found = streams(motion)
+    times, tips = found["psm2_pose"]
+    silent = (times > 2_400_000_000) & (times < 2_900_000_000)  # while placing
+    found["psm2_pose"] = times[~silent], tips[~silent]
+    bag = write_bag(tmp_path / "trial", "mcap", found)
+    made = import_bags([bag], task=None, out=tmp_path / "demos")
+    assert [row.task for row in made] == ["grasp", "insert", "handoff", "pullout"]
+    with pytest.raises(InputError, match=r"place: a topic is silent for over 0\.2 s"):
+        import_bags([bag], task="place", out=tmp_path / "other")
+    patient = import_bags([bag], task="place", out=tmp_path / "other", config=BagConfig(max_gap=1.0))
+    assert len(patient[0].paths) == 1
+
+
+def test_pauses_are_left_out_and_slow_motion_is_not():
+    count = 300
+    tip = np.tile(kinematics.start_in_base("psm2"), (count, 1, 1))
+    way = np.concatenate([np.linspace(0, 0.01, 100), np.full(100, 0.01), 0.01 + np.linspace(0, 0.001, 100)])
+    tip[:, 0, 3] += way + 2e-6 * np.random.default_rng(0).normal(size=count)
+    kept = segments.moving(tip, np.zeros(count))
+    rested = (kept > 110) & (kept < 190)
+    assert not rested.any()
+    assert {0, count - 1} <= set(kept)
+    assert len(kept) >= 200 - 2 * segments.WINDOW
+    jaw = np.concatenate([np.zeros(120), np.linspace(0, 0.5, 50), np.full(130, 0.5)])
+    assert set(range(125, 165)) <= set(segments.moving(tip, jaw)), "a closing jaw is no pause"
+
+
+def test_yaw_past_half_a_turn_is_no_jump(tmp_path):
+    """SurgicAI's half of the insertions turn the long way round; through quaternions of either sign none does."""
+    times = (np.arange(100) * 20_000_000).astype(np.int64)
+    motion = np.tile(kinematics.start_in_base("psm2"), (100, 1, 1))
+    yaw = np.arctan2(motion[0, 1, 0], motion[0, 0, 0])
+    turn = Rotation.from_euler("z", (np.linspace(np.pi - 0.3, np.pi + 0.3, 100) - yaw)[:, None])
+    motion[:, :3, :3] = turn.as_matrix() @ motion[:, :3, :3]
+    found = {"psm2_pose": (times, motion), "needle": (times, motion)}
+    tip = recorded(write_bag(tmp_path / "trial", "bag", found)).arms["psm2"].tip
+    turns = [geodesic_angle(a[:3, :3], b[:3, :3]) for a, b in itertools.pairwise(tip)]
+    np.testing.assert_allclose(turns, 0.6 / 99, rtol=1e-3)
+
+
+# -- frames and units -------------------------------------------------------------------------------------------------
+
+
+def seven(pose):
+    return (*pose[:3, 3].tolist(), *Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True).tolist())
+
+
+def some_pose(seed):
+    rng = np.random.default_rng(seed)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.2, 0.2, 3)
+    return pose
+
+
+def test_frames_and_units_are_converted(tmp_path):
+    motion = shown("place")
+    frame, tool, world, mark = (some_pose(seed) for seed in range(4))
+    found = streams(motion)
+    tips = np.linalg.inv(frame) @ motion.tip["psm2"] @ tool
+    tips[:, :3, 3] *= 1000.0
+    lying = np.linalg.inv(world) @ motion.needle @ mark
+    lying[:, :3, 3] *= 10.0
+    found = {"psm2_pose": (found["psm2_pose"][0], tips), "needle": (found["needle"][0], lying)}
+    config = BagConfig(
+        frames=Frames(psm2=seven(frame), tip=seven(tool), needle=seven(world), needle_offset=seven(mark)),
+        length_scale=0.001,
+        needle_scale=0.1,
+    )
+    recording = recorded(write_bag(tmp_path / "trial", "mcap", found, frame="ECM"), config)
+    np.testing.assert_allclose(recording.arms["psm2"].tip, motion.tip["psm2"], atol=1e-9)
+    np.testing.assert_allclose(recording.needle, motion.needle, atol=1e-9)
+
+
+def test_poses_relative_to_the_endoscope_are_refused(tmp_path):
+    bag = write_bag(tmp_path / "trial", "mcap", streams(shown("grasp")), frame="ECM")
+    with pytest.raises(InputError, match=r"is in frame 'ecm'.*local/measured_cp"):
+        import_bags([bag], task="grasp", out=tmp_path / "demos")
+
+
+def test_joints_serve_where_there_is_no_pose(tmp_path):
+    motion = shown("grasp")
+    found = streams(motion)
+    times = found.pop("psm2_pose")[0]
+    found["psm2_joints"] = times, motion.joints["psm2"]
+    topics = {**TOPICS, "psm2_joints": "/PSM2/measured_js"}
+    recording = recorded(write_bag(tmp_path / "trial", "bag", found, topics))
+    np.testing.assert_allclose(recording.arms["psm2"].tip, motion.tip["psm2"], atol=2e-6)
+
+
+def test_transforms_and_whole_numbers_are_read_as_well(tmp_path):
+    motion = shown("suture")
+    found = streams(motion)
+    times, labels = found["label"]
+    found["label"] = times, [names.SUBTASKS.index(label) for label in labels]
+    types = {**TYPES, "pose": "geometry_msgs/msg/TransformStamped", "label": "std_msgs/msg/Int32"}
+    plain, other = (write_bag(tmp_path / name, "mcap", *rest) for name, *rest in (
+        ("plain", streams(motion)), ("other", found, TOPICS, types)))  # fmt: skip
+    one, two = recorded(plain), recorded(other)
+    np.testing.assert_array_equal(one.arms["psm1"].tip, two.arms["psm1"].tip)
+    assert segments.segments(one, PAIR, WHOLE, None) == segments.segments(two, PAIR, WHOLE, None)
+
+
+AMBF = """\
+Header header  # AMBF's state of a body, of a version of its own
+uint32 sim_step
+string name
+float32 mass
+geometry_msgs/Pose pose
+float32[] joint_positions
+================================================================================
+MSG: std_msgs/Header
+uint32 seq
+"""
+
+
+def test_states_of_ambf_are_read_by_the_definition_in_the_bag(tmp_path):
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    motion = shown("place")
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(AMBF.split("\n===")[0], "ambf_msgs/msg/RigidBodyState"))
+    types = store.types
+    with Writer(tmp_path / "trial.bag") as writer:
+        topics = ("/ambf/env/Needle/State", "/ambf/env/psm2/baselink/State")
+        needle, arm = (
+            writer.add_connection(topic, "ambf_msgs/msg/RigidBodyState", typestore=store) for topic in topics
+        )
+        for index, lying in enumerate(motion.needle):
+            time = START + index * 20_000_000
+            stamp = types["builtin_interfaces/msg/Time"](sec=time // 10**9, nanosec=time % 10**9)
+            header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="world", seq=0)
+            x, y, z, *turn = seven(lying)
+            point = types["geometry_msgs/msg/Point"](10 * x, 10 * y, 10 * z)
+            w, i, j, k = turn
+            pose = types["geometry_msgs/msg/Pose"](point, types["geometry_msgs/msg/Quaternion"](i, j, k, w))
+            joints = np.append(motion.joints["psm2"][index], [0.1, 0.1]).astype(np.float32)
+            joints[2] *= 10
+            message = types["ambf_msgs/msg/RigidBodyState"](header, index, "body", 0.1, pose, joints)
+            for connection in (needle, arm):
+                writer.write(connection, time, store.serialize_ros1(message, connection.msgtype))
+    state = "/ambf/env/psm2/baselink/State"
+    config = BagConfig("ambf", Topics(psm2_joints=state, psm2_jaw=state, needle="/ambf/env/Needle/State"))
+    recording = recorded(tmp_path / "trial.bag", config)
+    np.testing.assert_allclose(recording.needle, motion.needle, atol=1e-9)
+    np.testing.assert_allclose(recording.arms["psm2"].tip, motion.tip["psm2"], atol=1e-6)
+    np.testing.assert_allclose(recording.arms["psm2"].jaw, 0.1, atol=1e-6)
+
+
+# -- subtasks ---------------------------------------------------------------------------------------------------------
+
+
+def test_events_find_the_five_subtasks_of_a_stitch(tmp_path):
+    motion = shown("suture")
+    recording = recorded(write_bag(tmp_path / "trial", "mcap", streams(motion, labels=False)))
+    found = segments.segments(recording, PAIR, WHOLE, None)
+    assert [segment.task for segment in found] == list(names.SUBTASKS)
+    assert all(one.stop == other.start for one, other in itertools.pairwise(found))
+    for phase, segment in enumerate(found):
+        inside = motion.phase[segment.start : segment.stop] == phase
+        assert inside.mean() > 0.8, segment
+    grasp, _, insert, handoff, pullout = found
+    first, second = (segments.holds(recording, arm) for arm in names.ARMS)
+    passed = segments.holes_passed(recording.needle, PAIR)
+    assert not second[: grasp.stop].any()
+    assert second[grasp.stop]
+    assert (passed[insert.start - 1], passed[insert.start], passed[insert.stop]) == (0, 1, 2)
+    assert not first[: handoff.stop].any()
+    assert first[handoff.stop]
+    assert passed[pullout.stop] == 3
+    moved = np.linalg.norm(recording.needle[handoff.start, :3, 3] - recording.needle[handoff.stop, :3, 3])
+    assert moved <= segments.ARRIVED
+
+
+@pytest.mark.parametrize("task", names.SUBTASKS)
+def test_events_know_a_single_subtask(tmp_path, task):
+    motion = shown(task, 3)
+    bag = write_bag(tmp_path / "trial", "mcap", streams(motion, labels=False))
+    (made,) = import_bags([bag], task=None, out=tmp_path / "demos")
+    assert (made.task, made.succeeded) == (task, 1)
+    assert len(read_demo(made.paths[0])) > 0.9 * (len(motion) - 1)
+
+
+def test_events_find_a_second_stitch(tmp_path):
+    motion = shown("suture")
+    twice = dataclasses.replace(
+        motion,
+        **{key: {arm: np.concatenate([a, a]) for arm, a in getattr(motion, key).items()} for key in ("tip", "jaw")},
+        needle=np.concatenate([motion.needle] * 2),
+        phase=np.tile(motion.phase, 2),
+    )
+    recording = recorded(write_bag(tmp_path / "trial", "mcap", streams(twice, labels=False)))
+    found = [segment.task for segment in segments.segments(recording, PAIR, WHOLE, None)]
+    assert found == [*names.SUBTASKS, *names.SUBTASKS]
+
+
+def test_noise_of_a_tracker_leaves_the_subtasks_as_they_are(tmp_path):
+    motion = shown("suture")
+    rng = np.random.default_rng(0)
+    needle = motion.needle.copy()
+    needle[:, :3, 3] += rng.normal(0, 0.00005, (len(needle), 3))
+    tip = {arm: poses_.copy() for arm, poses_ in motion.tip.items()}
+    for poses_ in tip.values():
+        poses_[:, :3, 3] += rng.normal(0, 0.00005, (len(needle), 3))
+    noisy = dataclasses.replace(motion, tip=tip, needle=needle)
+    clean, other = (
+        segments.segments(recorded(write_bag(tmp_path / name, "mcap", streams(some, labels=False))), PAIR, WHOLE, None)
+        for name, some in (("clean", motion), ("noisy", noisy))
+    )
+    assert [segment.task for segment in other] == list(names.SUBTASKS)
+    assert all(abs(a.stop - b.stop) <= 10 for a, b in zip(clean, other, strict=True))
+
+
+def test_labels_of_other_systems_are_translated_and_unknown_ones_named(tmp_path):
+    found = streams(shown("suture"))
+    times, _ = found["label"]
+    found["label"] = times, ["Approach", "S2", "", "Regrasp", "idle"]
+    bag = write_bag(tmp_path / "trial", "mcap", found)
+    with pytest.raises(InputError, match=r"label 'S2'.*labels:"):
+        import_bags([bag], task=None, out=tmp_path / "demos")
+    made = import_bags([bag], task=None, out=tmp_path / "demos", config=BagConfig(labels={"s2": "place"}))
+    assert [row.task for row in made] == ["grasp", "place", "handoff"]
+
+
+@pytest.mark.parametrize("task", ["place", "insert", "handoff"])
+def test_without_a_needle_it_lies_where_the_task_puts_it(tmp_path, task):
+    found = streams(shown(task))
+    del found["needle"]
+    bag = write_bag(tmp_path / "trial", "mcap", found)
+    (made,) = import_bags([bag], task=task, out=tmp_path / "demos")
+    demo = read_demo(made.paths[0])
+    env = envs.make(demo.config)
+    env.set_state_vector(demo.state[-1])
+    assert env.measure()["d_trans"] < 0.006
+
+
+def test_nothing_to_segment_by_is_said(tmp_path):
+    found = streams(shown("place"), labels=False)
+    del found["needle"]
+    bag = write_bag(tmp_path / "trial", "mcap", found)
+    with pytest.raises(InputError, match=r"no labels and no needle.*--task"):
+        import_bags([bag], task=None, out=tmp_path / "demos")
+    with pytest.raises(InputError, match="need the needle's pose"):
+        import_bags([bag], task=None, out=tmp_path / "demos", config=BagConfig(segmentation="events"))
+    with pytest.raises(InputError, match="/subtask"):
+        import_bags([bag], task=None, out=tmp_path / "demos", config=BagConfig(segmentation="labels"))
+
+
+# -- wrong input ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory):
+    """A bag of a grasp, without labels."""
+    return write_bag(tmp_path_factory.mktemp("bags") / "trial", "bag", streams(shown("grasp"), labels=False))
+
+
+def test_topics_that_are_not_there_are_refused_with_those_that_are(trial, tmp_path):
+    for config, message in (
+        (
+            BagConfig(topics=Topics(needle="/needle")),
+            r"no topic /needle \(needle\); it has /PSM1/jaw/measured_js \(sens",
+        ),
+        (BagConfig("ambf"), r"none of /CRTK/psm1/measured_cp, .*Its topics: /PSM1/jaw/measured_js"),
+        (
+            BagConfig(topics=Topics(needle="/PSM1/jaw/measured_js")),
+            "holds sensor_msgs/JointState; needle is read from",
+        ),
+        (BagConfig(topics=Topics(psm2_pose="/PSM2/jaw/measured_js")), "psm2_pose is read from geometry_msgs/PoseSt"),
+    ):
+        with pytest.raises(InputError, match=message) as caught:
+            import_bags([trial], task="grasp", out=tmp_path / "demos", config=config)
+        assert "\n" not in str(caught.value)
+    assert not (tmp_path / "demos").exists()
+
+
+def test_a_task_that_is_not_shown_is_refused(trial, tmp_path):
+    with pytest.raises(InputError, match="shows no insert; segmented by events it shows grasp"):
+        import_bags([trial], task="insert", out=tmp_path / "demos")
+    with pytest.raises(UnknownName, match="Did you mean 'insert'"):
+        import_bags([trial], task="insrt", out=tmp_path / "demos")
+
+
+def test_an_arm_that_is_not_recorded_is_named(tmp_path):
+    found = {role: rows for role, rows in streams(shown("grasp")).items() if not role.startswith("psm2")}
+    bag = write_bag(tmp_path / "trial", "mcap", found)
+    with pytest.raises(
+        InputError, match=r"grasp is done by psm2, whose pose is not on /PSM2/measured_cp\. The topics"
+    ):
+        import_bags([bag], task="grasp", out=tmp_path / "demos")
+    found = {role: rows for role, rows in streams(shown("grasp")).items() if role != "psm2_jaw"}
+    bag = write_bag(tmp_path / "jawless", "mcap", found)
+    with pytest.raises(InputError, match="grasp needs the jaw of psm2, which is not on /PSM2/jaw/measured_js"):
+        import_bags([bag], task="grasp", out=tmp_path / "demos")
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"topics": {"neddle": "/x"}}, "Did you mean 'needle'"),
+        ({"topics": {"needle": "x"}}, "begins with '/'"),
+        ({"convention": "dvkr"}, "Did you mean 'dvrk'"),
+        ({"frames": {"psm1": [1, 2, 3]}}, "seven numbers"),
+        ({"labels": {"a": "graps"}}, "Did you mean 'grasp'"),
+        ({"speed": 0.0}, "above 0"),
+        ({"step": "papr"}, "Did you mean 'paper'"),
+        ({"segmentation": "label"}, "Did you mean 'labels'"),
+    ],
+)
+def test_a_wrong_table_is_one_line(trial, tmp_path, capsys, table, message):
+    (tmp_path / "bag.yaml").write_text(yaml.safe_dump({"bag": table}))
+    assert (
+        main(["import-demos", str(trial), "--config", str(tmp_path / "bag.yaml"), "--out", str(tmp_path / "o")]) == 2
+    )
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert message in lines[0]
+
+
+def test_the_command_line_reads_a_folder_of_bags(tmp_path, capsys):
+    for seed in (0, 3):
+        write_bag(tmp_path / f"bags/trial{seed}", "mcap", streams(shown("grasp", seed)), {**TOPICS, "needle": "/n"})
+    (tmp_path / "bag.yaml").write_text(
+        "bag: {drop_pauses: false, topics: {label: /subtask}}\nenv: {scene: {thread: 0}}"
+    )
+    command = [
+        "import-demos",
+        str(tmp_path / "bags"),
+        "--out",
+        str(tmp_path / "demos"),
+        "--topic",
+        "needle=/n",
+        "--json",
+    ]
+    assert main([*command, "--config", str(tmp_path / "bag.yaml")]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert result["bags"] == 2
+    assert result["tasks"]["grasp"]["episodes"] == 2
+    assert result["tasks"]["grasp"]["pauses"] == 0
+    assert read_marker(tmp_path / "demos/grasp")["source"] == "bag"
+
+
+def test_options_of_bags_are_refused_for_pickles(tmp_path, capsys):
+    (tmp_path / "x.pkl").write_bytes(b"")
+    assert main(["import-demos", str(tmp_path / "x.pkl"), "--task", "grasp", "--topic", "needle=/n"]) == 2
+    assert "--topic is of bags" in capsys.readouterr().err
+    assert main(["import-demos", str(tmp_path), "--task", "grasp"]) == 2
+    assert "a folder without bags" in capsys.readouterr().err
+
+
+def test_no_definition_of_a_bag_becomes_code(trial):
+    """`rosbags` would make a module of a bag's definitions; we never ask it to."""
+    sys.modules.pop("rosbags.usertypes", None)
+    bags.read(trial, BagConfig().all_topics)
+    assert "rosbags.usertypes" not in sys.modules
+
+
+def test_missing_and_packed_bags_are_told(tmp_path):
+    with pytest.raises(BadFile, match="no such file"):
+        import_bags([tmp_path / "nothing.bag"], task="grasp", out=tmp_path / "demos")
+    bag = write_bag(tmp_path / "trial", "db3", streams(shown("grasp")))
+    table = yaml.safe_load((bag / "metadata.yaml").read_text())
+    table["rosbag2_bagfile_information"] |= {"compression_mode": "FILE", "compression_format": "zstd"}
+    (bag / "metadata.yaml").write_text(yaml.safe_dump(table))
+    with pytest.raises(BadFile, match="unpack it first"):
+        import_bags([bag], task="grasp", out=tmp_path / "demos")
