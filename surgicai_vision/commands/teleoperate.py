@@ -1,8 +1,6 @@
 """`teleoperate`: drive the arms by keyboard or gamepad and record what succeeded."""
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -104,15 +102,19 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     config = _config(options)
     out = Path(options.out) if options.out else folders.OUTPUTS / "teleoperation" / options.task
     folders.check_folder(out, "demos.json")
-    env = envs.make(config)
     rules = Rules(options.episodes, options.auto_keep, options.keep_failures, options.skip_idle)
-    with open_recordings(out, config, env.scene.hash, options.seed) as recordings, _place(options, console) as place:
-        session = Session(env, Steering(env, options.frame, options.speed), recordings, options.view, rules)
-        views = Views(env, options.view, options.size)
-        drive(session, place, place, views, Pacer(options.pace), lambda status: _tell(console, status.message))
-        views.close()
+    with _place(options) as place:
+        env = envs.make(config)
+        with open_recordings(out, config, env.scene.hash, options.seed) as recordings:
+            session = Session(env, Steering(env, options.frame, options.speed), recordings, options.view, rules)
+            views = Views(env, options.view, options.size)
+            for line in place.invitation:
+                console.note(line)
+            drive(session, place, place, views, Pacer(options.pace), lambda status: _tell(console, status.message))
+            views.close()
     env.close()
-    console.say(f"{session.kept} kept, {session.discarded} discarded; {len(recordings.seeds)} demonstrations: {out}")
+    held = f"{len(recordings.seeds)} demonstrations: {out}" if recordings.seeds else "no demonstrations yet."
+    console.say(f"{session.kept} kept, {session.discarded} discarded; {held}")
     return {
         "task": options.task,
         "kept": session.kept,
@@ -136,22 +138,16 @@ def _config(options: Options) -> TaskConfig:
     return dataclasses.replace(config, max_steps=max(1, round(seconds * names.FPS)))
 
 
-@contextmanager
-def _place(options: Options, console: Console) -> Iterator[Any]:
-    """Yield where the person sees and acts: a window or a page."""
+def _place(options: Options) -> Any:
+    """Return where the person sees and acts: a window or a page."""
     title = names.TASK_TEXTS[options.task]
-    if not options.web:
-        from surgicai_vision.teleoperation.window import Window
+    if options.web:
+        from surgicai_vision.teleoperation.web import WebView
 
-        with Window(options.view, title, options.size) as window:
-            yield window
-        return
-    from surgicai_vision.teleoperation.web import WebView
+        return WebView(options.view, title, options.port)
+    from surgicai_vision.teleoperation.window import Window
 
-    with WebView(options.view, title, options.port) as page:
-        console.note(f"Open {page.url}")
-        console.note(f"From another machine: ssh -L {page.port}:127.0.0.1:{page.port} THIS-MACHINE, then the same.")
-        yield page
+    return Window(options.view, title, options.size)
 
 
 def _tell(console: Console, message: str) -> None:

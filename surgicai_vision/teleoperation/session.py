@@ -276,7 +276,7 @@ class Session:
             self._keep()
         elif self._state != WAITING:
             self.discarded += 1
-        self._state, self._message = STOPPED, "Stopped."
+        self._state, self._message = STOPPED, f"{self.kept} kept. Everything is written."
 
     def _begin(self, seed: int, said: str) -> None:
         """Wait at the start of `seed`."""

@@ -218,6 +218,10 @@ class WebView:
             raise InputError(f"--port {port} is not free ({reason}); give another, or 0 for any.") from None
         self.port = self._server.server_address[1]
         self.url = f"http://{HOST}:{self.port}/{self.token}/"
+        self.invitation = (
+            f"Open {self.url}",
+            f"From another machine: ssh -L {self.port}:{HOST}:{self.port} THIS-MACHINE, then open the same there.",
+        )
         self.wants, self.show, self.poll = self.screen.wants, self.screen.show, self.hands.poll
 
     def __enter__(self) -> "WebView":

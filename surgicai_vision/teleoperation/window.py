@@ -5,6 +5,7 @@ elsewhere, as for the web. GLFW demands the main thread.
 """
 
 import ctypes
+import functools
 import os
 import warnings
 from collections.abc import Mapping
@@ -23,9 +24,12 @@ from surgicai_vision.teleoperation.keyboard import Keyboard
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, Status
 
 NO_WINDOW = "No window can be opened ({}); add --web for a page that any browser shows, also through ssh -L."
-BAR, GAP = 64, 4
+BAR, GAP = 88, 4
 """Height of the lines of text under the pictures, and space between these [pixel]."""
-PAPER, INK = (20, 23, 26), (232, 234, 236)
+NARROWEST = 480
+"""Width at which the lines fit [pixel]."""
+KEYS = "WASD EQ move   IK JL UO turn   Space jaw   Shift fine   V view   → keep   ← again   Esc stop"
+PAPER, INK, SOFT = (20, 23, 26), (232, 234, 236), (154, 164, 173)
 COLOURS = MappingProxyType({"waiting": (92, 195, 224), DRIVING: (255, 107, 107), "stopped": (154, 164, 173)})
 """State → colour of its mark; a judged episode is green or orange."""
 GOOD, BAD = (95, 194, 138), (239, 138, 114)
@@ -58,11 +62,13 @@ class Window:
     """
 
     def __init__(self, views: tuple[str, ...], title: str, size: int):
+        self.invitation = ("The window takes the keys: --help names them.",)
         self._glfw = _started()
         self._keyboard, self._gamepad = Keyboard(), Gamepad()
-        width = len(views) * (size + GAP) - GAP
+        width = max(len(views) * (size + GAP) - GAP, NARROWEST)
         self._canvas: NDArray[np.uint8] = np.zeros((size + BAR, width, 3), np.uint8)
         self._views, self._size, self._told = views, size, ""
+        self._tags = {view: name_tag(view)[:size, :size] for view in views}
         self._handle = self._opened(title)
         self._codes = _codes(self._glfw)
         # GLFW keeps no reference to what it calls.
@@ -97,6 +103,8 @@ class Window:
         for column, view in enumerate(sorted(self._views, key=lambda name: name != status.view)):
             left = column * (self._size + GAP)
             self._canvas[: self._size, left : left + self._size] = pictures[view]
+            tag = self._tags[view]
+            self._canvas[: tag.shape[0], left : left + tag.shape[1]] = tag
         lines = status_lines(status)
         if str(lines) != self._told:
             self._told = str(lines)
@@ -223,14 +231,33 @@ def colour_of(status: Status) -> tuple[int, int, int]:
 
 
 def text_bar(lines: tuple[str, str], colour: tuple[int, int, int], width: int) -> NDArray[np.uint8]:
-    """Return the lines as a picture (BAR, width, 3), in a size at which they fit."""
-    from PIL import Image, ImageDraw, ImageFont
+    """Return the lines, and the keys below them, as a picture (BAR, width, 3), in sizes at which they fit."""
+    from PIL import Image, ImageDraw
 
     picture = Image.new("RGB", (width, BAR), PAPER)
     pen = ImageDraw.Draw(picture)
     pen.rectangle((0, 0, 5, BAR), fill=colour)
-    for row, line in enumerate(lines):
-        fonts = [ImageFont.load_default(size) for size in (17, 15, 13, 11, 9)]
+    for row, (line, ink) in enumerate(((lines[0], INK), (lines[1], INK), (KEYS, SOFT))):
+        fonts = [_font(size) for size in (15, 13, 11, 9, 7)]
         font = next((font for font in fonts if pen.textlength(line, font=font) <= width - 20), fonts[-1])
-        pen.text((14, 10 + 26 * row), line, fill=INK, font=font)
+        pen.text((14, 17 + 27 * row), line, fill=ink, font=font, anchor="lm")
     return np.asarray(picture)
+
+
+def name_tag(name: str) -> NDArray[np.uint8]:
+    """Return a small picture of a view's name, (height, width, 3)."""
+    from PIL import Image, ImageDraw
+
+    font = _font(12)
+    picture = Image.new("RGB", (int(font.getlength(name)) + 12, 20), PAPER)
+    ImageDraw.Draw(picture).text((6, 10), name, fill=INK, font=font, anchor="lm")
+    return np.asarray(picture)
+
+
+@functools.cache
+def _font(size: int) -> Any:
+    """Return matplotlib's DejaVu Sans, which has arrows."""
+    import matplotlib
+    from PIL import ImageFont
+
+    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", size)
