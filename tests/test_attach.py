@@ -31,13 +31,15 @@ def test_the_needle_stays_without_friction():
     env = made()
     env.reset(seed=1)
     env.model.geom_friction[:] = 1e-6
+    for _ in range(10):  # the squeeze turns the needle against the weld's give, once
+        env.step(np.zeros(7, dtype=np.float32))
     before = in_jaws(env)
     for _ in range(50):
         env.step(np.array([0.5, 0.5, 0.5, 0.3, 0.3, 0.3, 0], dtype=np.float32))
     after = in_jaws(env)
     assert env.measure()["contact"]
     assert poses.distance(before, after) < 3e-4
-    assert poses.angle(before, after) < np.radians(1.5)
+    assert poses.angle(before, after) < np.radians(0.5)
 
 
 def test_open_jaws_let_go():

@@ -1,0 +1,94 @@
+"""Count the needle's pixels at the end of successful expert episodes, in the views a policy learns from.
+
+    python benchmarks/visibility.py --episodes 100
+
+Per task and view: the share of starts at whose successful end the needle covers at least 25 pixels of 224 × 224 in
+the segmentation picture (with the exact 95 % interval), and the fewest, the 5 %, and the median number of pixels.
+Starts that the expert fails are counted apart.
+"""
+
+import argparse
+from typing import Any, NamedTuple
+
+import numpy as np
+from common import chunks, emit, spread
+
+from surgicai_vision import envs, names
+from surgicai_vision.config import SceneConfig, TaskConfig
+from surgicai_vision.demos.expert import Expert
+from surgicai_vision.errors import SurgicaiError
+from surgicai_vision.scene.rendering import FrameRenderer
+from surgicai_vision.statistics import clopper_pearson
+
+TASKS = ("grasp", "place", "insert", "handoff")
+SIZE, PIXELS, GOAL = 224, 25, 0.95
+"""Side of a picture, fewest needle pixels in it, share of the starts that must show as many."""
+
+
+class Job(NamedTuple):
+    """Some episodes of one task, seen by some views."""
+
+    config: TaskConfig
+    seeds: range
+    views: tuple[str, ...]
+
+
+def count(job: Job) -> list[list[int] | None]:
+    """Return the needle's pixels per view at the end of each episode, None where the expert failed."""
+    env = envs.make(job.config)
+    with FrameRenderer(env.model, SIZE, SIZE) as renderer:
+        return [_pixels(env, seed, renderer, job.views) for seed in job.seeds]
+
+
+def _pixels(env: envs.SuturingEnv, seed: int, renderer: FrameRenderer, views: tuple[str, ...]) -> list[int] | None:
+    expert, needle = Expert(env), names.PARTS.index("needle")
+    try:
+        env.reset(seed=seed)
+        for _ in range(env.config.max_steps):
+            _, _, terminated, truncated, info = env.step(expert.action())
+            if terminated or truncated:
+                break
+    except SurgicaiError:  # no physical start, or a way that cannot be reached
+        return None
+    if not info["is_success"]:
+        return None
+    return [int((renderer.render(env.data, view, names.SEGMENTATION) == needle).sum()) for view in views]
+
+
+def table(pixels: list[int]) -> dict[str, Any]:
+    """Return one view's row."""
+    seen = sum(value >= PIXELS for value in pixels)
+    low, high = clopper_pearson(seen, len(pixels))
+    return {
+        "share": round(seen / len(pixels), 4),
+        "interval_95": [round(low, 4), round(high, 4)],
+        "enough": seen / len(pixels) >= GOAL,
+        "pixels": {"min": min(pixels), "p5": int(np.quantile(pixels, 0.05)), "median": int(np.median(pixels))},
+    }
+
+
+def main() -> None:
+    """Play, look, and print one JSON line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=TASKS, nargs="+", default=TASKS)
+    parser.add_argument("--view", choices=names.CAMERAS, nargs="+", default=("front", "back"))
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=names.TEST_SEED)
+    parser.add_argument("--thread", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    chosen = parser.parse_args()
+    scene, views = SceneConfig(thread=chosen.thread), tuple(chosen.view)
+    seeds = chunks(chosen.seed, chosen.episodes)
+    jobs = [Job(TaskConfig(task, scene), part, views) for task in chosen.task for part in seeds]
+    done = list(zip(jobs, spread(count, jobs, chosen.workers), strict=True))
+    rows: dict[str, Any] = {}
+    for task in chosen.task:
+        ends = [end for job, part in done if job.config.task == task for end in part]
+        shown = [end for end in ends if end is not None]
+        rows[task] = {"episodes": len(ends), "successes": len(shown)}
+        rows[task] |= {view: table([end[index] for end in shown]) for index, view in enumerate(views) if shown}
+    emit("visibility", {"seed": chosen.seed, "size": SIZE, "at_least": PIXELS, "tasks": rows}, render=True)
+
+
+if __name__ == "__main__":
+    main()
