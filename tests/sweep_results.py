@@ -82,23 +82,31 @@ def write_sweep(out, tasks=TASKS, seeds=(0, 1), encoders=ENCODERS, views=VIEWS):
             key = f"{encoder}{index:03d}"
             described = cell(task, encoder, view, seed)
             if (task, encoder, view, seed) == ("handoff", "imagenet", ("back",), 1):
-                files.write_json(
-                    out / "cells" / key / "failed.json" if (out / "cells" / key).mkdir(parents=True) is None else out,
-                    {"cell": described, "error": "Traceback\n  in train\nRuntimeError: the disk is full"},
-                )
+                (out / "cells" / key).mkdir(parents=True)
+                error = "Traceback\n  in train\nRuntimeError: the disk is full"
+                files.write_json(out / "cells" / key / "failed.json", {"cell": described, "error": error})
                 continue
             better = 0.25 if task == "handoff" else 0.0
             store_cell(out, key, described, rate + better + 0.1 * (view == ("back",)), generator)
-        not_run.append(f"not run: {task}, r3m-{'+'.join(view)}, seed {seed}: R3M's weights are not here; see its card.")
+        not_run.append(
+            f"not run: {task}, r3m-{'+'.join(view)}, seed {seed}: R3M's weights are not here; see its card."
+        )
     for task in tasks:
         store_cell(out, f"blind{task}", cell(task, None, (), 0), 0.05, generator)
         evaluation(out / "references" / f"expert-{task}", task, "expert", 1.5, generator, {})
     files.write_json(out / "sweep.json", {"task": list(tasks), "demonstrations": 50, "seed": list(seeds)})
-    run = {"title": "table", "command": COMMAND, "not_run": not_run, "provenance": MACHINE, "data": "50 demonstrations"}
+    run = {
+        "title": "table",
+        "command": COMMAND,
+        "not_run": not_run,
+        "provenance": MACHINE,
+        "data": "50 demonstrations",
+    }
     files.write_json(out / "run.json", run)
     probes = [
-        {"encoder": encoder, "view": "+".join(view), "pool": "global", "tip_mm": 6 - 4 * rate + generator.normal(0, 0.2),
-         "angle_deg": 12.0, "n": 900} for (encoder, rate), view in itertools.product(encoders.items(), views)
+        {"encoder": encoder, "view": "+".join(view), "pool": "global", "angle_deg": 12.0, "n": 900,
+         "tip_mm": 6 - 4 * rate + generator.normal(0, 0.2)}
+        for (encoder, rate), view in itertools.product(encoders.items(), views)
     ]  # fmt: skip
     pq.write_table(pa.Table.from_pylist(probes), out / "probes.parquet")
     return out

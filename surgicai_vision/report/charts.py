@@ -4,7 +4,7 @@ Series have Okabe and Ito's colours and a marker of their own, so that no chart 
 and axes come from the page's style sheet.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from markupsafe import Markup, escape
@@ -27,8 +27,10 @@ _HEAT = ((247, 251, 255), (198, 219, 239), (107, 174, 214), (33, 113, 181), (8, 
 """Brewer's sequential blues at 0, ¼, ½, ¾ and 1: lightness alone carries the value."""
 
 _MARKERS = ("circle", "square", "triangle", "diamond")
+_MIDDLE = 0.179
+"""Relative luminance at which black and white letters have the same contrast (WCAG 2)."""
 WIDTH, HEIGHT = 340, 210
-LEFT, RIGHT, TOP, BOTTOM = 38, 12, 10, 40
+LEFT, RIGHT, TOP, BOTTOM = 38, 22, 10, 40
 """Size and margins of a curve's drawing, in its own units."""
 
 
@@ -57,8 +59,14 @@ def heat(rate: float) -> tuple[str, str]:
     low = min(int(at), len(_HEAT) - 2)
     share = at - low
     red, green, blue = (round((1 - share) * a + share * b) for a, b in zip(_HEAT[low], _HEAT[low + 1], strict=True))
-    dark = 0.299 * red + 0.587 * green + 0.114 * blue < 140
-    return f"#{red:02x}{green:02x}{blue:02x}", "#ffffff" if dark else "#10202c"
+    return f"#{red:02x}{green:02x}{blue:02x}", "#ffffff" if _luminance(red, green, blue) < _MIDDLE else "#000000"
+
+
+def _luminance(*channels: int) -> float:
+    """Return the relative luminance of an sRGB colour (WCAG 2)."""
+    shares = [channel / 255 for channel in channels]
+    linear = [share / 12.92 if share <= 0.04045 else ((share + 0.055) / 1.055) ** 2.4 for share in shares]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
 def interval(rate: float, low: float, high: float, label: str, paper: float | None = None) -> Markup:
@@ -88,11 +96,27 @@ def outcomes(successes: int, failures: dict[str, int]) -> Markup:
         at += width
     words = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in failures.items())
     label = escape(f"{successes} of {total} succeeded" + (f"; {words}" if words else ""))
-    return Markup(f'<svg class="outcomes" viewBox="0 0 160 14" role="img" aria-label="{label}">{"".join(parts)}</svg>')
+    box = 'viewBox="0 0 160 14" preserveAspectRatio="none" role="img"'
+    return Markup(f'<svg class="outcomes" {box} aria-label="{label}">{"".join(parts)}</svg>')
 
 
-def curves(series: Sequence[Series], x_name: str, *, logarithmic: bool = False, label: str = "") -> Markup:
-    """Draw success against x, one line a series, intervals as bars at the points."""
+def curves(
+    series: Sequence[Series],
+    x_name: str,
+    *,
+    logarithmic: bool = False,
+    label: str = "",
+    ticks: Mapping[float, str] | None = None,
+) -> Markup:
+    """Draw success against x, one line a series, intervals as bars at the points.
+
+    Args:
+        series: the lines; each has an x of its own for every point.
+        x_name: what x is.
+        logarithmic: a logarithmic axis; every x above 0.
+        label: what a screen reader says.
+        ticks: x → its word, where it is no number.
+    """
     from math import log
 
     xs = sorted({point.x for line in series for point in line.points})
@@ -103,7 +127,7 @@ def curves(series: Sequence[Series], x_name: str, *, logarithmic: bool = False, 
     def place(x: float, rate: float) -> tuple[float, float]:
         return LEFT + (WIDTH - LEFT - RIGHT) * (scale(x) - low) / span, TOP + (HEIGHT - TOP - BOTTOM) * (1 - rate)
 
-    parts = [_axes(xs, place, x_name)]
+    parts = [_axes(xs, place, x_name, ticks or {})]
     for index, line in enumerate(series):
         shift = 3.0 * (index - (len(series) - 1) / 2) / max(1, len(series) - 1) if len(series) > 1 else 0.0
         parts.append(_line(line, index, shift, place))
@@ -126,7 +150,7 @@ def key(names: Sequence[str]) -> Markup:
     return Markup(f'<p class="key">{"".join(items)}</p>')
 
 
-def _axes(xs: Sequence[float], place: object, x_name: str) -> str:
+def _axes(xs: Sequence[float], place: object, x_name: str, ticks: Mapping[float, str]) -> str:
     assert callable(place)
     parts = []
     for rate in (0.0, 0.25, 0.5, 0.75, 1.0):
@@ -139,7 +163,8 @@ def _axes(xs: Sequence[float], place: object, x_name: str) -> str:
         if at - last < 26:
             continue
         last = at
-        parts.append(f'<text x="{at:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{x:g}</text>')
+        word = escape(ticks.get(x, f"{x:g}"))
+        parts.append(f'<text x="{at:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{word}</text>')
     middle = LEFT + (WIDTH - LEFT - RIGHT) / 2
     parts.append(f'<text class="name" x="{middle:.1f}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_name)}</text>')
     return "".join(parts)

@@ -131,13 +131,13 @@ def survival(groups: Sequence[Group]) -> Chart | None:
             Point(index + 1, count / item.episodes, *b, words)
             for index, (count, b, words) in enumerate(zip(counts, bounds, texts, strict=True))
         ]
-        lines.append(Series(item.condition.label, tuple(points)))
-        rows.append((item.condition.label, *texts))
+        lines.append(Series(item.label, tuple(points)))
+        rows.append((item.label, *texts))
     if not lines:
         return None
     drawn = lines[:MOST]
-    title = "subtasks finished: " + ", ".join(f"{index + 1} {name}" for index, name in enumerate(names.SUBTASKS))
-    drawing = charts.curves(drawn, title, label="survival along the chain")
+    ticks = {float(index + 1): name for index, name in enumerate(names.SUBTASKS)}
+    drawing = charts.curves(drawn, "finished, and all before it", label="survival along the chain", ticks=ticks)
     more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
     key = charts.key([line.name for line in drawn])
     return Chart("", drawing, key, ("policy", *names.SUBTASKS), tuple(rows), more)
@@ -161,7 +161,7 @@ def probes(collected: Collected, groups: Sequence[Group]) -> Probes | None:
         k, n = sum(item.successes for item in mine), sum(item.episodes for item in mine)
         rows.append(
             {
-                "task": probe.get("task") or (mine[0].condition.task if mine else text.ABSENT),
+                "task": probe.get("task") or "all",
                 "encoder": str(probe.get("encoder")),
                 "view": _view(probe),
                 "tip_mm": _number(probe.get("tip_mm")),
@@ -209,7 +209,7 @@ def _correlation(pairs: Sequence[tuple[float, float]]) -> str:
     found = spearmanr(errors, rates)
     return (
         f"Spearman's rank correlation of tip error and success over {len(pairs)} pairs: {found.statistic:.2f} "
-        f"(p = {text.probability(float(found.pvalue))}); below 0 a better probe goes with more successes."
+        f"(p {text.probability(float(found.pvalue), '= ')}); below 0 a better probe goes with more successes."
     )
 
 

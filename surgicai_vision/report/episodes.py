@@ -56,7 +56,7 @@ def group_details(
             if strip is not None:
                 films.append({"cell": index, "start": row["seed"], **_film(strip, on_page)})
     return {
-        "title": item.condition.label,
+        "title": item.label,
         "task": item.condition.task,
         "count": f"{item.successes}/{item.episodes}" if item.episodes else "",
         "interval": text.interval(item.interval) if item.episodes else "",

@@ -4,8 +4,9 @@ Episodes of one cell: k/n with the exact (Clopper–Pearson) interval. Over seve
 deviation of the cells' rates, and a hierarchical bootstrap interval (training seeds, then episodes).
 """
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -47,6 +48,18 @@ class Group:
     condition: Condition
     results: tuple[Result, ...] = ()
     missing: tuple[Missing, ...] = ()
+    several: bool = False
+    """Whether another condition differs from it by nothing but the number of demonstrations."""
+
+    @property
+    def demonstrations(self) -> str:
+        """The number of demonstrations, where it tells the condition from another."""
+        return f"{self.condition.demonstrations} demonstrations" if self.several else ""
+
+    @property
+    def label(self) -> str:
+        """The condition with everything that tells it from others of its task."""
+        return self.condition.label + (f", {self.demonstrations}" if self.several else "")
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
@@ -112,11 +125,13 @@ def group(collected: Collected) -> list[Group]:
     """Return one group for each condition, in the order of the results, those without any at their places."""
     conditions = {result.condition for result in collected.results}
     conditions |= {cell.condition for cell in collected.missing}
+    alike = Counter(replace(condition, demonstrations=None) for condition in conditions)
     return [
         Group(
             condition,
             tuple(result for result in collected.results if result.condition == condition),
             tuple(cell for cell in collected.missing if cell.condition == condition),
+            alike[replace(condition, demonstrations=None)] > 1,
         )
         for condition in sorted(conditions, key=order)
     ]

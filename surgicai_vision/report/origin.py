@@ -55,7 +55,7 @@ def _cell(item: Group, result: Result) -> dict[str, Any]:
     command = evaluate_command(result) or str(result.about.get("command") or "")
     return {
         "task": item.condition.task,
-        "policy": item.condition.label,
+        "policy": item.label,
         "seed": result.seed if result.trained else text.ABSENT,
         "weights": _hash(checkpoint.get("weights_sha256")),
         "sha256": _hash(checkpoint.get("policy_sha256")),

@@ -35,7 +35,6 @@ def render(page: dict[str, Any]) -> str:
 def numbers(collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]) -> dict[str, Any]:
     """Return everything but pictures and provenance."""
     index = {item.condition: at for at, item in enumerate(groups)}
-    several = len({item.condition.demonstrations for item in groups if item.condition.demonstrations}) > 1
     best = {task: best_trained(of_task(groups, task)) for task in names.TASKS}
     return {
         **headline(groups),
@@ -43,8 +42,8 @@ def numbers(collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]
         "paper": _paper(groups, index),
         "paper_source": paper.SOURCE,
         "paper_episodes": paper.EPISODES,
-        "heats": _heats(groups, index, several),
-        "rows": [_row(at, item, best.get(item.condition.task), several) for at, item in enumerate(groups)],
+        "heats": _heats(groups, index),
+        "rows": [_row(at, item, best.get(item.condition.task)) for at, item in enumerate(groups)],
         "across_seeds": any(item.across for item in groups),
         "shifted": any(not item.condition.plain for item in groups),
         "filters": _filters(groups),
@@ -72,14 +71,14 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
     if len(tasks) > 1:
         return _headline_of_many(evaluated, tasks)
     shown = best_trained(evaluated) or evaluated[0]
-    task, label = shown.condition.task, shown.condition.label
+    task, label = shown.condition.task, shown.label
     count = f"{shown.successes} of {shown.episodes} held-out starts of {task}"
     sentence = f"{label} solves {count}"
     if shown.condition.trained and not shown.successes:
         sentence = f"No trained policy solves any of {shown.episodes} held-out starts of {task}"
     first = f"{text.percent(shown.rate)}, 95 % interval {text.interval(shown.interval)}."
     lead = f"That is {first}" if shown.successes or not shown.condition.trained else f"The best: {first}"
-    others = [f"{item.condition.label} {item.successes}/{item.episodes}" for item in evaluated if item is not shown]
+    others = [f"{item.label} {item.successes}/{item.episodes}" for item in evaluated if item is not shown]
     return {"headline": sentence, "lead": lead + (f" Beside it: {'; '.join(others[:FEW])}." if others else "")}
 
 
@@ -91,8 +90,7 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
     low, high = min(item.rate for item in best), max(item.rate for item in best)
     span = text.percent(high) if low == high else f"{text.percent(low)} to {text.percent(high)}"
     parts = [
-        f"{item.condition.task} {item.successes}/{item.episodes} ({text.interval(item.interval)}; "
-        f"{item.condition.label})"
+        f"{item.condition.task} {item.successes}/{item.episodes} ({text.interval(item.interval)}; {item.label})"
         for item in best
     ]
     warning = "Each is the best of several and was chosen after the fact, so its interval flatters it."
@@ -135,31 +133,26 @@ def _paper(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[st
     return rows
 
 
-def _heats(groups: Sequence[Group], index: dict[Condition, int], several: bool) -> list[dict[str, Any]]:
-    """Return one heat map a view set: task × policy. A single row and column is no map."""
+def _heats(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, Any]]:
+    """Return one heat map a view set: task × policy; of several numbers of demonstrations the largest counts."""
     plain = [item for item in groups if item.condition.plain and item.condition.task != names.SUTURE]
     maps = []
     for views in dict.fromkeys(item.condition.views for item in plain):
         mine = [item for item in plain if item.condition.views == views]
-        columns = list(dict.fromkeys(_column(item, several) for item in mine))
+        columns = list(dict.fromkeys(item.condition.policy for item in mine))
         tasks = [task for task in names.TASKS if of_task(mine, task)]
         rows = []
         for task in tasks:
-            known = {_column(item, several): item for item in of_task(mine, task)}
+            known = {item.condition.policy: item for item in of_task(mine, task)}
             rows.append({"task": task, "cells": [_heat(known.get(column), index) for column in columns]})
         maps.append({"view": " + ".join(views) or "no pictures", "columns": columns, "rows": rows})
     return maps if sum(len(found["rows"]) for found in maps) > len(maps) else []
 
 
-def _column(item: Group, several: bool) -> str:
-    demonstrations = item.condition.demonstrations
-    return item.condition.policy + (f" · {demonstrations} demos" if several and demonstrations else "")
-
-
 def _heat(item: Group | None, index: dict[Condition, int]) -> dict[str, Any]:
     if item is None:
         return {"text": "", "small": "", "title": "not in this sweep", "group": None, "state": "none"}
-    title, group = item.condition.label, index[item.condition]
+    title, group = item.label, index[item.condition]
     if not item.episodes:
         cell = item.missing[0]
         return {"text": cell.state, "small": "", "title": f"{title}: {cell.reason}", "group": group, "state": "absent"}
@@ -175,16 +168,16 @@ def _heat(item: Group | None, index: dict[Condition, int]) -> dict[str, Any]:
     }
 
 
-def _row(at: int, item: Group, best: Group | None, several: bool) -> dict[str, Any]:
+def _row(at: int, item: Group, best: Group | None) -> dict[str, Any]:
     """Return one line of the success table; `sort` holds what its columns are sorted by."""
     condition = item.condition
     row: dict[str, Any] = {
         "group": at,
         "task": condition.task,
-        "policy": condition.label.split(" on ")[0] if condition.plain else condition.label,
+        "policy": condition.policy if condition.plain else condition.label,
         "encoder": condition.encoder,
         "views": condition.view or text.ABSENT,
-        "demonstrations": condition.demonstrations if several else None,
+        "demonstrations": item.demonstrations,
         "plain": condition.plain,
         "kind": "" if condition.trained else "reference",
         "note": _note(item),
@@ -204,7 +197,8 @@ def _row(at: int, item: Group, best: Group | None, several: bool) -> dict[str, A
         "rate": text.percent(item.rate),
         "interval": text.interval((low, high)),
         "drawing": charts.interval(item.rate, low, high, label),
-        "across": item.across_text(),
+        "across": item.across_text().partition(" (")[0],
+        "bootstrap": text.interval(item.across.interval) if item.across else "",
         "seeds": len(item.results),
         "length": text.mean(length),
         "steps": text.mean(steps),
@@ -237,10 +231,10 @@ def _measures(groups: Sequence[Group]) -> dict[str, Any]:
         cells = []
         for column, _, unit, _ in kept:
             found = text.quartiles(item.values(column))
-            digits = 2 if unit == "N" else 1
-            cells.append((text.spread(item.values(column), digits), found[1] if found else None))
+            middle, _, rest = text.spread(item.values(column), 2 if unit == "N" else 1).partition(" ")
+            cells.append((middle, rest, found[1] if found else None))
         condition = item.condition
-        rows.append({"group": at, "task": condition.task, "policy": condition.label, "cells": cells,
+        rows.append({"group": at, "task": condition.task, "policy": item.label, "cells": cells,
                      "encoder": condition.encoder, "views": condition.view or text.ABSENT, "plain": condition.plain,
                      "kind": "" if condition.trained else "reference"})  # fmt: skip
     explained = "; ".join(f"{what} [{unit}]: {why}" for _, what, unit, why in kept)
@@ -252,8 +246,8 @@ def _pair(at: int, pair: Pair) -> dict[str, Any]:
     return {
         "more": at >= PAIRS_SHOWN,
         "task": pair.first.condition.task,
-        "first": pair.first.condition.label,
-        "second": pair.second.condition.label,
+        "first": pair.first.label,
+        "second": pair.second.label,
         "factor": pair.factor,
         "first_count": f"{pair.first.successes}/{pair.first.episodes}",
         "second_count": f"{pair.second.successes}/{pair.second.episodes}",

@@ -245,26 +245,24 @@ def _missing(
             state = PENDING if cell["state"] == "to do" else str(cell["state"])
             reason = str(cell.get("reason") or "the sweep has not come to it yet")
             add(cell, state, reason, str(cell.get("key", "")))
-    if not cells:
-        for line in run.get("not_run", []):
-            noted = _noted(str(line))
-            if noted and not any(_same(noted, other) for other in found.values()):
-                found[noted.condition, noted.seed] = noted
+    for line in () if cells else run.get("not_run", []):
+        noted = _noted(str(line), shared)
+        if noted and (noted.condition, noted.seed) not in done:
+            found.setdefault((noted.condition, noted.seed), noted)
     return sorted(found.values(), key=lambda item: (*order(item.condition), item.seed))
 
 
-def _noted(line: str) -> Missing | None:
-    """Read a line that a run has noted of a cell; its name stays whole, as the policy's."""
+def _noted(line: str, shared: Mapping[str, Any]) -> Missing | None:
+    """Read a line that a run has noted of a cell: its policy's name is encoder and views, or stays whole."""
     match = PROBLEM.match(line)
     if not match:
         return None
     state, task, name, seed, reason = match.groups()
-    return Missing(Condition(task, name), int(seed), state, reason)
-
-
-def _same(noted: Missing, other: Missing) -> bool:
-    """Whether a noted line and a known cell are the same one: by task, training seed and state."""
-    return (noted.condition.task, noted.seed, noted.state) == (other.condition.task, other.seed, other.state)
+    encoder, _, last = name.rpartition("-")
+    views = tuple(last.split("+"))
+    known = encoder and all(view in names.VIEWS for view in views)
+    cell = {"task": task, "encoder": encoder if known else name, "view": views if known else (), **shared}
+    return Missing(condition_of(cell), int(seed), state, reason)
 
 
 def _filled(cell: Mapping[str, Any]) -> dict[str, Any]:

@@ -85,7 +85,7 @@ def _rollout(choice: Choice, reel: Reel) -> dict[str, Any] | None:
         {"step": step, "data": f"data:image/jpeg;base64,{frame}"}
         for step, frame in zip(strip.steps, strip.frames, strict=True)
     ]
-    label = choice.group.condition.label
+    label = choice.group.label
     success = bool(choice.row["success"])
     return {"id": film_id(choice.identity), "label": label, "outcome": strip.outcome, "success": success,
             "view": strip.view, "frames": frames}  # fmt: skip

@@ -249,8 +249,8 @@ def _pair_record(pair: Pair) -> dict[str, Any]:
     return {
         "task": pair.first.condition.task,
         "differ_in": pair.factor,
-        "first": pair.first.condition.label,
-        "second": pair.second.condition.label,
+        "first": pair.first.label,
+        "second": pair.second.label,
         "paired_episodes": pair.episodes,
         "first_only": pair.first_only,
         "second_only": pair.second_only,
@@ -260,7 +260,7 @@ def _pair_record(pair: Pair) -> dict[str, Any]:
 
 
 def _record(item: Group) -> tuple[str, ...]:
-    start = (item.condition.task, _policy(item.condition), item.condition.view or text.ABSENT)
+    start = (item.condition.task, _policy(item), item.condition.view or text.ABSENT)
     if not item.episodes:
         return (*start, item.missing[0].state, *[text.ABSENT] * 5)
     count = f"{item.successes}/{item.episodes}"
@@ -268,8 +268,10 @@ def _record(item: Group) -> tuple[str, ...]:
     return (*start, count, text.percent(item.rate), text.interval(item.interval), item.across_text(), *spread)
 
 
-def _policy(condition: Condition) -> str:
-    parts = [condition.policy] + ([f"{condition.axis} {condition.strength:g}"] if condition.axis else [])
+def _policy(item: Group) -> str:
+    condition = item.condition
+    parts = [condition.policy] + ([item.demonstrations] if item.several else [])
+    parts += [f"{condition.axis} {condition.strength:g}"] if condition.axis else []
     return ", ".join(parts + ([f"expert in {condition.swap}"] if condition.swap else []))
 
 

@@ -50,9 +50,9 @@ def spread(values: Sequence[float | None], digits: int = 1) -> str:
     return f"{middle} ({low}–{high})" + (f", n = {count}" if count < len(values) else "")
 
 
-def probability(p: float) -> str:
-    """Return a p-value with two digits that count: "0.031", "< 0.001"."""
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+def probability(p: float, sign: str = "") -> str:
+    """Return a p-value: "0.031", or "< 0.001" below that; `sign` stands before a number that is given."""
+    return "< 0.001" if p < 0.001 else f"{sign}{p:.3f}"
 
 
 def plural(count: int, word: str) -> str:

@@ -133,6 +133,16 @@
     for (const cell of group.missing) {
       body.append(make("p", {}, make("span", { class: `state ${cell.state}` }, cell.state), ` training seed ${cell.seed}: `, cell.reason));
     }
+    const seen = [...new Set(group.cells.map(cell => cell.outcomes).join(""))];
+    if (seen.length) {
+      const key = make("p", { class: "key soft" });
+      for (const letter of Object.keys(KINDS).filter(letter => seen.includes(letter))) {
+        const mark = make("span", {}, make("i", { style: `background:${KINDS[letter].colour}` }));
+        mark.append((letter === "s" ? "✓ " : letter + " ") + KINDS[letter].name);
+        key.append(mark);
+      }
+      body.append(key);
+    }
     group.cells.forEach((cell, index) => {
       const head = (cell.seed === null ? "" : `Training seed ${cell.seed}: `) + `${cell.count} (${cell.interval})`;
       const said = make("p", { class: "note said", "aria-live": "polite" }, "One square an episode, in the order of the starts; a ringed one has a film below.");
