@@ -147,8 +147,8 @@ def _set_options(spec: mujoco.MjSpec, thread: int) -> None:
 
     Joint damping is explicit. MuJoCo's Euler would take it implicitly after the contact solver: the accelerations
     that start the next solution are then not those of the last, the solver takes 2.4 iterations in place of 1.3, and
-    once in some thousand steps it ends far off and kicks the held needle (`benchmarks/grip.py`: 4.6° in the worst of 40
-    trials, 0.9° without). Islands do not pay for one tangle of contacts, a sparse Jacobian does with a thread.
+    once in some thousand steps it ends far off and kicks the held needle (`benchmarks/grip.py`: 4.6° in the worst of
+    40 trials, 0.9° without). Islands do not pay for one tangle of contacts, a sparse Jacobian does with a thread.
     """
     option = spec.option
     option.timestep = TIMESTEP
