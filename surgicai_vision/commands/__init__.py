@@ -23,6 +23,7 @@ VERBS = MappingProxyType(
         "cache": "list, measure or prune the cached features",
         "train": "train a policy on a dataset's features",
         "evaluate": "run a policy from held-out starts and count successes",
+        "robustness": "run a policy while light, cameras, pictures or the arm shift",
         "sweep": "encode, train and evaluate every cell of a grid",
         "report": "write the report of stored results",
     }

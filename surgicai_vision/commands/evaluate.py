@@ -23,6 +23,9 @@ from surgicai_vision.errors import InputError, UnknownName
 
 EXAMPLE = "surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json"
 
+CHAIN_SUFFIXES = (".yaml", ".yml")
+ALL = "all"
+"""`--swap`: the chain as it is, and with every subtask swapped in turn."""
 REPLAY = "replay"
 """The mean demonstration of a dataset, played blind."""
 
@@ -50,6 +53,12 @@ class Options:
     )
     weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
+    swap: str | None = option(
+        None,
+        f"for a chain: let the expert do this subtask ({', '.join(names.SUBTASKS)}), or {ALL}: each in turn",
+        check=one_of("subtask", (*names.SUBTASKS, ALL)),
+        metavar="SUBTASK",
+    )
     out: str | None = option(
         None,
         "folder for the rows; an earlier evaluation in it is replaced",
@@ -64,7 +73,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     from surgicai_vision import cells
     from surgicai_vision.results import MARKER
 
-    subject = _subject(options)
+    if options.swap == ALL:
+        return _run_swaps(options, console)
+    subject = subject_of(options)
     seeds = range(options.seed, options.seed + options.episodes)
     default = folders.evaluation_folder(subject.config.task, subject.name, options.seed, options.episodes)
     out = Path(options.out) if options.out else default
@@ -77,18 +88,24 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     return {**result, "out": str(out)}
 
 
-def _subject(options: Options) -> Any:
-    """Say who acts in which task: a baseline, or a checkpoint in the task it was trained for."""
+def subject_of(options: Any) -> Any:
+    """Say who acts in which task: a baseline, or a checkpoint in the task it was trained for.
+
+    Args:
+        options: of this verb, or another's with the same fields (`swap` is this one's alone).
+    """
     from surgicai_vision import cells, lerobot_agent
 
-    folder = Path(options.policy)
+    folder, swap = Path(options.policy), getattr(options, "swap", None)
+    if swap and folder.suffix not in CHAIN_SUFFIXES:
+        raise InputError(f"--swap {swap} is for a chain.yaml; leave it out.")
     if options.policy == REPLAY:
         subject = cells.replay_subject(folders.open_dataset(options.dataset, options.task or "grasp", ()))
         return _in_env(subject, options.env)
     if options.dataset:
         raise InputError("--dataset is for replay alone; leave it out.")
-    if folder.suffix in (".yaml", ".yml"):
-        return _chain(folder, options)
+    if folder.suffix in CHAIN_SUFFIXES:
+        return _chain(folder, options, swap)
     if options.policy in cells.BASELINES:
         config = task_config(options.task or "grasp", options.env)
         return cells.baseline_subject(options.policy, config)
@@ -110,15 +127,37 @@ def _in_env(subject: Any, env: dict[str, Any] | None) -> Any:
     return dataclasses.replace(subject, config=task_config(subject.config.task, env)) if env else subject
 
 
-def _chain(path: Path, options: Options) -> Any:
+def _chain(path: Path, options: Any, swap: str | None = None) -> Any:
     """Say who acts in a chain, in the task suture."""
-    from surgicai_vision import chain
+    from surgicai_vision import chain, survival
 
     config = from_mapping(chain.Chain, read_yaml(path), str(path))
     if options.task not in (None, names.SUTURE):
         raise InputError(f"{path} is a chain of the whole procedure; leave --task {options.task} out.")
-    subject = chain.subject(config, options.weights, options.accept_licence)
-    return _in_env(subject, {"max_steps": config.max_steps, **options.env} if options.env else None)
+    env = {"max_steps": config.max_steps, **options.env} if options.env else None
+    if swap != ALL:
+        return _in_env(survival.swapped(config, swap, options.weights, options.accept_licence), env)
+    variants = survival.variants_of(config, options.weights, options.accept_licence)
+    return {name: _in_env(subject, env) for name, subject in variants.items()}
+
+
+def _run_swaps(options: Options, console: Console) -> dict[str, Any]:
+    """Evaluate a chain as it is and with each subtask swapped, and print how far each comes."""
+    from surgicai_vision.survival import AS_IT_IS, CURVES, MARK, survival_curves
+
+    variants = subject_of(options)
+    plain = variants[AS_IT_IS]
+    default = folders.evaluation_folder(plain.config.task, plain.name, options.seed, options.episodes)
+    out = Path(options.out) if options.out else default.with_name(f"{default.name}-swaps")
+    folders.check_folder(out, MARK)
+    seeds = range(options.seed, options.seed + options.episodes)
+    rows = survival_curves(variants, seeds, out, console.stage, options.workers)
+    for swap in dict.fromkeys(row["swap"] for row in rows):
+        mine = [row for row in rows if row["swap"] == swap]
+        who = f"expert in {swap}" if swap else "the chain"
+        console.say(f"{who:<18} " + ", ".join(f"{row['subtask']} {row['k']}/{row['n']}" for row in mine))
+    console.say(f"survival: {out / CURVES}")
+    return {"policy": plain.name, "task": plain.config.task, "survival": rows, "out": str(out)}
 
 
 def summary_line(result: dict[str, Any]) -> str:

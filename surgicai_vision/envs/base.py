@@ -87,7 +87,8 @@ class SuturingEnv(gymnasium.Env):
         simulation, first = self.simulation, self._subtasks[0]
         axes = self.config.randomisation
         if axes.on:
-            simulation.randomise(randomisation.draw(axes, self.np_random))
+            # Numbers of their own: a start is the same whatever is randomised, so that evaluations can be paired.
+            simulation.randomise(randomisation.draw(axes, self.np_random.spawn(1)[0]))
             self._meet_draws()
         for _ in range(START_DRAWS):
             simulation.reset()
