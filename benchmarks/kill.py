@@ -1,9 +1,11 @@
 """Kill `render-demos` with SIGKILL at random moments, run it again to the end, and compare with an undisturbed run.
 
-    python benchmarks/kill.py --kills 100 --workers 2 --seed 0
+    python benchmarks/kill.py --kills 100 --together 2 --json
 
-Each trial renders the same demonstrations into a new folder, is killed once, and is run again. Prints one line a trial
-and, last, how many datasets were identical (digest and file fingerprint) and the most episodes that a kill cost.
+Each trial renders the same short demonstrations into a new folder, is killed once, and is run again. The moments are
+spread evenly over the time an undisturbed run takes under the same load (one in each hundredth, so that start, work
+and assembly are all met). Prints a line a trial and one JSON object last: how many datasets were identical (digest and
+file fingerprint), the most episodes that a kill cost, and what was left beside them. Exits with 1 unless all are.
 """
 
 import argparse
@@ -16,17 +18,23 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 RENDER = """
 import json, sys
 from pathlib import Path
 from surgicai_vision.dataset import open_dataset, render_demos
+from surgicai_vision.executor import Engine
 if __name__ == "__main__":
-    demos, out, workers = sys.argv[1:]
-    summary = render_demos(Path(demos), Path(out), size=96, depth=True, workers=int(workers))
+    demos, out, workers, size, address = sys.argv[1:]
+    engine = Engine("ray", address) if address else Engine()
+    options = {"size": int(size), "depth": True, "workers": int(workers), "engine": engine}
+    summary = render_demos(Path(demos), Path(out), **options)
     print(json.dumps([summary.digest, open_dataset(Path(out)).fingerprint, summary.frames, summary.episodes]))
 """
+
+SIZE = 64
 
 
 def make_demos(folder: Path, episodes: int) -> None:
@@ -37,9 +45,9 @@ def make_demos(folder: Path, episodes: int) -> None:
     record(TaskConfig("grasp"), episodes=episodes, out=folder, workers=0)
 
 
-def start(script: Path, demos: Path, out: Path, workers: int) -> subprocess.Popen:
-    """Start one rendering."""
-    command = [sys.executable, script, demos, out, str(workers)]
+def start(script: Path, demos: Path, out: Path, workers: int, address: str = "") -> subprocess.Popen:
+    """Start one rendering, in this machine's processes or on the Ray cluster at `address`."""
+    command = [sys.executable, script, demos, out, str(workers), str(SIZE), address]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -54,46 +62,86 @@ def finish(process: subprocess.Popen) -> list:
 def committed(out: Path) -> int:
     """Return the number of finished episodes in the store beside `out`."""
     work = out.with_name(f"{out.name}.work")
-    return len([path for path in work.glob("*") if not path.name.startswith(".")]) if work.exists() else 0
+    try:
+        return len([path for path in os.listdir(work) if not path.startswith(".") and path != "result"])
+    except OSError:
+        return 0
+
+
+def half_done(out: Path) -> int:
+    """Return the number of episodes that were being made in the store beside `out`."""
+    return len(list(out.with_name(f"{out.name}.work").glob(".partial-*")))
+
+
+class Trials:
+    """What every trial shares.
+
+    Attributes:
+        reference: digest, fingerprint, frames and episodes of the undisturbed run.
+        duration: its time under the trials' own load [s].
+    """
+
+    def __init__(self, root: Path, episodes: int, workers: int, together: int):
+        self.root, self.workers, self.script = root, workers, root / "render.py"
+        self.script.write_text(RENDER)
+        make_demos(root / "demos", episodes)
+        began = time.monotonic()
+        runs = [start(self.script, root / "demos", root / f"reference{n}", workers) for n in range(together)]
+        results = [finish(process) for process in runs]
+        self.duration, self.reference = time.monotonic() - began, results[0]
+        assert all(result == self.reference for result in results)
+
+    def run(self, trial: int, moment: float) -> dict:
+        """Kill one rendering after `moment` seconds, run it again, and say what came of it."""
+        out = self.root / f"set{trial}"
+        process = start(self.script, self.root / "demos", out, self.workers)
+        time.sleep(moment)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        time.sleep(0.6)  # its workers notice within half a second
+        kept, lost, whole = committed(out), half_done(out), out.exists()
+        result = finish(start(self.script, self.root / "demos", out, self.workers))
+        left = sorted(path.name for path in self.root.glob(f"*set{trial}[!0-9]*"))
+        row = {"identical": result == self.reference and not left, "kept": kept, "redone": lost, "left": left}
+        state = "complete" if whole else f"{kept} episodes kept, {lost} lost"
+        verdict = "identical" if row["identical"] else "DIFFERENT"
+        print(f"trial {trial}: killed after {moment:.2f} s, {state}: {verdict}", flush=True)
+        shutil.rmtree(out)
+        return row
 
 
 def main() -> int:
     """Run the trials; exit 1 unless every dataset is identical."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--episodes", type=int, default=6)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--workers", type=int, default=1, help="processes of each rendering")
+    parser.add_argument("--together", type=int, default=2, help="trials at a time")
+    parser.add_argument("--episodes", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the last line is always JSON")
     arguments = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
-    moments = random.Random(arguments.seed)
     root = Path(tempfile.mkdtemp(prefix="surgicai-vision-kill-"))
-    script = root / "render.py"
-    script.write_text(RENDER)
-    make_demos(root / "demos", arguments.episodes)
     began = time.monotonic()
-    reference = finish(start(script, root / "demos", root / "reference", arguments.workers))
-    duration = time.monotonic() - began
-    same = 0
-    for trial in range(arguments.kills):
-        out = root / f"set{trial}"
-        moment = moments.uniform(0.0, duration)
-        process = start(script, root / "demos", out, arguments.workers)
-        time.sleep(moment)
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-        kept, whole = committed(out), out.exists()
-        result = finish(start(script, root / "demos", out, arguments.workers))
-        left = sorted(path.name for path in root.glob(f"*set{trial}*") if path != out)
-        identical = result == reference and not left
-        same += identical
-        state = "complete" if whole else f"{kept} of {arguments.episodes} episodes kept"
-        verdict = "identical" if identical else f"DIFFERENT {left}"
-        print(f"trial {trial}: killed after {moment:.2f} s, {state}: {verdict}", flush=True)
-        shutil.rmtree(out)
-    print(f"{same} of {arguments.kills} identical ({reference[2]} frames, {arguments.workers} workers)")
+    trials = Trials(root, arguments.episodes, arguments.workers, arguments.together)
+    draw = random.Random(arguments.seed)
+    moments = [trials.duration * (at + draw.random()) / arguments.kills for at in range(arguments.kills)]
+    draw.shuffle(moments)
+    with ThreadPoolExecutor(arguments.together) as pool:
+        rows = list(pool.map(trials.run, range(arguments.kills), moments))
+    row = {
+        "kills": arguments.kills,
+        "identical": sum(row["identical"] for row in rows),
+        "most_redone": max(row["redone"] for row in rows),
+        "met_unfinished": sum(0 < row["kept"] < arguments.episodes or row["redone"] > 0 for row in rows),
+        "workers": arguments.workers,
+        "episodes": trials.reference[3],
+        "frames": trials.reference[2],
+        "seconds": round(time.monotonic() - began),
+    }
     shutil.rmtree(root)
-    return int(same != arguments.kills)
+    print(json.dumps(row))
+    return int(row["identical"] != arguments.kills or row["most_redone"] > arguments.workers)
 
 
 if __name__ == "__main__":

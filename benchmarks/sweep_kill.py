@@ -1,0 +1,144 @@
+"""Run a sweep of many small cells while its workers, its driver and a node are killed; compare with a quiet run.
+
+    python benchmarks/sweep_kill.py --cells 300 --json
+
+Three runs of the same grid: a quiet one; one by local processes, of which ten workers and once the driver are killed;
+one on a Ray cluster of two nodes on loopback, where a node is lost too. The sweep is started again after its driver's
+death, which is all the repair there is. A last call of the quiet run's command shows what a finished sweep costs.
+A cell is a policy without pictures: two epochs, one episode. Prints one JSON object last; exits with 1 unless every
+run has every cell once and the quiet run's digest.
+"""
+
+import argparse
+import functools
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from cluster import children, kill_one, spread, two_nodes
+
+GRID = """
+task: [grasp]
+encoder: []
+view: []
+seed: {seeds}
+proprioception: true
+expert: false
+demonstrations: 2
+epochs: 2
+episodes: 1
+size: 32
+"""
+
+
+class Sweep:
+    """One sweep in a folder of its own.
+
+    Args:
+        grid: its file.
+        out: its folder.
+        options: more options of the command.
+    """
+
+    def __init__(self, grid: Path, out: Path, *options: str):
+        command = [sys.executable, "-m", "surgicai_vision", "sweep", str(grid), "--out", str(out), "--json"]
+        self.command, self.out, self.starts = [*command, "--workers", "2", *options], out, 0
+        self.process: subprocess.Popen | None = None
+
+    def start(self) -> None:
+        """Start it, or start it again."""
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(self.command, stdout=pipe, stderr=pipe, text=True)
+        self.starts += 1
+
+    def filed(self) -> int:
+        """Return how many cells are in their place."""
+        try:
+            return len(os.listdir(self.out / "cells"))
+        except OSError:
+            return 0
+
+    def kill_driver(self) -> bool:
+        """Kill the command itself and give it again."""
+        self.process.kill()
+        self.process.communicate()
+        self.start()
+        return True
+
+    def run(self, events: list[tuple[int, Callable[[], bool]]]) -> dict:
+        """Run to the end, with what happens on the way; return its last line and the time [s]."""
+        began = time.monotonic()
+        self.start()
+        while self.process.poll() is None:
+            if events and self.filed() >= events[0][0] and events[0][1]():
+                events.pop(0)
+            time.sleep(0.02)
+        output, errors = self.process.communicate()
+        if self.process.returncode:
+            raise SystemExit(f"the sweep failed:\n{output}\n{errors}")
+        return {**json.loads(output.splitlines()[-1]), "seconds": round(time.monotonic() - began, 1)}
+
+    def verdict(self, result: dict, digest: str, cells: int) -> dict:
+        """Return what is in the folder beside what should be."""
+        import pyarrow.parquet as pq
+
+        rows = pq.read_table(self.out / "episodes.parquet", columns=["cell", "seed"]).to_pylist()
+        different = {(row["cell"], row["seed"]) for row in rows}
+        return {
+            "results": len({row["cell"] for row in rows}),
+            "duplicates": len(rows) - len(different),
+            "identical": result["digest"] == digest,
+            "left": sorted(path.name for path in self.out.iterdir() if path.name == "work"),
+            "starts": self.starts,
+            "seconds": result["seconds"],
+            "good": len(rows) == len(different) == cells and result["digest"] == digest,
+        }
+
+
+def main() -> int:
+    """Run the sweeps; exit 1 unless each is whole."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, default=300)
+    parser.add_argument("--kills", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--skip-ray", action="store_true", help="local processes alone")
+    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the last line is always JSON")
+    arguments = parser.parse_args()
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    root = Path(tempfile.mkdtemp(prefix="surgicai-vision-sweep-"))
+    os.environ["SURGICAI_VISION_CACHE"] = str(root / "cache")
+    grid, moments = root / "grid.yaml", random.Random(arguments.seed)
+    grid.write_text(GRID.format(seeds=list(range(arguments.cells))))
+    quiet = Sweep(grid, root / "quiet")
+    result, again = quiet.run([]), quiet.run([])
+    digest = result["digest"]
+    row = {"cells": arguments.cells, "kills": arguments.kills, "quiet_seconds": result["seconds"]}
+    row["second_run"] = {"seconds": again["seconds"], "done": again["done"], "same": again["digest"] == digest}
+    good = result["done"] == arguments.cells and again["done"] == 0 and again["digest"] == digest
+
+    local = Sweep(grid, root / "local")
+    kill = lambda: kill_one(children(local.process.pid), moments)  # noqa: E731
+    events = spread([kill] * arguments.kills + [local.kill_driver], arguments.cells - 1, moments)
+    row["local"] = local.verdict(local.run(events), digest, arguments.cells)
+    good = good and row["local"]["good"] and not events
+    if not arguments.skip_ray:
+        with two_nodes() as cluster:
+            ray = Sweep(grid, root / "ray", "--executor", "ray", "--address", cluster.address)
+            kills = [functools.partial(cluster.kill_worker, moments)] * arguments.kills
+            events = spread([*kills, cluster.lose_node, ray.kill_driver], arguments.cells - 1, moments)
+            row["ray"] = ray.verdict(ray.run(events), digest, arguments.cells)
+        good = good and row["ray"]["good"] and not events
+    shutil.rmtree(root)
+    print(json.dumps(row))
+    return int(not good)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
