@@ -7,8 +7,9 @@ robotics challenge: the same tip, one finger's angle as the jaw, of which only t
 """
 
 import dataclasses
+import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -38,6 +39,25 @@ LABELS: Mapping[str, str] = MappingProxyType(
     }
 )
 """Label, in lower case → subtask. Besides our names and indices those of SurgicAI."""
+
+
+def clean(text: object, longest: int = 80) -> str:
+    """Return what a bag says as something that can be shown: one line, printable, of limited length."""
+    whole = "".join(letter if letter.isprintable() else "?" for letter in str(text)[: longest + 1])
+    return whole if len(whole) <= longest else f"{whole[: longest - 1]}…"
+
+
+def listed(topics: Collection[str], wanted: str) -> str:
+    """Return topics as one line, those like the wanted one first, as many as can be read."""
+    near = difflib.get_close_matches(wanted, topics, n=len(topics) or 1, cutoff=0.3)
+    shown: list[str] = []
+    room = 450
+    for topic in [*near, *sorted(set(topics) - set(near))]:
+        room -= len(topic) + 2
+        if room < 0:
+            return f"{', '.join(shown)} and {len(topics) - len(shown)} more"
+        shown.append(topic)
+    return ", ".join(shown) or "none at all"
 
 
 def is_bag(path: Path) -> bool:
@@ -202,7 +222,7 @@ class BagConfig:
         table = {**LABELS, **{str(key).lower(): value for key, value in self.labels.items()}}
         if label.strip().lower() not in table:
             raise InputError(
-                f"The recording has the label '{label}'; known are {', '.join(filter(None, table))}. "
-                f"Say what it means in the file of --config: `bag: {{labels: {{'{label}': grasp}}}}`, or none."
+                f"The recording has the label '{clean(label)}'; known are {', '.join(filter(None, table))}. "
+                f"Say what it means in the file of --config: `bag: {{labels: {{'{clean(label)}': grasp}}}}`, or none."
             )
         return table[label.strip().lower()]

@@ -13,7 +13,7 @@ import numpy as np
 
 from surgicai_vision import names
 from surgicai_vision.config import TaskConfig
-from surgicai_vision.demos.bag_config import BagConfig
+from surgicai_vision.demos.bag_config import BagConfig, listed
 from surgicai_vision.demos.foreign import read_foreign
 from surgicai_vision.demos.recording import Arm, Recording, recording_of
 from surgicai_vision.demos.replay import Episode, Track, grip_error, needle_path
@@ -108,7 +108,7 @@ def _track(
         wanted = config.all_topics[f"{active}_pose"]
         raise InputError(
             f"{segment.task} is done by {active}, whose pose is not on {wanted}. "
-            f"The topics are {', '.join(recording.topics)}."
+            f"The topics are {listed(recording.topics, wanted)}."
         )
     tip, jaw = arms[active]
     kept = moving(tip[whole], jaw[whole]) if config.drop_pauses else np.arange(segment.stop - segment.start + 1)
@@ -133,9 +133,10 @@ def _jaw(recording: Recording, arm: str, task: str, config: BagConfig) -> np.nda
         return motion.jaw
     active = names.ACTIVE_ARM[task]
     if arm == active and task not in CLOSED:
+        wanted = config.all_topics[f"{arm}_jaw"]
         raise InputError(
-            f"{task} needs the jaw of {arm}, which is not on {config.all_topics[f'{arm}_jaw']}. "
-            f"The topics are {', '.join(recording.topics)}."
+            f"{task} needs the jaw of {arm}, which is not on {wanted}. "
+            f"The topics are {listed(recording.topics, wanted)}."
         )
     holding = (arm == active and task in CLOSED) or (arm == names.PSM2 and task == "handoff")
     return np.full(len(recording), 0.0 if holding else START_JAW)

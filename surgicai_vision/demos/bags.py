@@ -13,6 +13,8 @@ and a unit quaternion w x y z; joints (N, 6); jaw (N,); label (N,) texts.
 """
 
 import bz2
+import itertools
+import re
 import sqlite3
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -21,14 +23,13 @@ from typing import Any
 
 import lz4.frame
 import numpy as np
-import yaml
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import reader as ros1_reader
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import reader as ros2_reader
 from rosbags.rosbag2 import storage_mcap
 
-from surgicai_vision.demos.bag_config import ENDINGS, METADATA, is_bag
+from surgicai_vision.demos.bag_config import ENDINGS, METADATA, clean, is_bag, listed
 from surgicai_vision.demos.ros_messages import AMBF, WHOLE_NUMBERS, Layout, decode, layout_of
 from surgicai_vision.errors import BadFile, InputError
 
@@ -50,11 +51,11 @@ KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 """What a role's last word means → the message types that can say it."""
 ROLES = ("psm1_pose", "psm1_jaw", "psm1_joints", "psm2_pose", "psm2_jaw", "psm2_joints", "needle", "label")
 
-MAX_MESSAGES, MAX_MESSAGE, MAX_CHUNK, MAX_METADATA = 5_000_000, 2**20, 2**26, 2**20
-"""What is read at most: messages of all roles, bytes of a message, of an unpacked chunk, of a ROS 2 folder's text.
-ROS packs chunks of 768 KB; one picture makes them larger."""
-MAX_LISTED, MAX_NAME = 60, 160
-"""Topics of a bag that are named, and characters of each."""
+MAX_MESSAGES, MAX_MESSAGE, MAX_CHUNK, MAX_METADATA, MAX_DEPTH = 5_000_000, 2**20, 2**26, 2**18, 20
+"""What is read at most: messages of all roles, bytes of a message, of an unpacked chunk, of the text that describes a
+ROS 2 folder, and how deep its brackets go. ROS packs chunks of 768 KB; one picture makes them larger."""
+MAX_LISTED = 1000
+"""Topics of a bag that are looked at to be named."""
 UNIT = 0.01
 """Furthest a quaternion's length may be from 1."""
 _POSE_FIELDS = (
@@ -81,28 +82,27 @@ def read(path: Path, topics: Mapping[str, str], needed: Collection[str] = ()) ->
         _inspect(path)
         with Reader1(path) if path.suffix == ".bag" else Reader2(path) as reader:
             return _read(reader, path, topics, needed)
-    except InputError:
-        raise
+    except InputError as error:
+        raise error if str(path) in str(error) else type(error)(f"{path}: {error}") from None
     except Exception as error:  # a damaged bag can fail in any way, and ask for any amount of memory
-        line = (str(error).splitlines() or [""])[0][:160]
+        line = clean((str(error).splitlines() or ["it asks for too much"])[0], 160)
         raise BadFile(f"{path} is not a readable bag ({type(error).__name__}: {line}).") from None
 
 
 def _read(reader: Any, path: Path, topics: Mapping[str, str], needed: Collection[str]) -> dict[str, np.ndarray]:
     ros1 = isinstance(reader, Reader1)
     there = {connection.topic: _plain(connection.msgtype) for connection in reader.connections}
-    listed = [f"{topic} ({kind})"[:MAX_NAME] for topic, kind in sorted(there.items())][:MAX_LISTED]
+    known = [f"{clean(topic)} ({clean(kind)})" for topic, kind in sorted(there.items())[:MAX_LISTED]]
     missing = [role for role in needed if topics[role] not in there]
     if missing:
-        raise InputError(
-            f"{path} has no topic {topics[missing[0]]} ({missing[0]}); it has {', '.join(listed) or 'none at all'}."
-        )
+        wanted_topic = topics[missing[0]]
+        raise InputError(f"{path} has no topic {wanted_topic} ({missing[0]}); it has {listed(known, wanted_topic)}.")
     wanted = [connection for connection in reader.connections if connection.topic in topics.values()]
     layouts = {}
     for connection in wanted:
         _check_kind(connection, topics)
         layouts[connection.topic] = layout_of(_plain(connection.msgtype), ros1=ros1, text=connection.msgdef.data)
-    arrays = {"topics": np.array(listed, dtype=str)}
+    arrays = {"topics": np.array(known, dtype=str)}
     rows = _rows(reader, wanted, layouts, path, ros1) if wanted else {}
     for role, topic in topics.items():
         if rows.get(topic):
@@ -127,7 +127,7 @@ def _rows(
             message = decode(data, layouts[connection.topic], ros1=ros1)
         except ValueError as error:
             raise BadFile(
-                f"{path}: a message on {connection.topic} is no {_plain(connection.msgtype)} ({error})."
+                f"{path}: a message on {connection.topic} is no {clean(_plain(connection.msgtype))} ({error})."
             ) from None
         rows.setdefault(connection.topic, []).append((time, message))
     return rows
@@ -139,7 +139,7 @@ def _check_kind(connection: Any, topics: Mapping[str, str]) -> None:
     for role, topic in topics.items():
         allowed = KINDS[role.rsplit("_", 1)[-1]]
         if topic == connection.topic and kind not in allowed:
-            raise InputError(f"{topic} ({role}) holds {kind[:80]}; {role} is read from {', '.join(allowed)}.")
+            raise InputError(f"{topic} ({role}) holds {clean(kind)}; {role} is read from {', '.join(allowed)}.")
 
 
 def _arrays(role: str, topic: str, kind: str, rows: list[Row], path: Path) -> dict[str, np.ndarray]:
@@ -159,7 +159,7 @@ def _arrays(role: str, topic: str, kind: str, rows: list[Row], path: Path) -> di
     stamps = [row.get("header.sec", 0) * 10**9 + row.get("header.nanosec", 0) for _, row in rows]
     frames = sorted({str(row.get("header.frame_id", "")) for _, row in rows})
     if len(frames) > 1:
-        raise InputError(f"{path}: {topic} ({role}) changes its frame: {', '.join(frames)[:200]}.")
+        raise InputError(f"{path}: {topic} ({role}) changes its frame: {clean(', '.join(frames[:9]), 160)}.")
     return {
         f"{role}.time": np.array([time for time, _ in rows], dtype=np.int64),
         f"{role}.stamp": np.array(stamps, dtype=np.int64),
@@ -222,15 +222,15 @@ def _inspect(path: Path) -> None:
 
 
 def _inspect_metadata(path: Path) -> None:
+    """Look at a folder's description before `rosbags` parses it: a YAML parser takes seconds over deep brackets."""
     size = path.stat().st_size
     if size > MAX_METADATA:
         raise BadFile(f"{path} has {size} bytes; above {MAX_METADATA} are not read.")
-    try:
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-        mode = str(table["rosbag2_bagfile_information"].get("compression_mode", "")).lower()
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, KeyError, TypeError, AttributeError):
-        raise BadFile(f"{path} is no description of a ROS 2 bag.") from None
-    if mode == "file":
+    text = path.read_text(encoding="utf-8", errors="replace")
+    opened = itertools.accumulate(1 if mark in "[{" else -1 for mark in re.findall(r"[][{}]", text))
+    if "rosbag2_bagfile_information:" not in text or max(opened, default=0) > MAX_DEPTH:
+        raise BadFile(f"{path} is no description of a ROS 2 bag.")
+    if re.search(r"compression_mode\W+file\b", text, re.IGNORECASE):
         raise BadFile(f"{path.parent} is packed file by file; unpack it first (zstd -d, then `ros2 bag reindex`).")
 
 
@@ -243,7 +243,7 @@ def _inspect_database(path: Path) -> None:
         connection.close()
     for kind, name, sql in rows:
         if kind not in ("table", "index") or "VIRTUAL" in str(sql).upper() or "GENERATED" in str(sql).upper():
-            raise BadFile(f"{path} has a {kind} '{str(name)[:40]}', which no ROS 2 bag has; it is not read.")
+            raise BadFile(f"{path} has a {clean(kind)} '{clean(name, 40)}', which no ROS 2 bag has; it is not read.")
 
 
 def _bounded(whole: bytes) -> bytes:

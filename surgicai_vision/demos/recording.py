@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from surgicai_vision import names
-from surgicai_vision.demos.bag_config import BagConfig
+from surgicai_vision.demos.bag_config import BagConfig, clean, listed
 from surgicai_vision.demos.ros_messages import AMBF
 from surgicai_vision.errors import InputError
 from surgicai_vision.scene import kinematics
@@ -117,8 +117,8 @@ def _roles(arrays: Arrays, config: BagConfig) -> list[str]:
         roles += placed + [role for role in (f"{arm}_jaw",) if placed and f"{role}.value" in arrays]
     if not roles:
         wanted = ", ".join(config.all_topics[f"{arm}_pose"] for arm in names.ARMS)
-        listed = ", ".join(map(str, arrays["topics"])) or "none at all"
-        raise InputError(f"The recording has the pose of no arm: none of {wanted}. Its topics: {listed}.")
+        there = listed(arrays["topics"].tolist(), wanted)
+        raise InputError(f"The recording has the pose of no arm: none of {wanted}. The topics are {there}.")
     return [*roles, "needle"] if "needle.value" in arrays else roles
 
 
@@ -184,7 +184,7 @@ def _tip(role: str, track: Track, grid: np.ndarray, arrays: Arrays, config: BagC
     frame = str(arrays[f"{role}.frame"]).lower()
     if not placed and any(part in frame for part in ELSEWHERE):
         raise InputError(
-            f"{config.all_topics[role]} is in frame '{frame[:40]}', not in {arm}'s base. Take the topic that is "
+            f"{config.all_topics[role]} is in frame '{clean(frame)}', not in {arm}'s base. Take the topic that is "
             f"(dVRK: /{arm.upper()}/local/measured_cp), or give the frame's place in the base as frames: {arm}."
         )
     scaled = values * np.array([config.length_scale] * 3 + [1.0] * 4)

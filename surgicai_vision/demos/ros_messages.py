@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
+from surgicai_vision.demos.bag_config import clean
 from surgicai_vision.errors import BadFile
 
 PRIMITIVES: Mapping[str, str] = MappingProxyType(
@@ -100,7 +101,7 @@ def layout_of(kind: str, *, ros1: bool, text: str = "") -> Layout:
         BadFile: an unknown type, or a definition of AMBF's with fields that are not among the known types.
     """
     if kind not in DEFINITIONS:
-        raise BadFile(f"messages of type {kind[:80]!r} are not read; known are {', '.join(sorted(DEFINITIONS))}.")
+        raise BadFile(f"messages of type {clean(kind)} are not read; known are {', '.join(sorted(DEFINITIONS))}.")
     own = text.split("\n====", 1)[0] if kind in AMBF else ""
     return tuple(_flatten(own if own.strip() else DEFINITIONS[kind], "", ros1))
 
@@ -118,7 +119,7 @@ def _flatten(text: str, prefix: str, ros1: bool) -> list[Field]:
                 fields.append(Field(f"{prefix}{name}.seq", "uint32", False))
             fields += _flatten(DEFINITIONS[plain], f"{prefix}{name}.", ros1)
         else:
-            raise BadFile(f"a message definition has a field of type {kind[:80]!r}, which is not read.")
+            raise BadFile(f"a message definition has a field of type {clean(kind)}, which is not read.")
     if len(fields) > MAX_FIELDS:
         raise BadFile(f"a message definition has {len(fields)} fields; above {MAX_FIELDS} are not read.")
     return fields
@@ -134,7 +135,7 @@ def _lines(text: str) -> list[tuple[str, str]]:
         if not words or any("=" in word for word in words):
             continue
         if len(words) < 2 or not words[1].isidentifier():
-            raise BadFile(f"a message definition has the line {line.strip()[:60]!r}, which is no 'type name'.")
+            raise BadFile(f"a message definition has the line '{clean(line.strip())}', which is no 'type name'.")
         pairs.append((words[0], words[1]))
     return pairs
 
