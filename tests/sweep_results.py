@@ -104,7 +104,8 @@ def write_sweep(out, tasks=TASKS, seeds=(0, 1), encoders=ENCODERS, views=VIEWS):
     }
     files.write_json(out / "run.json", run)
     probes = [
-        {"encoder": encoder, "view": "+".join(view), "pool": "global", "angle_deg": 12.0, "n": 900,
+        {"encoder": encoder, "view": "+".join(view), "pool": "global", "angle_deg": 12.0, "n": 50,
+         "task": "handoff", "tip_mm_low": 2.0, "tip_mm_high": 7.0, "tip_mm_chance": 9.5,
          "tip_mm": 6 - 4 * rate + generator.normal(0, 0.2)}
         for (encoder, rate), view in itertools.product(encoders.items(), views)
     ]  # fmt: skip

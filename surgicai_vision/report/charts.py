@@ -107,6 +107,7 @@ def curves(
     logarithmic: bool = False,
     label: str = "",
     ticks: Mapping[float, str] | None = None,
+    joined: bool = True,
 ) -> Markup:
     """Draw success against x, one line a series, intervals as bars at the points.
 
@@ -116,6 +117,7 @@ def curves(
         logarithmic: a logarithmic axis; every x above 0.
         label: what a screen reader says.
         ticks: x → its word, where it is no number.
+        joined: draw a line through the points of a series.
     """
     from math import log
 
@@ -130,7 +132,7 @@ def curves(
     parts = [_axes(xs, place, x_name, ticks or {})]
     for index, line in enumerate(series):
         shift = 3.0 * (index - (len(series) - 1) / 2) / max(1, len(series) - 1) if len(series) > 1 else 0.0
-        parts.append(_line(line, index, shift, place))
+        parts.append(_line(line, index, shift if joined else 0.0, place, joined))
     body = "".join(parts)
     return Markup(
         f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(label or x_name)}">'
@@ -170,7 +172,7 @@ def _axes(xs: Sequence[float], place: object, x_name: str, ticks: Mapping[float,
     return "".join(parts)
 
 
-def _line(line: Series, index: int, shift: float, place: object) -> str:
+def _line(line: Series, index: int, shift: float, place: object, with_path: bool) -> str:
     """Draw one series; `shift` moves it sideways, so that intervals at one x stand beside each other."""
     assert callable(place)
     colour, path, parts = COLOURS[index % len(COLOURS)], [], []
@@ -182,7 +184,7 @@ def _line(line: Series, index: int, shift: float, place: object) -> str:
         bar = f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{top:.1f}" y2="{bottom:.1f}" stroke-width="1.6" opacity=".6"/>'
         title = escape(f"{line.name}: {point.text}")
         parts.append(f"<g><title>{title}</title>{bar}{_marker(index, x, y, colour)}</g>")
-    joined = f'<polyline points="{" ".join(path)}" fill="none" stroke-width="1.8"/>'
+    joined = f'<polyline points="{" ".join(path)}" fill="none" stroke-width="1.8"/>' if with_path else ""
     return f'<g stroke="{colour}">{joined}{"".join(parts)}</g>'
 
 

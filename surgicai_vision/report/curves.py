@@ -1,17 +1,15 @@
-"""Curves: success against demonstrations, against the strength of a shift, along the chain, and beside the probe."""
+"""Curves: success against demonstrations, against the strength of a shift, and along the chain."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 from markupsafe import Markup
 
 from surgicai_vision import names, statistics
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Point, Series
 from surgicai_vision.report.groups import Group
-from surgicai_vision.report.reading import Collected
 
 MOST = len(charts.COLOURS)
 """Series in one drawing; what is beyond stands in the table alone."""
@@ -141,76 +139,6 @@ def survival(groups: Sequence[Group]) -> Chart | None:
     more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
     key = charts.key([line.name for line in drawn])
     return Chart("", drawing, key, ("policy", *names.SUBTASKS), tuple(rows), more)
-
-
-@dataclass(frozen=True)
-class Probes:
-    """Probe errors beside success, and how the two go together."""
-
-    rows: tuple[dict[str, Any], ...]
-    correlation: str
-
-
-def probes(collected: Collected, groups: Sequence[Group]) -> Probes | None:
-    """Set each probe beside the success of the policies with its encoder, view and task."""
-    if not collected.probes:
-        return None
-    rows = []
-    for probe in collected.probes:
-        mine = [item for item in groups if _matches(probe, item)]
-        k, n = sum(item.successes for item in mine), sum(item.episodes for item in mine)
-        rows.append(
-            {
-                "task": probe.get("task") or "all",
-                "encoder": str(probe.get("encoder")),
-                "view": _view(probe),
-                "tip_mm": _number(probe.get("tip_mm")),
-                "angle_deg": _number(probe.get("angle_deg")),
-                "n": probe.get("n", text.ABSENT),
-                "success": f"{k}/{n}" if n else text.ABSENT,
-                "rate": text.percent(k / n) if n else "",
-                "pair": (float(probe["tip_mm"]), k / n) if n and text.finite([probe.get("tip_mm")]) else None,
-            }
-        )
-    return Probes(tuple(rows), _correlation([row["pair"] for row in rows if row["pair"]]))
-
-
-def _matches(probe: dict[str, Any], item: Group) -> bool:
-    condition = item.condition
-    if not (item.episodes and condition.trained and condition.plain):
-        return False
-    if probe.get("task") and probe["task"] != condition.task:
-        return False
-    pool = probe.get("pool") or "global"
-    pooled = pool == "global" or pool in condition.variant.split(" · ")
-    return pooled and probe.get("encoder") == condition.encoder and _view(probe) == condition.view
-
-
-def _view(probe: dict[str, Any]) -> str:
-    view = probe.get("view") or ()
-    views = view.replace("+", ",").split(",") if isinstance(view, str) else view
-    return " + ".join(str(name).strip() for name in views)
-
-
-def _number(value: Any) -> str:
-    known = text.finite([value])
-    return f"{known[0]:.2f}" if known else text.ABSENT
-
-
-def _correlation(pairs: Sequence[tuple[float, float]]) -> str:
-    """Describe Spearman's rank correlation of tip error and success."""
-    if len(pairs) < 4:
-        return f"{text.plural(len(pairs), 'pair')} of probe and success: too few for a correlation."
-    errors, rates = np.array(pairs).T
-    if len(set(errors)) == 1 or len(set(rates)) == 1:
-        return f"All {len(pairs)} pairs are alike in one of the two, so there is no correlation to speak of."
-    from scipy.stats import spearmanr
-
-    found = spearmanr(errors, rates)
-    return (
-        f"Spearman's rank correlation of tip error and success over {len(pairs)} pairs: {found.statistic:.2f} "
-        f"(p {text.probability(float(found.pvalue), '= ')}); below 0 a better probe goes with more successes."
-    )
 
 
 def _evaluated(item: Group, task: str, trained: bool = True) -> bool:

@@ -113,7 +113,7 @@ def _measures(item: Group) -> list[tuple[str, str]]:
         ("time steps of successes", text.mean(item.on_successes("steps"))),
     ]
     for column, what, unit, _ in MEASURES:
-        words = text.spread(item.values(column), 2 if unit == "N" else 1)
+        words = text.spread(item.values(column))
         if words != text.ABSENT:
             spread.append((f"{what} [{unit}], median (quartiles)", words))
     return spread

@@ -5,7 +5,7 @@ deviation of the cells' rates, and a hierarchical bootstrap interval (training s
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -24,8 +24,8 @@ MEASURES = (
     ("d_angle_deg", "angle error", "°", "angle to the goal when the episode ends"),
     ("entry_mm", "entry error", "mm", "where the needle passed the entry, from the hole's centre"),
     ("exit_mm", "exit error", "mm", "where the needle passed the exit, from the hole's centre"),
-    ("slip_mm", "needle slip", "mm", "largest slip of the needle in the grip"),
-    ("slip_deg", "needle slip", "°", "largest turn of the needle in the grip"),
+    ("slip_mm", "needle slip", "mm", "largest slip of the needle in the grip, where it was held"),
+    ("slip_deg", "needle slip", "°", "largest turn of the needle in the grip, where it was held"),
     ("tissue_force_n", "tissue force", "N", "largest contact force of needle or instrument on the tissue"),
 )
 """Columns of an episode's row that are no count: name, what, unit, explanation."""
@@ -106,8 +106,8 @@ class Group:
         return {kind: found.count(kind) for kind in known if kind in found}
 
     def values(self, column: str) -> list[float | None]:
-        """Return a column over all episodes."""
-        return [row.get(column) for row in self.rows]
+        """Return a column over all episodes; without a value where there was nothing to measure."""
+        return [measured(row, column) for row in self.rows]
 
     def on_successes(self, column: str) -> dict[str, float | None]:
         """Return mean and deviation of a column over successful episodes."""
@@ -119,6 +119,12 @@ class Group:
             return text.ABSENT
         mean, std = 100 * self.across.mean, 100 * self.across.std
         return f"{mean:.1f} ± {std:.1f} % ({text.interval(self.across.interval)})"
+
+
+def measured(row: Mapping[str, Any], column: str) -> float | None:
+    """Return a value of an episode; a needle that was never held has not slipped by 0 mm: it has no slip."""
+    absent = column.startswith("slip") and row["failure"] == "missed"
+    return None if absent else row.get(column)
 
 
 def group(collected: Collected) -> list[Group]:

@@ -13,6 +13,7 @@ from surgicai_vision.report.episodes import group_details, letters
 from surgicai_vision.report.films import Reel
 from surgicai_vision.report.groups import KINDS, MEASURES, Group, best_trained, of_task
 from surgicai_vision.report.pairs import Pair
+from surgicai_vision.report.probing import probes
 from surgicai_vision.report.reading import Collected, Condition
 from surgicai_vision.report.tables import beside_paper, our_text, paper_text
 
@@ -54,11 +55,11 @@ def numbers(collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]
         "robustness": curves.robustness_curves(groups),
         "survival": curves.survival(groups),
         "paper_chain": ", ".join(text.percent(rate) for rate in paper.CHAIN),
-        "probes": curves.probes(collected, groups),
+        "probes": probes(collected.probes, groups),
         "pairs": [_pair(at, pair) for at, pair in enumerate(pairs)],
         "pairs_shown": PAIRS_SHOWN,
         "letters": letters(),
-        "missing": [_missing(cell) for cell in collected.missing],
+        "missing": _missing(groups),
     }
 
 
@@ -87,6 +88,10 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
     best = [found for task in tasks if (found := best_trained(of_task(evaluated, task)))]
     if not best:
         return {"headline": f"References on {text.plural(len(tasks), 'task')}", "lead": "No trained policy was run."}
+    if not any(item.successes for item in best):
+        episodes = sum(item.episodes for item in evaluated if item.condition.trained)
+        sentence = f"No trained policy solves any held-out start of {text.plural(len(best), 'task')}"
+        return {"headline": sentence, "lead": f"{episodes:,} episodes; the intervals of each policy stand below."}
     low, high = min(item.rate for item in best), max(item.rate for item in best)
     span = text.percent(high) if low == high else f"{text.percent(low)} to {text.percent(high)}"
     parts = [
@@ -189,6 +194,7 @@ def _row(at: int, item: Group, best: Group | None) -> dict[str, Any]:
     low, high = item.interval
     length, steps = item.on_successes("trajectory_length_mm"), item.on_successes("steps")
     label = f"{text.percent(item.rate)}, 95 % interval {text.interval((low, high))}"
+    failures = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in item.failures.items())
     return {
         **row,
         "kind": "best" if item is best and item.successes else row["kind"],
@@ -203,7 +209,7 @@ def _row(at: int, item: Group, best: Group | None) -> dict[str, Any]:
         "length": text.mean(length),
         "steps": text.mean(steps),
         "outcomes": charts.outcomes(item.successes, item.failures),
-        "failures": ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in item.failures.items()) or "none",
+        "failures": failures or "no failure",
         "sort": {
             "rate": item.rate,
             "across": item.across.mean if item.across else item.rate,
@@ -229,9 +235,9 @@ def _measures(groups: Sequence[Group]) -> dict[str, Any]:
     rows = []
     for at, item in evaluated:
         cells = []
-        for column, _, unit, _ in kept:
+        for column, *_ in kept:
             found = text.quartiles(item.values(column))
-            middle, _, rest = text.spread(item.values(column), 2 if unit == "N" else 1).partition(" ")
+            middle, _, rest = text.spread(item.values(column)).partition(" ")
             cells.append((middle, rest, found[1] if found else None))
         condition = item.condition
         rows.append({"group": at, "task": condition.task, "policy": item.label, "cells": cells,
@@ -259,10 +265,17 @@ def _pair(at: int, pair: Pair) -> dict[str, Any]:
     }
 
 
-def _missing(cell: Any) -> dict[str, Any]:
-    condition = cell.condition
-    return {"task": condition.task, "policy": condition.label, "seed": cell.seed, "state": cell.state,
-            "reason": " ".join(cell.reason.split())}  # fmt: skip
+def _missing(groups: Sequence[Group]) -> list[dict[str, Any]]:
+    """Return what has no result, one row for each condition, state and reason."""
+    rows: dict[tuple[str, ...], list[int]] = {}
+    for item in groups:
+        for cell in item.missing:
+            key = (item.condition.task, item.label, cell.state, " ".join(cell.reason.split()))
+            rows.setdefault(key, []).append(cell.seed)
+    return [
+        {"task": task, "policy": policy, "seeds": ", ".join(map(str, seeds)), "state": state, "reason": reason}
+        for (task, policy, state, reason), seeds in rows.items()
+    ]
 
 
 def _filters(groups: Sequence[Group]) -> list[tuple[str, list[str]]]:

@@ -25,6 +25,9 @@ FAILED, NOT_RUN, PENDING = "failed", "not run", "pending"
 PROBLEM = re.compile(r"(failed|not run): (\w+), (.+), seed (\d+): (.*)", re.DOTALL)
 """A line of `run.json`'s "not_run"."""
 
+COUNT = re.compile(r"^(\d+)([a-z]+)$")
+"""A change of a recipe that is a number: "2epochs"."""
+
 
 @dataclass(frozen=True)
 class Condition:
@@ -270,8 +273,10 @@ def _filled(cell: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _variant(policy: str, pool: str, recipe: str) -> str:
-    """Name what is not as usual."""
-    parts = ((policy, "bc"), (pool, "global"), (recipe.removeprefix("paper+"), "paper"))
+    """Name what is not as usual; demonstrations are told elsewhere."""
+    name, *changes = recipe.split("+")
+    changes = [COUNT.sub(r"\1 \2", change) for change in changes if not change.endswith("demos")]
+    parts = ((policy, "bc"), (pool, "global"), (name, "paper"), (" + ".join(changes), ""))
     return " · ".join(part for part, usual in parts if part != usual)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from surgicai_vision import files, names, statistics
 from surgicai_vision.report import paper, text
-from surgicai_vision.report.groups import KINDS, MEASURES, Group
+from surgicai_vision.report.groups import KINDS, MEASURES, Group, measured
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.reading import REFERENCES, Condition, Result
 from surgicai_vision.results import parquet_bytes
@@ -36,11 +36,17 @@ def write_tables(folder: Path, groups: Sequence[Group], pairs: Sequence[Pair], t
     """Write every table below `folder` and return their folder."""
     out = folder / FOLDER
     out.mkdir(parents=True, exist_ok=True)
-    files.write_bytes(out / "table.md", markdown(groups, title).encode())
-    files.write_bytes(out / "table.tex", latex(groups, title).encode())
-    files.write_bytes(out / "table.csv", _csv([condition_record(item) for item in groups]))
-    files.write_bytes(out / "cells.parquet", parquet_bytes(list(cell_records(groups))))
-    files.write_bytes(out / "pairs.csv", _csv([_pair_record(pair) for pair in pairs]))
+    contents = {
+        "table.md": markdown(groups, title).encode(),
+        "table.tex": latex(groups, title).encode(),
+        "table.csv": _csv([condition_record(item) for item in groups]),
+        "cells.parquet": parquet_bytes(list(cell_records(groups))),
+        "pairs.csv": _csv([_pair_record(pair) for pair in pairs]),
+    }
+    for name, content in contents.items():
+        path = out / name
+        if not path.exists() or path.read_bytes() != content:  # a second run changes nothing
+            files.write_bytes(path, content)
     return out
 
 
@@ -239,7 +245,7 @@ def _measures(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         spread = statistics.mean_and_std([float(row[column]) for row in wins])
         found |= {f"{column}_mean": spread["mean"], f"{column}_std": spread["std"]}
     for column, *_ in MEASURES:
-        middle = text.quartiles([row.get(column) for row in rows])
+        middle = text.quartiles([measured(row, column) for row in rows])
         found[f"{column}_median"] = middle[1] if middle else None
     failures = [row["failure"] for row in rows if not row["success"]]
     return {**found, **{kind: failures.count(kind) for kind in KINDS}}

@@ -40,11 +40,15 @@ def quartiles(values: Sequence[float | None]) -> tuple[float, float, float] | No
     return float(low), float(middle), float(high)
 
 
-def spread(values: Sequence[float | None], digits: int = 1) -> str:
-    """Return the median and quartiles as "0.8 (0.5–1.2)"; of how many, where some are missing."""
+def spread(values: Sequence[float | None]) -> str:
+    """Return the median and quartiles as "0.8 (0.5–1.2)", with two digits that count at the upper quartile.
+
+    Of how many is said where some are missing.
+    """
     found = quartiles(values)
     if found is None:
         return ABSENT
+    digits = next((digits for digits, least in enumerate((100, 1, 0.1, 0.01)) if found[2] >= least), 3)
     low, middle, high = (f"{value:.{digits}f}" for value in found)
     count = len(finite(values))
     return f"{middle} ({low}–{high})" + (f", n = {count}" if count < len(values) else "")
