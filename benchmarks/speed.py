@@ -8,7 +8,8 @@ step     `env.step` (obs_type state) along an expert's whole procedure, against 
 frames   `FrameRenderer.render` against `mujoco.Renderer` with shadows, multisampling and triangles set alike, on the
          same states; both must give the same pixels. One core: llvmpipe draws in the calling thread.
 reset    per task [ms].
-workers  asynchronous vector envs with two workers against one, with state and with pictures.
+workers  two worker processes against one, steps of all envs a second: gymnasium's asynchronous vector env (`async_…`:
+         an env a worker) and ours (`shares_…`: `--share` envs a worker), with state and with pictures.
 
 A and B take turns; figures are medians over the turns, and ratios are medians of the turns' ratios. `--clock cpu`
 counts the process's own CPU time instead of the wall's, for a machine that others use too; workers are timed by the
@@ -186,32 +187,42 @@ def measure_reset(repeats: int) -> dict[str, float]:
     return row
 
 
-def measure_workers(repeats: int, steps: int, obs_type: str) -> dict[str, Any]:
-    """Time vector envs with one and with two workers; steps of all workers a second."""
+def measure_workers(repeats: int, steps: int, obs_type: str, share: int) -> dict[str, Any]:
+    """Time vector envs with one and with two workers.
+
+    Args:
+        repeats: turns.
+        steps: vector steps in a turn.
+        obs_type: what the envs show.
+        share: envs of a worker of ours; 0 for gymnasium's asynchronous vector env.
+    """
     chosen = {"obs_type": obs_type, **({"cameras": (CAMERA,), "image_size": SIZE} if obs_type == "pixels" else {})}
-    vectors = [
-        gymnasium.make_vec(
-            names.ENV_IDS["insert"], count, "async", vector_kwargs={"context": "spawn"}, max_steps=10**6, **chosen
-        )
-        for count in (1, 2)
-    ]
+    vectors = [_vector(workers, share, chosen) for workers in (1, 2)]
     rng = np.random.default_rng(0)
     for vector in vectors:
         vector.reset(seed=0)
 
-    def drive(index: int) -> None:
-        count = index + 1
+    def drive(vector: gymnasium.vector.VectorEnv) -> None:
         for _ in range(steps):
-            vectors[index].step(rng.uniform(-0.2, 0.2, (count, 7)).astype(np.float32))
+            vector.step(rng.uniform(-0.2, 0.2, (vector.num_envs, 7)).astype(np.float32))
 
-    one, two = in_turns(lambda: drive(0), lambda: drive(1), repeats)
+    one, two = in_turns(lambda: drive(vectors[0]), lambda: drive(vectors[1]), repeats)
+    taken = [steps * vector.num_envs for vector in vectors]
     for vector in vectors:
         vector.close()
     return {
-        "one_steps_per_s": round(steps / median(one, 9)),
-        "two_steps_per_s": round(2 * steps / median(two, 9)),
+        "one_steps_per_s": round(taken[0] / median(one, 9)),
+        "two_steps_per_s": round(taken[1] / median(two, 9)),
         "two_of_one": ratio([2 * seconds for seconds in one], two),
     }
+
+
+def _vector(workers: int, share: int, chosen: dict[str, Any]) -> gymnasium.vector.VectorEnv:
+    """Return a vector env of the subtask insert that never truncates."""
+    task, chosen = names.ENV_IDS["insert"], {"max_steps": 10**6, **chosen}
+    if share:
+        return gymnasium.make_vec(task, workers * share, workers=workers, **chosen)
+    return gymnasium.make_vec(task, workers, "async", vector_kwargs={"context": "spawn"}, **chosen)
 
 
 def main() -> None:
@@ -221,6 +232,7 @@ def main() -> None:
     parser.add_argument("--only", choices=parts, nargs="+", default=parts)
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--frames", type=int, default=100, help="frames or vector steps in a turn")
+    parser.add_argument("--share", type=int, default=16, help="envs of a worker of ours")
     parser.add_argument("--clock", choices=tuple(CLOCKS), default="wall")
     chosen = parser.parse_args()
     Clock.now = staticmethod(CLOCKS[chosen.clock])
@@ -233,8 +245,11 @@ def main() -> None:
         row["reset_ms"] = measure_reset(chosen.repeats)
     if "workers" in chosen.only:
         Clock.now = staticmethod(CLOCKS["wall"])
-        kinds = ("state", "pixels")
-        row["workers"] = {kind: measure_workers(chosen.repeats, chosen.frames, kind) for kind in kinds}
+        row["workers"] = {
+            f"{how}_{kind}": measure_workers(chosen.repeats, chosen.frames, kind, share)
+            for how, share in (("async", 0), ("shares", chosen.share))
+            for kind in ("state", "pixels")
+        }
     row["load_average"] = [round(value, 2) for value in os.getloadavg()]
     emit("speed", row, render="frames" in chosen.only)
 

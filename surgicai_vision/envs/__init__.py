@@ -74,6 +74,7 @@ for _task, _id in names.ENV_IDS.items():
         gymnasium.register(
             id=_id,
             entry_point="surgicai_vision.envs:make_task",
+            vector_entry_point="surgicai_vision.envs.vectorised:make_vector",
             kwargs={"task": _task},
             order_enforce=True,
             disable_env_checker=False,
