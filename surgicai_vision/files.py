@@ -108,6 +108,23 @@ def check_output(path: Path, *, may_resume: str | None = None) -> None:
         raise InputError(f"--out {path} cannot be written: no permission on {parent}; choose another folder.")
 
 
+def claim(path: Path, owner: dict[str, Any], what: str) -> None:
+    """Write whose folder this is into the file `path` in it; refuse a folder of somebody else.
+
+    Args:
+        path: a file in the folder, which is made.
+        owner: plain data: everything the folder's content depends on.
+        what: what the folder holds, for the message.
+
+    Raises:
+        OutputExists: the file is there and says something else.
+    """
+    if path.exists() and read_json(path) != owner:
+        raise OutputExists(f"{path.parent} holds {what} of another policy, task or starts; give another --out.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, owner)
+
+
 def sha256_file(path: Path) -> str:
     """sha256 (hex) of a file's bytes."""
     with open(path, "rb") as file:

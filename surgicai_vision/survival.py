@@ -14,7 +14,7 @@ from typing import Any
 from surgicai_vision import chain, files, names
 from surgicai_vision.cells import Stage, Subject, evaluate_into
 from surgicai_vision.config import to_mapping
-from surgicai_vision.errors import OutputExists, check_name
+from surgicai_vision.errors import check_name
 from surgicai_vision.evaluation import Agent, MakeAgent
 from surgicai_vision.results import MARKER, parquet_bytes, read_rows
 from surgicai_vision.statistics import clopper_pearson, holm, mcnemar
@@ -116,8 +116,4 @@ def _claim(out: Path, subject: Subject, seeds: Sequence[int]) -> None:
         "task_config": to_mapping(subject.config),
         "seeds": [int(seed) for seed in seeds],
     }
-    path = out / MARK
-    if path.exists() and files.read_json(path) != mine:
-        raise OutputExists(f"{out} holds the survival of another chain, task or starts; give another --out.")
-    out.mkdir(parents=True, exist_ok=True)
-    files.write_json(path, mine)
+    files.claim(out / MARK, mine, "the survival")

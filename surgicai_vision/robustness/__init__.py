@@ -14,7 +14,7 @@ from typing import Any
 from surgicai_vision import files
 from surgicai_vision.cells import Stage, Subject, evaluate_into
 from surgicai_vision.config import to_mapping
-from surgicai_vision.errors import InputError, OutputExists, check_name
+from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.results import MARKER, parquet_bytes, read_rows
 from surgicai_vision.robustness.axes import AXES, axes_of, shifted
 from surgicai_vision.statistics import area_interval, area_under_curve, clopper_pearson, holm, mcnemar
@@ -103,11 +103,7 @@ def _claim(out: Path, subject: Subject, seeds: Sequence[int]) -> None:
         "task_config": to_mapping(subject.config),
         "seeds": [int(seed) for seed in seeds],
     }
-    path = out / MARK
-    if path.exists() and files.read_json(path) != mine:
-        raise OutputExists(f"{out} holds the curves of another policy, task or starts; give another --out.")
-    out.mkdir(parents=True, exist_ok=True)
-    files.write_json(path, mine)
+    files.claim(out / MARK, mine, "the curves")
 
 
 def _copy(plain: Path, folder: Path, axis: str) -> None:
