@@ -12,12 +12,14 @@ import pytest
 from teleoperators import REST, SHORT, VIEWS, AtGamepad, AtKeyboard, Script, Stand, Still, event, right
 
 from surgicai_vision import envs
+from surgicai_vision.cli import main
 from surgicai_vision.config import RandomisationConfig, TaskConfig
 from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker
 from surgicai_vision.errors import OutputExists, SurgicaiError
 from surgicai_vision.teleoperation.commands import DISCARD, KEEP, START, STOP, VIEW, Input
 from surgicai_vision.teleoperation.driving import drive
+from surgicai_vision.teleoperation.keyboard import TABLE, key_names, key_table
 from surgicai_vision.teleoperation.pacing import Pacer
 from surgicai_vision.teleoperation.recordings import open_recordings
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, STOPPED, WAITING, Rules, Session
@@ -354,6 +356,40 @@ def test_a_closed_screen_ends_the_loop(begin):
     canvas.closed = True
     drive(session, Script(), canvas, canvas, Pacer(1.0, clock, clock.sleep))
     assert not session.over
+
+
+# -- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--veiw", "front"], "Did you mean '--view'?"),
+        (["--view", "frnt"], "Did you mean 'front'?"),
+        (["--view", ""], "--view is empty"),
+        (["--frame", "cam"], "Did you mean 'camera'?"),
+        (["--speed", "2"], "--speed is 2.0; it must be above 0 and at most 1"),
+        (["--seconds", "nan"], "--seconds is nan"),
+        (["--port", "8000"], "give --web with it"),
+        (["--port", "99999", "--web"], "--port is 99999"),
+        (["--episodes", "0"], "at least 1"),
+        (["--out", "/proc/x"], "cannot be written"),
+    ],
+)
+def test_wrong_input_is_one_line(arguments, said, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["teleoperate", *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_help_and_documentation_have_the_key_table(root, capsys):
+    assert main(["teleoperate", "--help"]) == 0
+    assert key_table() in capsys.readouterr().out
+    text = (root / "docs" / "teleoperation.md").read_text()
+    for row in TABLE:
+        keys = " ".join(f"<kbd>{name}</kbd>" for name in key_names(row))
+        assert f"| {keys} | {row.gamepad} | {row.meaning} |" in text
 
 
 # -- the process ------------------------------------------------------------------------------------------------------

@@ -3,8 +3,11 @@
 import http.client
 import itertools
 import json
+import subprocess
+import sys
 import threading
 import time
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -267,6 +270,40 @@ def test_keys_that_came_by_http_grasp_the_needle(web, tmp_path):
     env.close()
     demo = read_demo(list_demos(tmp_path / "demos")[0])
     assert demo.success[-1] and demo.contact[-1]
+
+
+def test_the_command_records_stops_and_sums_up(tmp_path):
+    command = [sys.executable, "-m", "surgicai_vision", "teleoperate", "--web", "--port", "0", "--size", "64"]
+    command += ["--keep-failures", "--out", str(tmp_path / "demos"), "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    address = urlsplit(process.stderr.readline().split()[-1])
+    connection = http.client.HTTPConnection(address.netloc, timeout=20)
+
+    def status(after=0):
+        connection.request("GET", f"{address.path}status?after={after}")
+        return json.loads(connection.getresponse().read())
+
+    for number, (code, state, kept) in enumerate(
+        (("Enter", DRIVING, 0), ("ArrowRight", WAITING, 1), ("Escape", "stopped", 1))
+    ):
+        body = json.dumps(said(number, pressed=[code]))
+        connection.request("POST", f"{address.path}input", body, {"Content-Type": "application/json"})
+        assert connection.getresponse().read() == b""
+        now = status()
+        while now["state"] != state or (state == DRIVING and now["steps"] < 3):
+            now = status(after=now["number"])
+        assert now["kept"] == kept
+    out, error = process.communicate(timeout=30)
+    assert process.returncode == 0, error
+    summary = json.loads(out.splitlines()[-1])
+    demo = read_demo(list_demos(tmp_path / "demos")[0])
+    assert summary == {
+        "task": "grasp", "kept": 1, "discarded": 0, "skipped": 0, "steps": len(demo), "episodes": 1,
+        "demos": str(tmp_path / "demos"),
+    }  # fmt: skip
+    assert demo.config.max_steps == 3000
+    assert "Kept as episode 0" in error
 
 
 # -- a browser --------------------------------------------------------------------------------------------------------

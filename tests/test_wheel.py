@@ -43,7 +43,8 @@ def test_wheel_holds_the_three_packages_and_nothing_else(built: tuple[Path, Path
     sources = {
         f"{path.relative_to(root)}"
         for name in ("surgicai_vision", "encoders", "policies")
-        for path in (root / name).rglob("*.py")
+        for path in (root / name).rglob("*")
+        if path.suffix in (".py", ".js", ".css", ".j2")
     }
     assert sources <= set(contents)
     configs = {f"surgicai_vision/{path.relative_to(root)}" for path in (root / "configs").rglob("*") if path.is_file()}

@@ -54,7 +54,9 @@ class Options:
 
     task: str = option("grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
     web: bool = option(False, "show a page on this machine's loopback in place of a window")
-    port: int = option(WEB_PORT, "port of the page, 0 for any", check=_within(0, 65535), metavar="N")
+    port: int | None = option(
+        None, "with --web, its port, 0 for any", check=_within(0, 65535), metavar="N", default_text=f"{WEB_PORT}"
+    )
     view: tuple[str, ...] = option(
         ("front", "back"),
         f"cameras shown; the first leads: {', '.join(names.CAMERAS)}",
@@ -63,7 +65,9 @@ class Options:
     )
     size: int = option(448, "side of a picture in pixels", check=_within(*SIZES), metavar="N")
     frame: str = option(
-        "camera", "whose axes the keys mean: camera, or tool", check=one_of("frame", ("camera", "tool"))
+        "camera",
+        "whose axes the keys mean: camera (of the leading view), or tool",
+        check=one_of("frame", ("camera", "tool")),
     )
     speed: float = option(0.5, "share of the step size that a key or a full deflection commands", check=_speed)
     pace: float = option(1.0, "share of real time; 0.5 gives twice the time to react", check=_within(*PACES))
@@ -99,6 +103,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
     if not options.view:
         raise InputError("--view is empty; name at least one camera.")
+    if options.port is not None and not options.web:
+        raise InputError("--port is the page's; give --web with it.")
     config = _config(options)
     out = Path(options.out) if options.out else folders.OUTPUTS / "teleoperation" / options.task
     folders.check_folder(out, "demos.json")
@@ -144,7 +150,7 @@ def _place(options: Options) -> Any:
     if options.web:
         from surgicai_vision.teleoperation.web import WebView
 
-        return WebView(options.view, title, options.port)
+        return WebView(options.view, title, WEB_PORT if options.port is None else options.port)
     from surgicai_vision.teleoperation.window import Window
 
     return Window(options.view, title, options.size)

@@ -35,7 +35,7 @@ from surgicai_vision.teleoperation.gamepad import Gamepad
 from surgicai_vision.teleoperation.keyboard import TABLE, Keyboard, key_names
 from surgicai_vision.teleoperation.session import Status
 
-HOST, PORT = "127.0.0.1", 8765
+HOST = "127.0.0.1"
 NAMES = ("127.0.0.1", "localhost")
 """What a browser on this machine, or at the end of a tunnel, may call the server."""
 SILENT = 0.5
@@ -207,7 +207,7 @@ class WebView:
 
     closed = False
 
-    def __init__(self, views: tuple[str, ...], title: str, port: int = PORT):
+    def __init__(self, views: tuple[str, ...], title: str, port: int = 0):
         self.hands, self.screen = Hands(), Show()
         self.token = secrets.token_urlsafe(16)
         self._page = _page(views, title)
