@@ -140,11 +140,11 @@ def test_the_needle_starts_where_the_released_code_puts_it():
 # -- rewards ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("tolerance", ["paper", "released"])
 @pytest.mark.parametrize("reward", ["sparse", "dense"])
 @pytest.mark.parametrize("task", names.SUBTASKS)
-def test_compute_reward_is_the_reward(task, reward):
-    """Where success is a matter of the pose alone: the released code's tolerances."""
-    env = make(task, obs_type="goal", reward=reward, tolerance="released")
+def test_compute_reward_is_the_reward(task, reward, tolerance):
+    env = make(task, obs_type="goal", reward=reward, tolerance=tolerance)
     seen, _ = env.reset(seed=0)
     expert, rows, rewards, infos = Expert(env), [], [], []
     for _ in range(150):
@@ -164,3 +164,19 @@ def test_compute_reward_is_the_reward(task, reward):
         expected = [0.0 if info["is_success"] else -1.0 for info in infos]
         assert infos[-1]["is_success"]
     assert np.allclose(rewards, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("task", names.SUBTASKS)
+def test_the_goals_pose_alone_is_no_reward(task):
+    """Jaws closed on nothing, holes not passed: a needle put to its goal is rewarded where nothing else is asked."""
+    env = make(task, obs_type="goal")
+    seen, _ = env.reset(seed=1)
+    achieved, desired = seen["desired_goal"].copy(), seen["desired_goal"]
+    achieved[7] = seen["achieved_goal"][7]
+    asked = task != "place"
+    assert achieved[7] == (not asked) and desired[7] == 1.0
+    assert env.compute_reward(achieved, desired) == (-1.0 if asked else 0.0)
+    batch = env.compute_reward(np.stack([achieved, desired]), np.stack([desired, desired]))
+    assert batch.tolist() == [-1.0 if asked else 0.0, 0.0]
+    relabelled = seen["achieved_goal"]  # as HER does: what was achieved is what was wanted
+    assert env.compute_reward(seen["achieved_goal"], relabelled) == 0.0

@@ -27,7 +27,7 @@ from surgicai_vision.envs.observation import ObservationConfig
 from surgicai_vision.envs.pictures import Pictures
 from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
 from surgicai_vision.envs.subtask import Subtask
-from surgicai_vision.envs.success import Info, Target, measure
+from surgicai_vision.envs.success import Info, Target, measure, meets_demands
 from surgicai_vision.errors import InputError, PhysicsError
 from surgicai_vision.scene import build_scene
 
@@ -224,12 +224,17 @@ class SuturingEnv(gymnasium.Env):
         return -(info["d_trans"] + info["d_angle"] / 10.0)
 
     def compute_reward(self, achieved_goal: NDArray, desired_goal: NDArray, info: Any = None) -> NDArray[np.float64]:
-        """Return rewards for (batch, 7) or (7,) goals of obs_type "goal", by position and angle alone (for HER)."""
+        """Return the rewards of goals of obs_type "goal", (batch, 8) or (8,): vectorised, for HER.
+
+        On what was observed it is the reward of the step. A relabelled goal asks for what held when it was achieved: an
+        insertion that missed the holes is no example of one that passed them, but is one of reaching that pose.
+        """
         distance, turn = observation.goal_errors(achieved_goal, desired_goal)
         if self.config.reward == "dense":
             return -(distance + turn / 10.0)
         tolerance = self.subtask.tolerances[self.config.tolerance]
-        return np.where((distance <= tolerance.distance) & (turn <= tolerance.angle), 0.0, -1.0)
+        met = np.asarray(achieved_goal)[..., 7] >= np.asarray(desired_goal)[..., 7]
+        return np.where((distance <= tolerance.distance) & (turn <= tolerance.angle) & met, 0.0, -1.0)
 
     # -- observing ------------------------------------------------------------------------------------------------
 
@@ -264,8 +269,8 @@ class SuturingEnv(gymnasium.Env):
             jaw = self.simulation.jaw(self.subtask.arm)
             return {
                 "observation": self.agent_pos(),
-                "achieved_goal": observation.goal_vector(achieved, jaw),
-                "desired_goal": observation.goal_vector(desired, 0.0),
+                "achieved_goal": observation.goal_vector(achieved, jaw, self._meets_demands()),
+                "desired_goal": observation.goal_vector(desired, 0.0, True),
             }
         seen = self._pictures.look(self.data, self.view)
         if self.view.obs_type == "pixels_agent_pos":
@@ -305,6 +310,10 @@ class SuturingEnv(gymnasium.Env):
         x, y, z = self.simulation.tip(arm)[:3]
         memory.tip_path += ((x - memory.tool_x) ** 2 + (y - memory.tool_y) ** 2 + (z - memory.tool_z) ** 2) ** 0.5
         memory.tool_x, memory.tool_y, memory.tool_z = x, y, z
+
+    def _meets_demands(self) -> bool:
+        """Say whether what success needs besides the pose holds now."""
+        return meets_demands(self.simulation, self.subtask, self.stitch, self.config.tolerance)
 
     def _progress(self, info: Info) -> bool:
         """Move on to the next subtask and say so, where a task has several; here there is none."""

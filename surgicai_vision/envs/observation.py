@@ -3,8 +3,9 @@
 `state`             (21,) float32: tip now (7), tip that would meet the goal (7), error (7); each 7 is x y z [cm],
                     roll pitch yaw [rad], jaw [rad] in the active arm's base (released code's layout). The error's
                     rotation is the rotation vector from now to the goal, so it never wraps.
-`goal`              Dict for hindsight relabelling: `observation` (7), `achieved_goal` (7), `desired_goal` (7): the
-                    measured frame that success is judged by and its goal, in world, x y z [m], rotation vector, jaw.
+`goal`              Dict for hindsight relabelling: `observation` (7), `achieved_goal` (8), `desired_goal` (8): the
+                    measured frame that success is judged by and its goal, in world, x y z [m], rotation vector, jaw,
+                    and 1 where what success needs besides the pose holds (contact, holes passed, needle out), else 0.
 `pixels`            Dict with `pixels`: view → (height, width, 3) uint8 RGB; with depth=True `depth`: view →
                     (height, width, 1) float32 [m]; with segmentation=True `segmentation`: view → (…, 1) uint8.
 `pixels_agent_pos`  the same and `agent_pos` (7,) float32: x y z [m], roll pitch yaw [rad], jaw [rad] of the active
@@ -75,7 +76,7 @@ class ObservationConfig:
         if self.obs_type == "state":
             return _box(21)
         if self.obs_type == "goal":
-            return spaces.Dict({key: _box(7) for key in ("observation", "achieved_goal", "desired_goal")})
+            return spaces.Dict({"observation": _box(7), "achieved_goal": _box(8), "desired_goal": _box(8)})
         height, width = self.image_size
         groups: dict[str, spaces.Space] = {"pixels": self._views(spaces.Box(0, 255, (height, width, 3), np.uint8))}
         if self.depth:
@@ -175,13 +176,13 @@ def _roll(sine: float, cosine: float) -> float:
     return roll if roll <= 0.0 else max(roll - 2.0 * pi, -LARGEST_ROLL)
 
 
-def goal_vector(pose: Pose, jaw: float) -> np.ndarray:
-    """Return x y z [m], rotation vector [rad], jaw [rad] of a pose in world, shape (7,)."""
-    return np.array([*pose[:3], *matrix_to_rotvec_flat(pose[3:]), jaw], dtype=np.float32)
+def goal_vector(pose: Pose, jaw: float, met: bool) -> np.ndarray:
+    """Return x y z [m], rotation vector [rad], jaw [rad] of a pose in world, and whether demands are met, (8,)."""
+    return np.array([*pose[:3], *matrix_to_rotvec_flat(pose[3:]), jaw, float(met)], dtype=np.float32)
 
 
 def goal_errors(achieved: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance [m] and geodesic angle [rad] between goal vectors of shape (7,) or (batch, 7)."""
+    """Return distance [m] and geodesic angle [rad] between goal vectors of shape (8,) or (batch, 8)."""
     from scipy.spatial.transform import Rotation
 
     one, other = np.atleast_2d(achieved).astype(np.float64), np.atleast_2d(desired).astype(np.float64)

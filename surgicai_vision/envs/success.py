@@ -39,6 +39,12 @@ def measure(simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: st
     }
 
 
+def meets_demands(simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str) -> bool:
+    """Say whether what success needs besides the pose holds now: contact, holes passed, needle out, no divergence."""
+    contact = simulation.holds(subtask.arm)
+    return simulation.memory.diverged == 0.0 and _meets_demands(simulation, subtask, stitch, preset, contact)
+
+
 def _meets_demands(simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str, contact: bool) -> bool:
     """Say whether what success needs besides the pose holds."""
     demands, passed = subtask.demands[preset], simulation.memory.passed

@@ -33,6 +33,10 @@ class Suture(SuturingEnv):
         self._enter(int(memory.phase) + 1)
         return True
 
+    def _meets_demands(self) -> bool:
+        """Say so of the last subtask alone: it is the one whose success is the whole's."""
+        return int(self.simulation.memory.phase) == len(self._subtasks) - 1 and super()._meets_demands()
+
     def begin(self, phase: int) -> None:
         """Begin a subtask by choice, as a high-level policy does: its arm moves from now on.
 
