@@ -15,8 +15,8 @@ from surgicai_vision import envs
 from surgicai_vision.cli import main
 from surgicai_vision.config import RandomisationConfig, TaskConfig
 from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
-from surgicai_vision.demos.store import list_demos, read_demo, read_marker
-from surgicai_vision.errors import OutputExists, SurgicaiError
+from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_marker
+from surgicai_vision.errors import BadFile, OutputExists, SurgicaiError
 from surgicai_vision.teleoperation.commands import DISCARD, KEEP, START, STOP, VIEW, Input
 from surgicai_vision.teleoperation.driving import drive
 from surgicai_vision.teleoperation.keyboard import TABLE, key_names, key_table
@@ -210,6 +210,12 @@ def test_another_task_scene_or_seed_is_refused(tmp_path):
     for config, scene, seed in ((LONG, "f", None), (SHORT, "e", None), (SHORT, "f", 3)):
         with pytest.raises(OutputExists), open_recordings(tmp_path / "demos", config, scene * 64, seed):
             pass
+    write_marker(tmp_path / "demos", "grasp", "teleoperate", request=read_marker(tmp_path / "demos")["request"])
+    with (
+        pytest.raises(BadFile, match="does not say which seeds"),
+        open_recordings(tmp_path / "demos", SHORT, "f" * 64),
+    ):
+        pass
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "thesis.txt").write_text("mine")
     with (
@@ -275,6 +281,13 @@ def test_kept_episodes_go_through_render_demos_as_they_are(tmp_path):
     assert not check_dataset(tmp_path / "dataset").problems
     actions = np.concatenate([read_demo(path).action for path in list_demos(tmp_path / "demos")])
     np.testing.assert_array_equal(open_dataset(tmp_path / "dataset").columns()["action"], actions)
+
+
+def test_a_whole_suture_is_driven_with_one_gamepad_and_changes_arms(tmp_path):
+    assert play(tmp_path / "demos", AtGamepad, TaskConfig("suture", max_steps=2000), speed=1.0).kept == 1
+    demo = read_demo(list_demos(tmp_path / "demos")[0])
+    assert np.unique(demo.phase).tolist() == [0, 1, 2, 3, 4]
+    assert demo.success[-1]
 
 
 def test_randomised_and_delayed_envs_are_driven_too(tmp_path):

@@ -14,7 +14,7 @@ from typing import Any
 
 from surgicai_vision.config import TaskConfig, to_mapping
 from surgicai_vision.demos.store import MARKER, Demo, list_demos, read_demo, read_marker, write_demo, write_marker
-from surgicai_vision.errors import OutputExists, SurgicaiError
+from surgicai_vision.errors import BadFile, OutputExists, SurgicaiError
 from surgicai_vision.files import TEMPORARY, check_output, code_version
 
 SOURCE = "teleoperate"
@@ -111,7 +111,9 @@ def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -
             "give another folder."
         )
     paths = list_demos(folder) if any(folder.glob("episode_*")) else []
-    seeds = list(marker["seeds"])
+    seeds, skipped = marker.get("seeds"), marker.get("skipped")
+    if not (isinstance(seeds, list) and isinstance(skipped, list)):
+        raise BadFile(f"{folder / MARKER} does not say which seeds were kept and given up; give another folder.")
     if len(seeds) != len(paths):  # killed between an episode and its entry
         seeds = [read_demo(path).seed for path in paths]
-    return Recordings(folder, request, seeds, list(marker["skipped"]))
+    return Recordings(folder, request, seeds, skipped)
