@@ -12,7 +12,7 @@ After `decisions` decisions (paper: 50) both arms hold still.
 A chain is a YAML file, which `surgicai-vision evaluate chain.yaml` takes:
 
     hlp: outputs/train/suture-hlp-…   # a checkpoint, or `order`: the subtasks in their order
-    grasp: outputs/train/grasp-…      # a checkpoint of this subtask, or `expert`, `random`, `zero`
+    grasp: outputs/train/grasp-…      # a checkpoint of this subtask, LeRobot's too, or `expert`, `random`, `zero`
     place: …                          # and so on for insert, handoff, pullout
     termination: privileged
 """
@@ -26,7 +26,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision import names
+from surgicai_vision import lerobot_agent, names
 from surgicai_vision.agents import BASELINES, Shared, one_thread
 from surgicai_vision.cells import Subject, checkpoint_subject, policy_agent
 from surgicai_vision.config import TaskConfig, digest, to_mapping
@@ -83,7 +83,7 @@ def subject(chain: Chain, weights: str | None = None, accept_licence: bool = Fal
 
     Args:
         chain: who decides and who acts.
-        weights: file with the encoders' pretrained weights.
+        weights: files with the encoders' pretrained weights, as `registry.weights_of` takes them.
         accept_licence: accept weights under a non-commercial licence.
 
     Raises:
@@ -95,10 +95,10 @@ def subject(chain: Chain, weights: str | None = None, accept_licence: bool = Fal
     configs = {}
     for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True):
         if policy not in BASELINES:
-            configs[subtask] = checkpoint_subject(Path(policy), weights, accept_licence).config
+            configs[subtask] = _low_subject(policy, subtask, weights, accept_licence).config
             if configs[subtask].task != subtask:
                 raise InputError(f"{policy} was trained for '{configs[subtask].task}', not for '{subtask}'.")
-    about: dict[str, Any] = {"chain": to_mapping(chain), "views": list(_views(chain))}
+    about: dict[str, Any] = {"chain": to_mapping(chain)}
     if chain.hlp != ORDER:
         checkpoint = read_checkpoint(Path(chain.hlp))
         if checkpoint.policy != "hlp" or checkpoint.task.task != names.SUTURE:
@@ -110,16 +110,27 @@ def subject(chain: Chain, weights: str | None = None, accept_licence: bool = Fal
         raise InputError(
             "The chain's policies were trained in different scenes or with different steps; give one kind."
         )
+    about["views"] = list(_views(chain, weights, accept_licence))
     name = f"chain-{chain.termination}-{digest(chain)[:8]}"
     return Subject(name, made[0], functools.partial(ChainAgent, name, chain, weights, accept_licence), about)
 
 
-def _views(chain: Chain) -> tuple[str, ...]:
+def _low_subject(policy: str, subtask: str, weights: str | None, accept_licence: bool) -> Subject:
+    """Return the subject of a low-level policy's folder, ours or LeRobot's."""
+    lerobot = lerobot_agent.find(Path(policy))
+    if lerobot:
+        return lerobot_agent.subject(lerobot, subtask, weights)
+    return checkpoint_subject(Path(policy), weights, accept_licence)
+
+
+def _views(chain: Chain, weights: str | None, accept_licence: bool) -> tuple[str, ...]:
     """Every view some policy of the chain sees."""
     from surgicai_vision.checkpoint import read_checkpoint
 
-    folders = [folder for folder in {chain.hlp, *chain.low} if folder != ORDER and folder not in BASELINES]
-    seen = {view for folder in folders for view in read_checkpoint(Path(folder)).views}
+    seen = set() if chain.hlp == ORDER else set(read_checkpoint(Path(chain.hlp)).views)
+    for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True):
+        if policy not in BASELINES:
+            seen.update(_low_subject(policy, subtask, weights, accept_licence).about["views"])
     return tuple(view for view in names.CAMERAS if view in seen)
 
 
@@ -149,10 +160,16 @@ class ChainAgent:
     """
 
     def __init__(self, name: str, chain: Chain, weights: str | None = None, accept_licence: bool = False):
-        self.name, self.chain, self.cameras = name, chain, _views(chain)
-        load = functools.lru_cache(lambda folder: policy_agent(Path(folder), weights, accept_licence))
-        self._low = [BASELINES[policy]() if policy in BASELINES else load(policy) for policy in chain.low]
-        self._high: Any = None if chain.hlp == ORDER else load(chain.hlp)
+        self.name, self.chain = name, chain
+        self.cameras = _views(chain, weights, accept_licence)
+        self._low: list[Any] = [
+            BASELINES[policy]()
+            if policy in BASELINES
+            else _low_subject(policy, subtask, weights, accept_licence).make_agent()
+            for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True)
+        ]
+        high = None if chain.hlp == ORDER else policy_agent(Path(chain.hlp), weights, accept_licence)
+        self._high: Any = high
         sizes = {agent.image_size for agent in (*self._low, self._high) if agent is not None and agent.cameras}
         if len(sizes) > 1:
             raise InputError(
@@ -176,7 +193,7 @@ class ChainAgent:
         self._features.clear()
         states = [self._slots[slot] for slot in slots]
         with one_thread():
-            self._decide(states, envs, observations)
+            self._decide(slots, states, envs, observations)
         actions = np.zeros((len(slots), len(names.ACTION_NAMES)), np.float32)
         for subtask, agent in enumerate(self._low):
             rows = [row for row, state in enumerate(states) if state.subtask == subtask and self._may_act(state)]
@@ -191,7 +208,9 @@ class ChainAgent:
         """Say whether a decision is still being carried out; without one both arms hold still."""
         return state.decisions <= self.chain.decisions
 
-    def _decide(self, states: Sequence[_Progress], envs: Sequence[Any], observations: Sequence[Any]) -> None:
+    def _decide(
+        self, slots: Sequence[int], states: Sequence[_Progress], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> None:
         """Ask the high-level policy wherever it is due, and begin what it says."""
         asked = [row for row, state in enumerate(states) if self._may_act(state) and self._is_asked(state, envs[row])]
         if not asked:
@@ -202,6 +221,8 @@ class ChainAgent:
             if self._believes(state, env, choice):
                 state.subtask, state.steps, state.doubts = choice, 0, 0
                 state.decisions += 1
+                if restart := getattr(self._low[choice], "restart", None):
+                    restart(slots[row])
             if self._may_act(state):
                 env.begin(state.subtask)
 

@@ -83,13 +83,14 @@ def subject(folder: Path, task: str | None = None, weights: str | None = None) -
     config, sight = _circumstances(training, folder, task, policy)
     encoder, views = sight.encoder or policy.get("encoder"), "+".join(sight.cameras) or "proprioception"
     name = "-".join(part for part in (policy["type"], encoder, views) if part)
+    text = names.TASK_TEXTS[config.task]
     about = {
         "checkpoint": {"policy_sha256": sha256_file(folder / WEIGHTS), "policy": policy["type"]},
         "folder": str(folder),
         "views": list(sight.cameras),
         "encoder": encoder or "own",
     }
-    return Subject(name, config, functools.partial(LeRobotAgent, name, folder, sight, weights), about)
+    return Subject(name, config, functools.partial(LeRobotAgent, name, folder, sight, weights, text), about)
 
 
 def _circumstances(
@@ -150,11 +151,13 @@ class LeRobotAgent:
         folder: its checkpoint.
         sight: what it sees.
         weights: file with the encoder's pretrained weights.
+        text: the task in words, as its dataset says it; empty for the env's own.
     """
 
-    def __init__(self, name: str, folder: Path, sight: Sight, weights: str | None = None):
+    def __init__(self, name: str, folder: Path, sight: Sight, weights: str | None = None, text: str = ""):
         self.name, self.cameras, self.image_size = name, sight.cameras, sight.image_size
         self._policy, self._before, self._after = _load(folder, weights)
+        self._text = text
         self._together = bool(getattr(self._policy, "memoryless", False))
         self._encoder = _encoder(sight, weights) if sight.encoder else None
         self._slots: dict[int, tuple[Any, Any]] = {}
@@ -169,6 +172,10 @@ class LeRobotAgent:
             policy = copy.deepcopy(policy, {id(tensor): tensor for tensor in tensors})
         policy.reset()
         self._slots[slot] = policy, torch.Generator().manual_seed(seed).get_state()
+
+    def restart(self, slot: int) -> None:
+        """Forget what the slot's policy has planned: a chain begins the subtask anew."""
+        self._slots[slot][0].reset()
 
     def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
         """Return the policy's actions (n, 7)."""
@@ -190,16 +197,14 @@ class LeRobotAgent:
         import torch
         from lerobot.envs.utils import preprocess_observation
 
-        poses = [
-            o["agent_pos"] if isinstance(o, dict) else e.agent_pos() for o, e in zip(observations, envs, strict=True)
-        ]
-        raw: dict[str, Any] = {"agent_pos": np.stack(poses)}
+        # Asked of the env: in a chain another arm may have become active since it was observed.
+        raw: dict[str, Any] = {"agent_pos": np.stack([env.agent_pos() for env in envs])}
         if self._encoder is None:
             raw["pixels"] = {view: np.stack([o["pixels"][view] for o in observations]) for view in self.cameras}
         else:
             views = [self._encoder(np.stack([o["pixels"][view] for o in observations])) for view in self.cameras]
             raw["environment_state"] = np.concatenate(views, axis=1)
-        batch = {**preprocess_observation(raw), "task": [env.task_description for env in envs]}
+        batch = {**preprocess_observation(raw), "task": [self._text or env.task_description for env in envs]}
         action = self._after(policy.select_action(self._before(batch)))
         return action.to("cpu", torch.float32).numpy()
 

@@ -93,6 +93,14 @@ def test_a_subtask_ends_after_its_steps_and_an_episode_after_its_decisions() -> 
     assert acted == [1, 1, 2, 2, 3, 3, 0, 0, 0], "after the third decision the arms hold still"
 
 
+def test_a_policy_that_plans_ahead_forgets_its_plan_when_its_subtask_begins() -> None:
+    actor, forgotten = agent([0, 1, 2, 3, 4]), []
+    for index, low in enumerate(actor._low):
+        low.restart = lambda slot, index=index: forgotten.append((slot, index))
+    roll(actor, Env(3), 8)
+    assert forgotten == [(0, 0), (0, 1), (0, 2)]
+
+
 def test_learned_termination_waits_for_the_high_level_policy() -> None:
     actor, env = agent([0] * 4 + [1] * 3 + [0] + [1] * 20), Env(2)
     object.__setattr__(actor.chain, "termination", "learned")
