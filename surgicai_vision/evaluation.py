@@ -213,7 +213,8 @@ class _Slot:
         contact = bool(self.info.get("contact", False))
         success = bool(self.info.get("is_success", False)) and not self.error
         gauge = self.gauge
-        failure = failure_kind(self.error, self.diverged, self.touched, gauge.wrong_hole, contact)
+        held = not self.error and gauge.held()
+        failure = failure_kind(self.error, self.diverged, self.touched, gauge.wrong_hole, held)
         row = EpisodeRow(
             task=self.task_config.task,
             policy=self.agent.name,

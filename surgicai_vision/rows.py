@@ -36,7 +36,7 @@ class EpisodeRow:
         trajectory_length_mm: path of the measured active tip, Σ‖Δxyz‖ [mm].
         d_trans_mm: last distance to the goal [mm]; NaN where nothing was measured.
         d_angle_deg: last angle to the goal [deg].
-        contact: whether the jaws felt the needle at the end.
+        contact: whether the active jaws felt the needle at the end.
         error: what broke the episode off, or "".
         grasp: grasp level of the scene.
         failure: "" for a success, else one of `KINDS`.
@@ -68,7 +68,7 @@ class EpisodeRow:
     tissue_force_n: float = 0.0
 
 
-def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, contact: bool) -> str:
+def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, held: bool) -> str:
     """Name why an episode failed: the first that holds.
 
     Args:
@@ -76,7 +76,7 @@ def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, co
         diverged: the physics broke it off: "physics"; any other error: "error".
         touched: whether the active jaws ever felt the needle; if not: "missed".
         wrong_hole: the needle went through another opening than the stitch's, and stayed wrong: "wrong_hole".
-        contact: whether the jaws felt the needle at the end: "time" if they did, else "dropped".
+        held: whether either arm held the needle at the end: "time" if one did, else "dropped".
     """
     if error:
         return "physics" if diverged else "error"
@@ -84,7 +84,7 @@ def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, co
         return "missed"
     if wrong_hole:
         return "wrong_hole"
-    return "time" if contact else "dropped"
+    return "time" if held else "dropped"
 
 
 def summary(rows: Sequence[EpisodeRow]) -> dict[str, Any]:

@@ -70,6 +70,9 @@ class FakeGauge:
 
     begin = forget
 
+    def held(self):
+        return self.env._info()["contact"]
+
     def look(self, info):
         self.entry_error = 5e-4
         self.slip, self.turn, self.tissue_force = 1e-4 * self.env.count, np.pi / 180, 0.1 * self.env.count
@@ -185,10 +188,10 @@ def test_rows_and_summary_hold_what_was_measured(fake_envs, tmp_path):
 
 def test_kinds_of_failure():
     assert [failure_kind("x", diverged, True, True, True) for diverged in (True, False)] == ["physics", "error"]
-    assert failure_kind("", False, touched=False, wrong_hole=False, contact=False) == "missed"
-    assert failure_kind("", False, touched=True, wrong_hole=True, contact=False) == "wrong_hole"
-    assert failure_kind("", False, touched=True, wrong_hole=False, contact=False) == "dropped"
-    assert failure_kind("", False, touched=True, wrong_hole=False, contact=True) == "time"
+    assert failure_kind("", False, touched=False, wrong_hole=False, held=False) == "missed"
+    assert failure_kind("", False, touched=True, wrong_hole=True, held=False) == "wrong_hole"
+    assert failure_kind("", False, touched=True, wrong_hole=False, held=False) == "dropped"
+    assert failure_kind("", False, touched=True, wrong_hole=False, held=True) == "time"
     assert KINDS == ("missed", "dropped", "wrong_hole", "time", "physics", "error")
 
 

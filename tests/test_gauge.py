@@ -167,3 +167,8 @@ def test_the_thread_does_not_press():
     bare, threaded = (Plate(envs.make(TaskConfig(scene=SceneConfig(thread=count))).model) for count in (0, 10))
     assert threaded._model.ngeom > bare._model.ngeom
     assert threaded._presses.sum() == bare._presses.sum()
+
+
+def test_the_needle_is_held_by_either_arm():
+    held = {task: started(task)[1].held() for task in ("grasp", "place", "handoff", "pullout")}
+    assert held == {"grasp": False, "place": True, "handoff": True, "pullout": True}

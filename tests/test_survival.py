@@ -59,7 +59,9 @@ def test_a_swapped_expert_lets_the_chain_go_on_to_the_next_weak_link(chain_file,
 
 def test_one_subtask_can_be_swapped_alone(chain_file, tmp_path, capsys):
     assert main(["evaluate", str(chain_file), "--swap", "place", "--out", str(tmp_path / "out"), *STARTS]) == 0
-    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    *told, last = capsys.readouterr().out.splitlines()
+    result = json.loads(last)
+    assert "failed: 2 time; reached grasp 2, place 2, insert 2, handoff 0, pullout 0" in told[0]
     assert result["reached"]["insert"] == 2
     assert json.loads((tmp_path / "out" / MARKER).read_text())["about"]["swap"] == "place"
 

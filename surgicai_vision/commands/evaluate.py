@@ -170,6 +170,10 @@ def summary_line(result: dict[str, Any]) -> str:
     length, steps = result["trajectory_length_mm"], result["time_steps"]
     if length["mean"] is not None:
         line += f", {length['mean']:.1f} mm and {steps['mean']:.0f} steps"
-    if result["errors"]:
-        line += f", {result['errors']} errors"
+    if result["failures"]:
+        line += "; failed: " + ", ".join(
+            f"{count} {kind.replace('_', ' ')}" for kind, count in result["failures"].items()
+        )
+    if "survival" in result:
+        line += "; reached " + ", ".join(f"{stage['subtask']} {stage['k']}" for stage in result["survival"])
     return line

@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision import names
 from surgicai_vision.envs import randomisation
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.passage import JUMP
@@ -68,6 +69,10 @@ class Gauge:
         before, self._tip = self._tip, simulation.needle_point(needle.TIP_ANGLE)
         if math.dist(before, self._tip) <= JUMP:
             self._watch(before, self._tip)
+
+    def held(self) -> bool:
+        """Say whether either arm holds the needle now."""
+        return any(self._env.simulation.holds(arm) for arm in names.ARMS)
 
     def _watch(self, before: Point, now: Point) -> None:
         """Note a passage of the tip through the plane of any hole, inside its opening."""
