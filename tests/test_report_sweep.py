@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from sweep_results import COMMAND, TASKS, add_curves, cell, store_cell, write_sweep
+from sweep_results import COMMAND, TASKS, add_curves, cell, evaluation, store_cell, write_sweep
 from test_report import assert_stands_alone, painted_stage
 
 from surgicai_vision import pictures, report, statistics
@@ -191,7 +191,10 @@ def test_curves_chain_and_probes_are_drawn_with_their_numbers(text, groups):
         assert f'<h2 id="{section}">' in text
     curves = text.split('id="curves"')[1].split('id="chain"')[0]
     assert curves.count('<svg class="curve"') == 3
-    assert curves.count("<th>area</th>") == 2
+    assert curves.count("<th>area (interval)</th>") == 2
+    lite = [find(groups, task="place", encoder="imagenet-lite", axis="light", strength=s) for s in (0.25, 0.5, 1.0)]
+    area = statistics.area_under_curve((0.25, 0.5, 1.0), [item.rate for item in lite])
+    assert re.search(rf"{area:.2f} \(0\.\d\d–0\.\d\d\)", curves.split("<h3>place: light</h3>")[1])
     item = find(groups, task="place", encoder="imagenet", axis="light", strength=0.5)
     assert f"{item.successes}/{item.episodes}" in curves
     chain = text.split('id="chain"')[1].split('id="probes"')[0]
@@ -208,6 +211,18 @@ def test_curves_chain_and_probes_are_drawn_with_their_numbers(text, groups):
 def test_a_shifted_policy_is_no_cell_of_the_tables(text, groups):
     assert not any(tables.paper_rate(item.condition) for item in groups if not item.condition.plain)
     assert text.count('data-plain="no"') == 2 * sum(not item.condition.plain for item in groups)
+
+
+def test_shifted_evaluations_alone_make_a_page(tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "stage", painted_stage)
+    generator = np.random.default_rng(0)
+    for strength in (0.0, 0.5, 1.0):
+        about = {"views": ["front"], "encoder": "random", "shift": {"axis": "blur", "strength": strength}}
+        evaluation(tmp_path / "blur" / f"{strength:g}", "grasp", "random-front", 1.5 - strength, generator, about)
+    text = report.write_report(tmp_path).read_text()
+    assert "random on front, blur 0 solves 20 of 20 held-out starts of grasp" in text
+    assert len(rows_of(text, "success")) == 3
+    assert text.split('id="curves"')[1].count("<polyline") == 1
 
 
 def test_films_show_every_condition_and_stay_within_the_budget(text, groups, written, monkeypatch):

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from markupsafe import Markup
 
@@ -10,6 +9,7 @@ from surgicai_vision import names, statistics
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Point, Series
 from surgicai_vision.report.groups import Group
+from surgicai_vision.report.reading import Condition
 
 MOST = len(charts.COLOURS)
 """Series in one drawing; what is beyond stands in the table alone."""
@@ -33,11 +33,8 @@ def data_curves(groups: Sequence[Group]) -> list[Chart]:
     for task in names.TASKS:
         candidates = [item for item in groups if _evaluated(item, task) and item.condition.plain]
         candidates = [item for item in candidates if item.condition.demonstrations]
-        lines = _series(
-            candidates,
-            lambda item: replace(item.condition, demonstrations=None),
-            lambda item: float(item.condition.demonstrations or 0),
-        )
+        members = _by_condition(candidates, lambda item: replace(item.condition, demonstrations=None))
+        lines = _series(members, lambda item: float(item.condition.demonstrations or 0))
         if lines:
             found.append(_chart(task, lines, "demonstrations", logarithmic=True))
     return found
@@ -49,42 +46,57 @@ def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
     for task in names.TASKS:
         mine = [item for item in groups if _evaluated(item, task) and not item.condition.swap]
         for axis in dict.fromkeys(item.condition.axis for item in mine if item.condition.axis):
-            lines = _with_zero(mine, axis)
+            members = _by_condition(_with_zero(mine, axis), _base)
+            lines = _series(members, lambda item: item.condition.strength)
             if lines:
-                areas = {line.name: _area(line) for line in lines}
+                areas = {base.label: _area(items) for base, items in members.items()}
                 title = f"{task}: {axis.replace('_', ' ')}"
-                found.append(_chart(title, lines, "strength", extra=("area", areas)))
+                found.append(_chart(title, lines, "strength", extra=("area (interval)", areas)))
     return found
 
 
-def _with_zero(groups: Sequence[Group], axis: str) -> list[Series]:
-    """Return the curves of one axis; an evaluation without a shift is strength 0 where none was made."""
+def _with_zero(groups: Sequence[Group], axis: str) -> list[Group]:
+    """Return the evaluations of one axis; an evaluation without a shift is strength 0 where none was made."""
     of_axis = [item for item in groups if item.condition.axis == axis]
-    bases = {replace(item.condition, axis="", strength=0.0) for item in of_axis}
-    have_zero = {_base(item) for item in of_axis if item.condition.strength == 0}
-    plain = [
-        item for item in groups if item.condition.plain and item.condition in bases and _base(item) not in have_zero
-    ]
-    return _series([*plain, *of_axis], _base, lambda item: item.condition.strength)
+    lacking = {_base(item) for item in of_axis} - {_base(item) for item in of_axis if item.condition.strength == 0}
+    return [*(item for item in groups if item.condition in lacking), *of_axis]
 
 
-def _base(item: Group) -> Any:
+def _base(item: Group) -> Condition:
     return replace(item.condition, axis="", strength=0.0)
 
 
-def _area(line: Series) -> str:
-    rates = [point.rate for point in line.points]
-    return f"{statistics.area_under_curve([point.x for point in line.points], rates):.2f}"
+def _area(items: Sequence[Group]) -> str:
+    """Return the area under a curve, with an interval where every strength had the same starts.
+
+    The area is linear in the successes: its mean over the starts' own areas is the curve's.
+    """
+    ordered = sorted(items, key=lambda item: item.condition.strength)
+    strengths = [item.condition.strength for item in ordered]
+    if len(set(strengths)) < 2:
+        return text.ABSENT
+    wins = [{(r.seed, row["seed"]): float(row["success"]) for r in item.results for row in r.rows} for item in ordered]
+    area = statistics.area_under_curve(strengths, [item.rate for item in ordered])
+    if any(each.keys() != wins[0].keys() for each in wins):
+        return f"{area:.2f}"
+    own = [statistics.area_under_curve(strengths, [each[start] for each in wins]) for start in wins[0]]
+    low, high = statistics.area_interval(own)
+    return f"{area:.2f} ({low:.2f}–{high:.2f})"
 
 
-def _series(groups: Sequence[Group], same: Callable[[Group], Any], x: Callable[[Group], float]) -> list[Series]:
-    """Join the groups that are the `same` but for x; lines of a single point are no curves."""
-    lines: dict[Any, list[Group]] = {}
+def _by_condition(groups: Sequence[Group], same: Callable[[Group], Condition]) -> dict[Condition, list[Group]]:
+    """Gather the groups that are the `same` but for what the curve runs along."""
+    found: dict[Condition, list[Group]] = {}
     for item in groups:
-        lines.setdefault(same(item), []).append(item)
+        found.setdefault(same(item), []).append(item)
+    return found
+
+
+def _series(members: dict[Condition, list[Group]], x: Callable[[Group], float]) -> list[Series]:
+    """Join groups into lines; a single point is no curve."""
     found = []
-    for condition, members in lines.items():
-        points = tuple(_point(x(item), item) for item in sorted(members, key=x))
+    for condition, items in members.items():
+        points = tuple(_point(x(item), item) for item in sorted(items, key=x))
         if len({point.x for point in points}) > 1:
             found.append(Series(condition.label, points))
     return found

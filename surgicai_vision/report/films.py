@@ -21,7 +21,7 @@ from surgicai_vision.results import read_film
 
 FRAMES, SIZE, QUALITY = 8, 128, 72
 """Frames of a strip, their height and width [px] and their JPEG quality."""
-BUDGET = 5_500_000
+BUDGET = 4_000_000
 """Characters of base64 that all strips together may take: with the rest the page stays below 8 MB."""
 MOST_STRIPS = 160
 COMPARED = 5

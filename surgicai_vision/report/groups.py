@@ -150,5 +150,12 @@ def of_task(groups: Sequence[Group], task: str, *, plain: bool = True) -> list[G
 
 def best_trained(groups: Sequence[Group]) -> Group | None:
     """The trained policy with the highest success rate (the first of them), or None."""
-    trained = [item for item in groups if item.condition.trained and item.condition.plain and item.episodes]
+    trained = [item for item in as_trained(groups) if item.condition.trained]
     return max(trained, key=lambda item: item.rate, default=None)
+
+
+def as_trained(groups: Sequence[Group]) -> list[Group]:
+    """Return the evaluations without a shift; where there are none, those at strength 0, else all."""
+    evaluated = [item for item in groups if item.episodes]
+    plain = [item for item in evaluated if item.condition.plain]
+    return plain or [item for item in evaluated if not item.condition.strength] or evaluated

@@ -11,7 +11,7 @@ from surgicai_vision import names
 from surgicai_vision.report import charts, curves, paper, text
 from surgicai_vision.report.episodes import group_details, letters
 from surgicai_vision.report.films import Reel
-from surgicai_vision.report.groups import KINDS, MEASURES, Group, best_trained, of_task
+from surgicai_vision.report.groups import KINDS, MEASURES, Group, as_trained, best_trained, of_task
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.probing import probes
 from surgicai_vision.report.reading import Collected, Condition
@@ -46,7 +46,7 @@ def numbers(collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]
         "heats": _heats(groups, index),
         "rows": [_row(at, item, best.get(item.condition.task)) for at, item in enumerate(groups)],
         "across_seeds": any(item.across for item in groups),
-        "shifted": any(not item.condition.plain for item in groups),
+        "shifted": len({item.condition.plain for item in groups}) > 1,
         "filters": _filters(groups),
         "caption": _caption(groups),
         "kinds": [(kind.replace("_", " "), charts.KIND_COLOURS[kind]) for kind in ("success", *_kinds(groups))],
@@ -65,7 +65,7 @@ def numbers(collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]
 
 def headline(groups: Sequence[Group]) -> dict[str, str]:
     """Return the main finding in one sentence, and what it stands beside."""
-    evaluated = [item for item in groups if item.episodes and item.condition.plain]
+    evaluated = as_trained(groups)
     tasks = list(dict.fromkeys(item.condition.task for item in evaluated))
     if not evaluated:
         return {"headline": "No cell has a result yet", "lead": "What is missing, and why, stands below."}
