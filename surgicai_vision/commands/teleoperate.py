@@ -59,11 +59,11 @@ class Options:
     )
     view: tuple[str, ...] = option(
         ("front", "back"),
-        f"cameras shown; the first leads: {', '.join(names.CAMERAS)}",
+        f"views shown, a comma list; the first leads: {', '.join(names.CAMERAS)}",
         check=many_of("view", names.CAMERAS),
-        metavar="NAME[,NAME]",
+        metavar="VIEW[,VIEW]",
     )
-    size: int = option(448, "side of a picture in pixels", check=_within(*SIZES), metavar="N")
+    size: int = option(448, "height and width of pictures [px]", check=_within(*SIZES), metavar="PX")
     frame: str = option(
         "camera",
         "whose axes the keys mean: camera (of the leading view), or tool",
@@ -102,7 +102,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     from surgicai_vision.teleoperation.steering import Steering
 
     if not options.view:
-        raise InputError("--view is empty; name at least one camera.")
+        raise InputError("--view is empty; name at least one view.")
     if options.port is not None and not options.web:
         raise InputError("--port is the page's; give --web with it.")
     config = _config(options)
