@@ -47,6 +47,9 @@ class Recipe:
         hidden: width of each hidden layer.
         batch_norm: put BatchNorm before each hidden layer.
         learning_rate: Adam's.
+        weight_decay: decoupled weight decay (AdamW) [per step, times the learning rate].
+        schedule: "constant", or "one_cycle": up to the learning rate over the first third, then down to nothing
+            (Smith and Topin, Super-convergence, 2017).
         epochs: passes over the training frames; the last one is the checkpoint.
         batch_size: frames per step.
         split: "episode", or "transition" as the released code did (neighbouring frames leak).
@@ -59,6 +62,8 @@ class Recipe:
     hidden: tuple[int, ...] = (256, 256, 256)
     batch_norm: bool = True
     learning_rate: float = 1e-3
+    weight_decay: float = 0.0
+    schedule: str = "constant"
     epochs: int = 30
     batch_size: int = 256
     split: str = "episode"
@@ -69,12 +74,15 @@ class Recipe:
 
     def __post_init__(self) -> None:
         check_name("split", self.split, ("episode", "transition"))
+        check_name("schedule", self.schedule, ("constant", "one_cycle"))
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1 or more.")
         if self.epochs < 1 or self.batch_size < 2:
             raise InputError(f"epochs is {self.epochs}, batch_size {self.batch_size}; at least 1 and 2.")
         if not self.learning_rate > 0:
             raise InputError(f"learning_rate is {self.learning_rate}; it must be above 0.")
+        if not self.weight_decay >= 0:
+            raise InputError(f"weight_decay is {self.weight_decay}; it must be at least 0.")
         if not 0 <= self.validation < 1:
             raise InputError(f"validation is {self.validation}; give a share from 0 to below 1.")
 

@@ -28,6 +28,7 @@ ENCODERS: Mapping[str, str] = MappingProxyType(
     {
         "imagenet-lite": "encoders.imagenet_lite:IMAGENET_LITE",
         "random": "encoders.random_resnet:RANDOM",
+        "random-conv": "encoders.random_conv:RANDOM_CONV",
         "r3m": "encoders.r3m:R3M",
         "r3m-34": "encoders.r3m:R3M_34",
         "r3m-18": "encoders.r3m:R3M_18",
@@ -47,7 +48,7 @@ OPEN_ENCODERS: Mapping[str, str] = MappingProxyType({"timm:": "encoders.timm_mod
 POOLS = ("global", "spatial", "tokens")
 """What may be taken from an encoder; a test compares this with `encoders.base`."""
 
-OFFLINE_ENCODERS = ("imagenet-lite", "random")
+OFFLINE_ENCODERS = ("imagenet-lite", "random", "random-conv")
 """Encoders that never download; a test compares this with their cards."""
 
 POLICIES: Mapping[str, str] = MappingProxyType({"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP"})

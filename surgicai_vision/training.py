@@ -4,7 +4,7 @@ Interface:
 
 * `train(dataset, features, policy, recipe, seed=…, out=…, progress=…) -> Checkpoint`: train from the
   feature cache. Running it again goes on where it was broken off, or returns what is done.
-* `split(episode_index, recipe, seed) -> (train rows, validation rows, validation episodes)`.
+* What it reads of a dataset, its split and its batches: `surgicai_vision.training_data`.
 
 Layout of the folder while it trains; the first and the last two stay (see `surgicai_vision.checkpoint`):
 
@@ -25,17 +25,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 
 from surgicai_vision import __version__, names
 from surgicai_vision.checkpoint import CARD, Checkpoint, EncoderRecord, read_checkpoint, write_checkpoint
-from surgicai_vision.config import TaskConfig, digest, to_mapping
+from surgicai_vision.config import digest, to_mapping
 from surgicai_vision.errors import InputError, OutputExists, SurgicaiError, UnknownName
 from surgicai_vision.features import Features
 from surgicai_vision.files import check_output, read_json, write_bytes, write_json
+from surgicai_vision.training_data import TrainingData, cuts, over_places, split
 
 REQUEST, STATE = "training.json", "training_state.pt"
 STATE_EVERY = 5  # epochs between training states: a broken-off training loses at most these
@@ -46,19 +47,6 @@ Progress = Callable[[int, int], None]
 """Called with (epochs done, epochs in all)."""
 Log = Callable[[int, dict[str, float]], None]
 """Called with (epoch, losses by name)."""
-
-
-class TrainingData(Protocol):
-    """The part of a dataset that training reads."""
-
-    config: TaskConfig
-    image_size: int
-    length: int
-    fingerprint: str
-    episode_index: np.ndarray
-
-    def columns(self) -> dict[str, np.ndarray]:
-        """Return what policies are fed and learn, by key: (N, 7) state and action, (N,) phase, …"""
 
 
 def train(
@@ -180,29 +168,6 @@ def _request(task: _Task, start: Any) -> dict[str, Any]:
     }
 
 
-def split(episode_index: np.ndarray, recipe: Any, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Split the frames into training and validation.
-
-    Args:
-        episode_index: (N,) episode of every frame.
-        recipe: has `split` ("episode" or "transition") and `validation` (share held out).
-        seed: of the draw.
-
-    Returns:
-        Training rows, validation rows (both sorted int64), and the episodes held out (whole ones only).
-        At least one episode is held out when the share is above 0 and there are two or more.
-    """
-    generator = np.random.default_rng(seed)
-    units = np.unique(episode_index) if recipe.split == "episode" else np.arange(len(episode_index))
-    count = round(recipe.validation * len(units))
-    if recipe.validation > 0 and len(units) > 1:
-        count = min(max(count, 1), len(units) - 1)
-    held = np.sort(generator.permutation(units)[:count])
-    belongs = np.isin(episode_index, held) if recipe.split == "episode" else np.isin(units, held)
-    episodes = tuple(int(index) for index in held) if recipe.split == "episode" else ()
-    return np.flatnonzero(~belongs), np.flatnonzero(belongs), episodes
-
-
 class _Training:
     """One training: its data, its policy, its optimiser."""
 
@@ -227,7 +192,7 @@ class _Training:
         else:
             self._copy(start)
         self.policy.to(device)
-        self.optimiser = torch.optim.Adam(self.policy.parameters(), lr=task.recipe.learning_rate)
+        self.optimiser, self.schedule = self._optimiser()
         self.order = np.random.default_rng((task.seed, 1))
         self.losses: list[float] = []
         self.held_losses: list[float] = []
@@ -254,6 +219,16 @@ class _Training:
                 progress(done, epochs)
         return self._write(out)
 
+    def _optimiser(self) -> tuple[torch.optim.Optimizer, Any]:
+        """Return the recipe's optimiser and its schedule, or None where the learning rate stays."""
+        recipe = self.task.recipe
+        kind = torch.optim.AdamW if recipe.weight_decay else torch.optim.Adam
+        optimiser = kind(self.policy.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+        if recipe.schedule == "constant":
+            return optimiser, None
+        steps = recipe.epochs * len(cuts(len(self.rows), recipe.batch_size))
+        return optimiser, torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.learning_rate, total_steps=steps)
+
     def _observed(self, rows: np.ndarray) -> torch.Tensor:
         """Return the raw inputs of some frames, (n, inputs) float32: the views' features, then the vector."""
         parts = [entry.rows[rows].astype(np.float32) for entry in self.task.features]
@@ -271,6 +246,7 @@ class _Training:
         for piece in pieces:
             squares += ((self._observed(piece).double() - mean) ** 2).sum(0) / len(self.rows)
         std = squares.sqrt()
+        mean, std = over_places(mean, std, self.policy.inputs.visual)
         self.policy.input_mean.copy_(mean)
         self.policy.input_std.copy_(torch.where(std > SMALLEST_STD, std, torch.ones_like(std)))
 
@@ -285,12 +261,8 @@ class _Training:
 
     def _batches(self) -> list[np.ndarray]:
         """Return the training rows of one epoch in a new order; a last batch of one joins the one before."""
-        size = self.task.recipe.batch_size
         order = self.order.permutation(self.rows)
-        cuts = list(range(size, len(order), size))
-        if cuts and len(order) - cuts[-1] == 1:
-            cuts.pop()
-        return np.split(order, cuts)
+        return np.split(order, cuts(len(order), self.task.recipe.batch_size)[1:])
 
     def _epoch(self) -> float:
         """Make one pass over the training frames; return its mean loss."""
@@ -302,6 +274,8 @@ class _Training:
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()
             self.optimiser.step()
+            if self.schedule:
+                self.schedule.step()
             total += loss.item() * len(rows)
         if not np.isfinite(total):
             raise SurgicaiError("The training loss is not finite; lower the learning rate or look at the features.")
@@ -324,6 +298,7 @@ class _Training:
         state = {
             "policy": self.policy.state_dict(),
             "optimiser": self.optimiser.state_dict(),
+            "schedule": self.schedule.state_dict() if self.schedule else {},
             "order": json.dumps(self.order.bit_generator.state),  # its integers are wider than a tensor's
             "random": torch.get_rng_state(),
             "losses": self.losses,
@@ -340,6 +315,8 @@ class _Training:
             return
         self.policy.load_state_dict(state["policy"])
         self.optimiser.load_state_dict(state["optimiser"])
+        if self.schedule:
+            self.schedule.load_state_dict(state["schedule"])
         self.order.bit_generator.state = json.loads(state["order"])
         torch.set_rng_state(state["random"])
         self.losses, self.held_losses = list(state["losses"]), list(state["held_losses"])

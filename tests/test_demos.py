@@ -65,6 +65,16 @@ def test_noise_is_executed_and_the_label_is_the_experts(tmp_path):
     np.testing.assert_array_equal(roll(env, FakeExpert(env), 3, disturbance=Disturbance(0.2)).demo.state, noisy.state)
 
 
+def test_each_episode_draws_its_own_noise_within_the_range():
+    env = FakeEnv(CONFIG)
+    spread = Disturbance(0.6, noise_from=0.1)
+    demos = [roll(env, FakeExpert(env), seed, disturbance=spread).demo for seed in range(12)]
+    off = [np.abs(demo.executed - demo.action)[:, 1:6].mean() for demo in demos]
+    assert max(off) > 1.5 * min(off) > 0, "episodes differ in their noise"
+    even = [roll(env, FakeExpert(env), seed, disturbance=Disturbance(0.6)).demo for seed in range(12)]
+    assert np.mean(off) < np.mean([np.abs(demo.executed - demo.action)[:, 1:6].mean() for demo in even])
+
+
 class Patient(FakeEnv):
     """Knows no success while a push lasts."""
 
@@ -87,9 +97,9 @@ def test_a_recovery_starts_elsewhere_and_its_push_is_not_recorded():
         assert start < CONFIG.max_steps
 
 
-@pytest.mark.parametrize("wrong", [{"noise": -0.1}, {"noise": float("nan")}, {"recoveries": 1.1}])
+@pytest.mark.parametrize("wrong", [{"noise": -0.1}, {"noise": float("nan")}, {"recoveries": 1.1}, {"noise_from": 0.1}])
 def test_a_senseless_disturbance_is_refused(wrong):
-    with pytest.raises(InputError, match="within 0 and 1"):
+    with pytest.raises(InputError, match="within 0 and"):
         Disturbance(**wrong)
 
 

@@ -1,8 +1,9 @@
 """Training: from the cache to a checkpoint that is read back or refused."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from surgicai_vision.config import TaskConfig
 from surgicai_vision.errors import BadFile, InputError, OutputExists, UnknownName
 from surgicai_vision.features import Features
 from surgicai_vision.registry import load_policy, load_recipe, recipe_names
-from surgicai_vision.training import split, train
+from surgicai_vision.training import train
+from surgicai_vision.training_data import split
 
 DIM = 12
 
@@ -132,6 +134,17 @@ def test_statistics_are_those_of_the_training_frames(tmp_path: Path) -> None:
     np.testing.assert_allclose(policy.input_std, inputs.std(0), rtol=1e-4)
 
 
+def test_a_maps_statistics_are_its_channels(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    entry = features_of(dataset, shape=[3, 2, 2])
+    checkpoint = train(dataset, [entry], BC, QUICK, out=tmp_path / "map")
+    index = np.asarray(dataset.episode_index)
+    rows = entry.rows[~np.isin(index, checkpoint.validation_episodes)].astype(np.float64).reshape(-1, 3, 4)
+    policy = load_policy(tmp_path / "map")
+    np.testing.assert_allclose(policy.input_mean[:12].view(3, 4), rows.mean((0, 2))[:, None].repeat(4, 1), rtol=1e-4)
+    np.testing.assert_allclose(policy.input_std[:12].view(3, 4), rows.std((0, 2))[:, None].repeat(4, 1), rtol=1e-4)
+
+
 def test_same_seed_same_weights_other_seed_others(tmp_path: Path) -> None:
     dataset = FakeDataset()
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
@@ -147,21 +160,23 @@ def test_training_leaves_the_callers_random_state(tmp_path: Path) -> None:
     assert torch.equal(before, torch.get_rng_state())
 
 
-def test_broken_off_training_resumes_to_the_same_weights(tmp_path: Path) -> None:
+@pytest.mark.parametrize("changes", [{}, {"schedule": "one_cycle", "weight_decay": 1e-3}])
+def test_broken_off_training_resumes_to_the_same_weights(tmp_path: Path, changes: dict[str, Any]) -> None:
+    recipe = replace(QUICK, **changes)
     dataset = FakeDataset()
 
     def stop(done: int, total: int) -> None:
         if done == 7:
             raise KeyboardInterrupt
 
-    train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "whole")
+    train(dataset, [features_of(dataset)], BC, recipe, out=tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
-        train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "broken", progress=stop)
+        train(dataset, [features_of(dataset)], BC, recipe, out=tmp_path / "broken", progress=stop)
     with pytest.raises(BadFile, match="has not ended"):
         read_checkpoint(tmp_path / "broken")
     seen: list[int] = []
-    train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "broken", progress=lambda d, t: seen.append(d))
-    assert seen[0] == 5 and seen[-1] == QUICK.epochs
+    train(dataset, [features_of(dataset)], BC, recipe, out=tmp_path / "broken", progress=lambda d, t: seen.append(d))
+    assert seen[0] == 5 and seen[-1] == recipe.epochs
     assert tensors_of(tmp_path / "whole") == tensors_of(tmp_path / "broken")
     assert not (tmp_path / "broken" / "training_state.pt").exists()
 

@@ -39,6 +39,13 @@ class Options:
         check=share,
         metavar="SIGMA",
     )
+    noise_from: float | None = option(
+        None,
+        "lowest such deviation: each episode draws its own between this and --noise",
+        check=share,
+        metavar="SIGMA",
+        default_text="--noise itself",
+    )
     recoveries: float = option(
         0.0, "share of episodes that start with a push that is not recorded", check=share, metavar="P"
     )
@@ -68,7 +75,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
             out=out,
             source=options.source,
             seed=options.seed,
-            disturbance=Disturbance(options.noise, options.recoveries),
+            disturbance=Disturbance(options.noise, options.recoveries, options.noise_from),
             workers=options.workers,
             engine=engine,
             demos=taught,

@@ -57,13 +57,17 @@ class Disturbance:
     Attributes:
         noise: standard deviation of the Gaussian noise on the six motions of an executed action, in units of its
             range; the jaw is done as meant, since a random walk of it would drop the needle.
+        noise_from: lowest such deviation; each episode draws its own between the two. None takes `noise` throughout.
         recoveries: share of episodes that start with a push in a random direction, which is not recorded.
     """
 
     noise: float = 0.0
     recoveries: float = 0.0
+    noise_from: float | None = None
 
     def __post_init__(self) -> None:
+        if self.noise_from is not None and not 0.0 <= self.noise_from <= self.noise:
+            raise InputError(f"noise_from is {self.noise_from:g}; it must be within 0 and noise, {self.noise:g}.")
         if not 0.0 <= self.noise <= 1.0 or not 0.0 <= self.recoveries <= 1.0:
             raise InputError(
                 f"noise is {self.noise:g} and recoveries {self.recoveries:g}; each must be within 0 and 1."
@@ -80,9 +84,14 @@ class Disturbance:
                 return False
         return True
 
-    def executed(self, action: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def deviation(self, rng: np.random.Generator) -> float:
+        """Return the standard deviation of an episode's noise."""
+        return self.noise if self.noise_from is None else float(rng.uniform(self.noise_from, self.noise))
+
+    @staticmethod
+    def executed(action: np.ndarray, deviation: float, rng: np.random.Generator) -> np.ndarray:
         """Return what is done in the place of `action`, (7,) float32."""
-        noisy = action + np.append(rng.normal(0.0, self.noise, 6), 0.0)
+        noisy = action + np.append(rng.normal(0.0, deviation, 6), 0.0)
         return np.clip(noisy, -1.0, 1.0).astype(np.float32)
 
 
@@ -111,13 +120,14 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert", disturbance:
     env.reset(seed=seed)
     if not disturbance.push(env, rng):
         env.reset(seed=seed)  # the push ended it; this start stays as it was
+    deviation = disturbance.deviation(rng)
     states, rows = [env.get_state()], []
     info: dict[str, Any] = {}
     ended = False
     while not ended:
         phase = env.phase
         action = np.asarray(actor.action(), dtype=np.float32)
-        executed = disturbance.executed(action, rng) if disturbance.noise else action
+        executed = disturbance.executed(action, deviation, rng) if deviation else action
         _, reward, terminated, truncated, info = env.step(executed)
         states.append(env.get_state())
         rows.append((action, executed, phase, reward, info["is_success"], info["contact"]))
@@ -157,13 +167,14 @@ def record_episode(
     seed: int,
     noise: float = 0.0,
     recoveries: float = 0.0,
+    noise_from: float | None = None,
     demos: Sequence[str] = (),
 ) -> None:
     """Job "record-episode": roll `seed` and write the episode, or why it failed, into `folder`."""
     module, _, name = SOURCES[source].partition(":")
     env = _env(from_mapping(TaskConfig, task))
     actor = getattr(importlib.import_module(module), name)(env, *([demos] if demos else []))
-    rollout = roll(env, actor, seed, source, Disturbance(noise, recoveries))
+    rollout = roll(env, actor, seed, source, Disturbance(noise, recoveries, noise_from))
     if rollout.success:
         write_demo(folder, 0, rollout.demo)
     write_json(folder / "result.json", {"seed": seed, "success": rollout.success, "reason": rollout.reason})
@@ -236,7 +247,8 @@ def _check_taught(source: str, demos: Sequence[Path]) -> None:
 
 def _of(disturbance: Disturbance) -> dict[str, float]:
     """Return what a request says of a disturbance: nothing of what is off."""
-    return {name: value for name, value in dataclasses.asdict(disturbance).items() if value}
+    said = dataclasses.asdict(disturbance)
+    return {name: value for name, value in said.items() if value != getattr(CALM, name)}
 
 
 def finished(out: Path, request: Mapping[str, Any]) -> bool:
