@@ -250,6 +250,34 @@ def test_training_moves_the_network_and_never_the_encoder(trained: Path) -> None
     np.testing.assert_array_equal(encoder(np.full((1, SIZE, SIZE, 3), 90, np.uint8)), feature)
 
 
+def test_training_encodes_a_picture_once_and_forgets_beyond_its_limit() -> None:
+    from lerobot_env_surgicai.pictures import Remembered
+
+    encoded: list[int] = []
+
+    def encoder(pictures: np.ndarray) -> np.ndarray:
+        encoded.append(len(pictures))
+        return pictures.reshape(len(pictures), -1)[:, :4].astype(np.float16).astype(np.float32) / 3
+
+    pictures = np.random.default_rng(0).integers(0, 256, (6, 8, 8, 3), np.uint8)
+    memory = Remembered(encoder)
+    batches = [[0, 1, 2], [2, 1, 3], [3, 3, 0], [4, 4, 5]]
+    wanted = [encoder(pictures[rows]).astype(np.float16).astype(np.float32) for rows in batches]
+    encoded.clear()
+    for rows, features in zip(batches, wanted, strict=True):
+        np.testing.assert_array_equal(memory(pictures[rows]), features)
+    assert encoded == [3, 1, 2], "each picture once, each batch's new ones together"
+    changed_one = pictures[:1].copy()
+    changed_one[0, 7, 7, 2] ^= 1
+    memory(changed_one)
+    assert encoded[-1] == 1, "a picture that differs in one bit is another"
+    small = Remembered(encoder, limit=8)
+    encoded.clear()
+    for _ in range(2):
+        small(pictures[:3])
+    assert encoded == [3, 2]
+
+
 def changed(source: Path, out: Path, **values: Any) -> Path:
     shutil.copytree(source, out)
     config = json.loads((out / "config.json").read_text())

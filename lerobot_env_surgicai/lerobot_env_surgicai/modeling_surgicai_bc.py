@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from lerobot_env_surgicai.configuration_surgicai_bc import SurgicaiBcConfig
-from lerobot_env_surgicai.pictures import check_identity, encode, identity, load_encoder
+from lerobot_env_surgicai.pictures import Remembered, check_identity, encode, identity, load_encoder
 from surgicai_vision import names, registry
 from surgicai_vision.errors import BadFile, InputError
 
@@ -36,11 +36,13 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         self._encoder: Any = None
+        self._training_encoder: Any = None
         visual: tuple[tuple[int, ...], ...] = ()
         if config.encoder:
             self._encoder = load_encoder(config.encoder, config.encoder_weights, config.encoder_pool)
             check_identity(self._encoder, config.encoder_sha256, config.encoder_identity, "surgicai_bc")
             config.encoder_sha256, config.encoder_identity = self._encoder.weights_sha256, identity(self._encoder)
+            self._training_encoder = Remembered(self._encoder)
             visual = (self._encoder.shape,) * len(config.views)
         self.network = registry.policy_plugin("bc").make(config.recipe(), visual)
         self._acting: Any = None
@@ -80,7 +82,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the mean squared error of the actions, and the same as a number."""
         parts = [batch[OBS_STATE]] if self.config.proprioception else []
-        features = self._features(batch)
+        features = self._features(batch, self._training_encoder)
         if features is not None:
             parts.insert(0, torch.from_numpy(features).to(batch[ACTION].device))
         observed = torch.cat(parts, dim=1)
@@ -104,11 +106,13 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
             acting = copy.deepcopy(self.network).cpu().eval()
             object.__setattr__(self, "_acting", acting)  # not a submodule: it must not be saved
         poses = batch[OBS_STATE].float().cpu().numpy()
-        return torch.from_numpy(self._acting.act(self._features(batch), poses)).to(batch[OBS_STATE].device)
+        return torch.from_numpy(self._acting.act(self._features(batch, self._encoder), poses)).to(
+            batch[OBS_STATE].device
+        )
 
-    def _features(self, batch: dict[str, Tensor]) -> np.ndarray | None:
+    def _features(self, batch: dict[str, Tensor], encoder: Any) -> np.ndarray | None:
         """Return the views' features side by side (B, F) float32; None without pictures."""
-        if self._encoder is None:
+        if encoder is None:
             return None
         for view in self.config.views:
             trained, given = self.config.input_features[names.image_key(view)].shape, batch[names.image_key(view)]
@@ -117,4 +121,4 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
                     f"surgicai_bc was trained on pictures of {tuple(trained)}, got {tuple(given.shape[1:])}; "
                     f"give --env.image_size={trained[-1]}."
                 )
-        return encode(self._encoder, batch, self.config.views)
+        return encode(encoder, batch, self.config.views)
