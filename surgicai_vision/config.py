@@ -70,6 +70,7 @@ RANDOMISATION_LIMITS: Mapping[str, float] = types.MappingProxyType(
         "friction": 0.5,
         "phantom_shift": 5.0,
         "kinematic_error": 1.0,
+        "needle_size": 0.1,
         "latency": LATENCY_LIMIT,
     }
 )
@@ -87,6 +88,7 @@ class RandomisationConfig:
         camera_turn: rotation of each camera about each axis [deg].
         camera_fovy: vertical field of view of each camera [deg].
         needle_thickness: fraction of the needle's thickness.
+        needle_size: fraction of the radius and the length of the needle's arc.
         friction: fraction of every friction coefficient.
         phantom_shift: place of the phantom, its holes and goals, in x and y [mm].
         kinematic_error: offset of each arm's first three joints that the arm does not know of; 1 is ±5°, ±5°, ±5 mm,
@@ -103,6 +105,7 @@ class RandomisationConfig:
     friction: float = 0.0
     phantom_shift: float = 0.0
     kinematic_error: float = 0.0
+    needle_size: float = 0.0
     latency: int = 0
 
     def __post_init__(self) -> None:

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from surgicai_vision import envs
-from surgicai_vision.config import RANDOMISATION_LIMITS, RandomisationConfig, TaskConfig, from_mapping, to_mapping
+from surgicai_vision.config import (
+    RANDOMISATION_LIMITS,
+    RandomisationConfig,
+    SceneConfig,
+    TaskConfig,
+    from_mapping,
+    to_mapping,
+)
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.envs import observation, poses, randomisation, simulation
 from surgicai_vision.errors import InputError
@@ -23,6 +30,7 @@ EVERYTHING = RandomisationConfig(
     friction=0.2,
     phantom_shift=1.5,
     kinematic_error=0.3,
+    needle_size=0.05,
     latency=2,
 )
 
@@ -94,7 +102,9 @@ def test_one_more_axis_leaves_the_draws_of_the_others():
     assert sum(a != b for a, b in zip(alone, both, strict=True)) == len(randomisation.UNITS["light"])
 
 
-@pytest.mark.parametrize("axis", ["light", "colour", "camera_shift", "camera_turn", "camera_fovy", "needle_thickness"])
+@pytest.mark.parametrize(
+    "axis", ["light", "colour", "camera_shift", "camera_turn", "camera_fovy", "needle_thickness", "needle_size"]
+)
 def test_an_axis_of_sight_changes_pictures(axis):
     plain, changed = made(obs_type="pixels"), made(obs_type="pixels", **{axis: RANDOMISATION_LIMITS[axis] / 4})
     changed.reset(seed=1)
@@ -163,6 +173,63 @@ def test_a_thicker_needle_lies_higher():
         grown = float(info["randomisation"]["needle_thickness"][0])
         rise = env.needle_pose()[2] - plain.needle_pose()[2]
         assert abs(rise - grown * needle.BODY_RADIUS) < 4e-5
+
+
+def test_a_needles_size_is_that_of_its_arc_its_mass_and_its_stitch():
+    """What collides, what is drawn, the tip that passage watches and the goals all lie on the arc that was drawn."""
+    axes = {"randomisation": RandomisationConfig(needle_size=0.1), "scene": SceneConfig(thread=10)}
+    env, plain = envs.make(TaskConfig("insert", **axes)), build_scene(SceneConfig(thread=10)).model
+    radii = set()
+    for seed in range(4):
+        _, info = env.reset(seed=seed)
+        size = 1.0 + float(info["randomisation"]["needle_size"][0])
+        radius, model, data = size * needle.RADIUS, env.model, env.data
+        radii.add(radius)
+        pose = poses.square(env.simulation.needle())
+        for index in env.scene.needle_geoms:
+            way = data.geom_xmat[index].reshape(3, 3)[:, 2] * model.geom_size[index, 1]
+            for end in (data.geom_xpos[index] + way, data.geom_xpos[index] - way):
+                assert np.linalg.norm(pose[:3, :3].T @ (end - pose[:3, 3])) == pytest.approx(radius, abs=1e-9)
+        tip = env.simulation.needle_point(needle.TIP_ANGLE)
+        np.testing.assert_allclose(data.site("needle_tip").xpos, tip, atol=1e-9)
+        np.testing.assert_allclose(data.body("thread_0").xpos, env.simulation.needle_point(0.0), atol=1e-9)
+        entry, leave = (np.array(hole.centre) for hole in (env.stitch.pair.entry, env.stitch.pair.exit))
+        for hole in (entry, leave):
+            assert np.linalg.norm(hole - env.stitch.centre) == pytest.approx(radius, abs=1e-9)
+        mesh = slice(
+            model.mesh("needle").vertadr[0], model.mesh("needle").vertadr[0] + model.mesh("needle").vertnum[0]
+        )
+        longer = np.ptp(model.mesh_vert[mesh], axis=0).max() - np.ptp(plain.mesh_vert[mesh], axis=0).max()
+        chord = 2 * needle.RADIUS * math.sin(needle.TIP_ANGLE / 2)
+        assert longer == pytest.approx((size - 1.0) * chord, abs=5e-5)
+        body = model.body("needle").id
+        assert model.body_mass[body] == pytest.approx(size * plain.body_mass[body])
+        assert model.body_invweight0[body, 0] != plain.body_invweight0[body, 0]
+        assert model.stat.extent == plain.stat.extent
+    assert len(radii) == 4
+    randomisation.apply(env.scene, env.model, randomisation.NOTHING)
+    for name in ("geom_pos", "geom_size", "body_mass", "body_inertia", *randomisation.DERIVED):
+        np.testing.assert_array_equal(getattr(env.model, name), getattr(plain, name))
+
+
+@pytest.mark.parametrize(
+    ("task", "seed"), [(task, seed) for task in ("insert", "handoff", "pullout") for seed in (1, 2)]
+)
+def test_the_expert_threads_needles_of_any_size(task, seed):
+    env = made(task, needle_size=0.1)
+    env.reset(seed=seed)
+    expert, ended = Expert(env), False
+    while not ended:
+        _, _, terminated, truncated, info = env.step(expert.action())
+        ended = terminated or truncated
+    assert info["is_success"]
+
+
+def test_a_size_that_leaves_no_room_for_the_stitch_is_refused():
+    scene = SceneConfig(layout="3dmed_straight", hole_pair=4)
+    with pytest.raises(InputError, match="needle_size"):
+        envs.make(TaskConfig("insert", scene=scene, randomisation=RandomisationConfig(needle_size=0.1)))
+    envs.make(TaskConfig("grasp", scene=scene, randomisation=RandomisationConfig(needle_size=0.1)))
 
 
 def test_an_arm_does_not_know_its_joint_error():

@@ -173,12 +173,12 @@ def _take(scene: Sight, goal: Matrix, back: float, opened: float) -> Wish:
 
 
 def _grasp(scene: Sight) -> Wish:
-    goal = scene.needle @ grasp_in_needle(scene.arm, scene.memory.grasp_angle)
+    goal = scene.needle @ grasp_in_needle(scene.arm, scene.memory.grasp_angle, radius=scene.stitch.radius)
     return _take(scene, goal, HOVER, OPEN_ABOVE)
 
 
 def _handoff(scene: Sight) -> Wish:
-    goal = scene.needle @ grasp_in_needle(scene.arm, HANDOFF_ANGLE + HANDOFF_OFFSET)
+    goal = scene.needle @ grasp_in_needle(scene.arm, HANDOFF_ANGLE + HANDOFF_OFFSET, radius=scene.stitch.radius)
     return _take(scene, goal, HANDOFF_BACK, OPEN_HANDOFF)
 
 
@@ -197,7 +197,7 @@ def on_path(stitch: Stitch, turned: float) -> Matrix:
     pose = start.copy()
     pose[:3, :3] = rotvec_to_matrix(-turned * WOUND) @ start[:3, :3]
     tip = np.asarray(stitch.pair.entry.centre)
-    pose[:3, 3] = tip - pose[:3, :3] @ needle.point(needle.TIP_ANGLE)
+    pose[:3, 3] = tip - pose[:3, :3] @ needle.point(needle.TIP_ANGLE, stitch.radius)
     return pose
 
 
@@ -211,7 +211,7 @@ def _place(scene: Sight) -> Wish:
     """Lift the needle, turn it upright before the entry, bring its tip in."""
     goal = scene.stitch.place()
     outward = scene.stitch.pair.entry.rotation[:, 2]
-    line = scene.needle[:3, :3] @ needle.polyline(13).T + scene.needle[:3, 3:4]
+    line = scene.needle[:3, :3] @ needle.polyline(13, scene.stitch.radius).T + scene.needle[:3, 3:4]
     if float(line[2].min()) < SURFACE + CLEAR and _angle(scene.needle, goal) > math.radians(20.0):
         return Wish(_shifted(scene.command, np.array([0.0, 0.0, 0.01])), 0.0)
     offset = line[:, -1] - np.asarray(scene.stitch.pair.entry.centre)
@@ -223,7 +223,7 @@ def _place(scene: Sight) -> Wish:
 def _insert(scene: Sight) -> Wish:
     """Bring the tip in, then drive the needle along its path."""
     start = scene.stitch.place()
-    tip = scene.needle[:3, :3] @ needle.point(needle.TIP_ANGLE) + scene.needle[:3, 3]
+    tip = scene.needle[:3, :3] @ needle.point(needle.TIP_ANGLE, scene.stitch.radius) + scene.needle[:3, 3]
     local = scene.stitch.pair.entry.rotation.T @ (tip - np.asarray(scene.stitch.pair.entry.centre))
     turned = turn_about_wound(start, scene.needle)
     if scene.memory.passed == 0.0:
@@ -249,7 +249,7 @@ def _pullout(scene: Sight) -> Wish:
     stitch = scene.stitch
     if scene.memory.release > 30:
         return Wish(scene.command, 0.0)
-    line = (scene.needle[:3, :3] @ needle.polyline(13).T + scene.needle[:3, 3:4]).T
+    line = (scene.needle[:3, :3] @ needle.polyline(13, scene.stitch.radius).T + scene.needle[:3, 3:4]).T
     outside = ((line - np.asarray(stitch.pair.exit.centre)) @ stitch.pair.exit.rotation)[:, 2]
     if float(outside.min()) > 0.0005:
         return Wish(scene.carrying(stitch.pulled()), 0.0)

@@ -29,7 +29,7 @@ from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.envs.success import Info, Target, measure, meets_demands
 from surgicai_vision.errors import InputError, PhysicsError
-from surgicai_vision.scene import build_scene
+from surgicai_vision.scene import build_scene, needle
 
 START_DRAWS = 60
 """Draws of a start state before giving up."""
@@ -67,17 +67,29 @@ class SuturingEnv(gymnasium.Env):
         axes = config.randomisation
         self.simulation = Simulation(self.scene, own_model=bool(axes.on), latency=axes.latency)
         self.stitch = Stitch.of(self.scene.pair)
-        if not self.stitch.possible and any(subtask.through for subtask in subtasks):
-            raise InputError(
-                f"'{config.task}' is not possible in layout '{config.scene.layout}': the holes of pair "
-                f"{config.scene.hole_pair} are {self.scene.pair.gap * 1e3:.1f} mm apart, too far for this needle (see "
-                "surgicai_vision.envs.geometry). Allowed there: grasp, place. All tasks: simple, 3dmed_straight."
-            )
+        self._refuse_impossible(subtasks)
         self.observation_space = view.space()
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
         self._subtasks = subtasks
         self._step_size = StepSize.of(config.step)
         self._pictures = Pictures(self.simulation.model)
+
+    def _refuse_impossible(self, subtasks: tuple[Subtask, ...]) -> None:
+        """Refuse subtasks for which the holes are too far apart, with the smallest needle of all episodes."""
+        config, pair = self.config, self.scene.pair
+        smallest = needle.RADIUS * (1.0 - config.randomisation.needle_size)
+        if Stitch.of(pair, smallest).possible or not any(subtask.through for subtask in subtasks):
+            return
+        why = f"the holes of pair {config.scene.hole_pair} are {pair.gap * 1e3:.1f} mm apart, too far for this needle"
+        if self.stitch.possible:
+            raise InputError(
+                f"randomisation: needle_size {config.randomisation.needle_size} makes '{config.task}' impossible in "
+                f"layout '{config.scene.layout}': {why} when it is smallest. Take a smaller one, or layout simple."
+            )
+        raise InputError(
+            f"'{config.task}' is not possible in layout '{config.scene.layout}': {why} (see "
+            "surgicai_vision.envs.geometry). Allowed there: grasp, place. All tasks: simple, 3dmed_straight."
+        )
 
     # -- gymnasium ------------------------------------------------------------------------------------------------
 
@@ -226,8 +238,8 @@ class SuturingEnv(gymnasium.Env):
     def compute_reward(self, achieved_goal: NDArray, desired_goal: NDArray, info: Any = None) -> NDArray[np.float64]:
         """Return the rewards of goals of obs_type "goal", (batch, 8) or (8,): vectorised, for HER.
 
-        On what was observed it is the reward of the step. A relabelled goal asks for what held when it was achieved: an
-        insertion that missed the holes is no example of one that passed them, but is one of reaching that pose.
+        On what was observed it is the reward of the step. A relabelled goal asks for what held when it was achieved:
+        an insertion that missed the holes is no example of one that passed them, but is one of reaching that pose.
         """
         distance, turn = observation.goal_errors(achieved_goal, desired_goal)
         if self.config.reward == "dense":
@@ -297,8 +309,9 @@ class SuturingEnv(gymnasium.Env):
 
     def _meet_draws(self) -> None:
         """Follow a new randomisation: goals stand on the phantom, and a renderer keeps the needle's shape."""
-        self.stitch = Stitch.of(randomisation.shifted(self.scene.pair, self.simulation.draws))
-        if self.config.randomisation.needle_thickness:
+        pair, axes = randomisation.shifted(self.scene.pair, self.simulation.draws), self.config.randomisation
+        self.stitch = Stitch.of(pair, self.simulation.radius)
+        if axes.needle_thickness or axes.needle_size:
             self._pictures.close()
 
     def _remember_tool(self) -> None:

@@ -55,27 +55,34 @@ PULLOUT_TURN = math.radians(-50.0)
 """End of the pull-out: the exit shifted by `PULLOUT_SHIFT`, the handoff grasp turned about y (released code)."""
 
 
-def grasp_in_needle(arm: str, angle: float, depth: float = GRASP_DEPTH) -> Matrix:
+def grasp_in_needle(arm: str, angle: float, depth: float = GRASP_DEPTH, radius: float = needle.RADIUS) -> Matrix:
     """Return T_needle_tip (4, 4): the tool's pose that grasps the needle's point at `angle` [rad].
 
     Args:
         arm: "psm1" or "psm2".
         angle: angle of the grasped point.
         depth: distance of the tip frame from the needle's plane [m].
+        radius: of the needle's arc [m].
     """
     y = GRASP_SIGNS[arm] * needle.radial(angle)
     z = np.array([0.0, 0.0, -1.0])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
-    pose[:3, 3] = needle.point(angle) - depth * z
+    pose[:3, 3] = needle.point(angle, radius) - depth * z
     return pose
 
 
-def needle_frame(angle: float) -> Matrix:
+def needle_frame(angle: float, radius: float = needle.RADIUS) -> Matrix:
     """Return T_needle_point (4, 4): the needle's frame shifted to its point at `angle`."""
     pose = np.eye(4)
-    pose[:3, 3] = needle.point(angle)
+    pose[:3, 3] = needle.point(angle, radius)
     return pose
+
+
+@functools.lru_cache(maxsize=256)
+def needle_frame_flat(angle: float, radius: float) -> Pose:
+    """Return `needle_frame` as twelve floats."""
+    return poses.flat(needle_frame(angle, radius))
 
 
 @dataclass(frozen=True)
@@ -86,30 +93,32 @@ class Stitch:
         pair: entry and exit.
         centre: centre of the circle through both holes [m, world].
         half: half of the circle's angle between the holes [rad].
+        radius: of the circle and of the needle's arc [m].
     """
 
     pair: HolePair
     centre: Matrix
     half: float
+    radius: float = needle.RADIUS
 
     @classmethod
-    def of(cls, pair: HolePair) -> "Stitch":
-        """Return the stitch through `pair`."""
+    def of(cls, pair: HolePair, radius: float = needle.RADIUS) -> "Stitch":
+        """Return the stitch through `pair` by a needle whose arc has `radius` [m]."""
         entry, leave = np.asarray(pair.entry.centre), np.asarray(pair.exit.centre)
         chord = leave - entry
         half = float(np.linalg.norm(chord)) / 2
         up = np.cross(chord / (2 * half), WOUND)
-        centre = (entry + leave) / 2 + up * math.sqrt(needle.RADIUS**2 - half**2)
-        return cls(pair, centre, math.asin(half / needle.RADIUS))
+        centre = (entry + leave) / 2 + up * math.sqrt(radius**2 - half**2)
+        return cls(pair, centre, math.asin(half / radius), radius)
 
     def on_arc(self, angle_at_entry: float) -> Matrix:
         """Return the needle's pose on the circle with its point at `angle_at_entry` [rad] in the entry."""
-        radial = (np.asarray(self.pair.entry.centre) - self.centre) / needle.RADIUS
+        radial = (np.asarray(self.pair.entry.centre) - self.centre) / self.radius
         return _needle_pose(angle_at_entry, radial, self.centre)
 
     def angle_at_entry(self, angle: float, beyond: float) -> float:
         """Return which needle angle is in the entry when the point at `angle` is `beyond` the exit [m]."""
-        return angle - beyond / needle.RADIUS - 2 * self.half
+        return angle - beyond / self.radius - 2 * self.half
 
     def place(self) -> Matrix:
         """Return the needle's pose with its tip in the entry, perpendicular to the entry's plane."""
@@ -117,7 +126,7 @@ class Stitch:
         inward = -entry.rotation[:, 2]
         radial = np.cross(WOUND, inward)
         pose = _needle_pose(needle.TIP_ANGLE, radial, np.zeros(3))
-        pose[:3, 3] = np.asarray(entry.centre) - pose[:3, :3] @ needle.point(needle.TIP_ANGLE)
+        pose[:3, 3] = np.asarray(entry.centre) - pose[:3, :3] @ needle.point(needle.TIP_ANGLE, self.radius)
         return pose
 
     def inserted(self, extra: float = 0.0) -> Matrix:
@@ -130,13 +139,15 @@ class Stitch:
         turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
         pose = np.eye(4)
         pose[:3, :3] = turn @ self.inserted()[:3, :3]
-        pose[:3, 3] = np.asarray(self.pair.exit.centre) + PULLOUT_SHIFT - pose[:3, :3] @ needle.point(HANDOFF_ANGLE)
+        pose[:3, 3] = (
+            np.asarray(self.pair.exit.centre) + PULLOUT_SHIFT - pose[:3, :3] @ needle.point(HANDOFF_ANGLE, self.radius)
+        )
         return pose
 
     @functools.cached_property
     def last_grasp(self) -> float:
         """Return the largest needle angle at which PSM2's jaws stay outside the entry to the end [rad]."""
-        return self.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA) - PAD_WIDTH / 2 / needle.RADIUS
+        return self.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA) - PAD_WIDTH / 2 / self.radius
 
     @property
     def possible(self) -> bool:
@@ -150,17 +161,17 @@ class Stitch:
     @functools.cached_property
     def place_tip(self) -> Pose:
         """Return the goal of `place` for the needle's frame at its tip."""
-        return poses.flat(self.place() @ needle_frame(needle.TIP_ANGLE))
+        return poses.flat(self.place() @ needle_frame(needle.TIP_ANGLE, self.radius))
 
     @functools.cached_property
     def insert_point(self) -> Pose:
         """Return the goal of `insert` for the needle's frame at `INSERT_ANGLE`."""
-        return poses.flat(self.inserted() @ needle_frame(INSERT_ANGLE))
+        return poses.flat(self.inserted() @ needle_frame(INSERT_ANGLE, self.radius))
 
     @functools.cached_property
     def pullout_point(self) -> Pose:
         """Return the goal of `pullout` for the needle's frame at `HANDOFF_ANGLE`."""
-        return poses.flat(self.pulled() @ needle_frame(HANDOFF_ANGLE))
+        return poses.flat(self.pulled() @ needle_frame(HANDOFF_ANGLE, self.radius))
 
 
 def _needle_pose(angle: float, radial: Matrix, centre: Matrix) -> Matrix:

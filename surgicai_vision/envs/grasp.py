@@ -50,12 +50,12 @@ class Grasp(Subtask):
 
 def grasp_goal(simulation: Simulation, arm: str, angle: float) -> Pose:
     """Return the jaws' grasp frame that holds the needle's point at `angle` [rad], in world."""
-    return poses.compose(simulation.needle(), _grasp_frame(arm, angle))
+    return poses.compose(simulation.needle(), _grasp_frame(arm, angle, simulation.radius))
 
 
 @functools.lru_cache(maxsize=64)
-def _grasp_frame(arm: str, angle: float) -> Pose:
+def _grasp_frame(arm: str, angle: float, radius: float) -> Pose:
     """Return T_needle_grasp: `grasp_in_needle` with the jaws' grasp point for its origin."""
     shift = np.eye(4)
     shift[2, 3] = GRASP_DEPTH
-    return poses.flat(grasp_in_needle(arm, angle) @ shift)
+    return poses.flat(grasp_in_needle(arm, angle, radius=radius) @ shift)

@@ -6,7 +6,7 @@ from types import MappingProxyType
 import numpy as np
 
 from surgicai_vision.envs import poses
-from surgicai_vision.envs.geometry import INSERT_ANGLE, Stitch, needle_frame
+from surgicai_vision.envs.geometry import INSERT_ANGLE, Stitch, needle_frame_flat
 from surgicai_vision.envs.place import draw_psm2_grasp
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import about_point, draw_rotation, hold_needle
@@ -17,7 +17,6 @@ from surgicai_vision.scene.kinematics import Pose
 
 START_SHIFT, START_TURN = 0.0055, math.radians(12.0)
 """How far the tip may be off the entry at the start (paper)."""
-_POINT = poses.flat(needle_frame(INSERT_ANGLE))
 
 
 class Insert(Subtask):
@@ -30,7 +29,7 @@ class Insert(Subtask):
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the needle with its tip near the entry, outside the tissue."""
         nominal = stitch.place()
-        tip = nominal[:3, :3] @ needle.point(needle.TIP_ANGLE) + nominal[:3, 3]
+        tip = nominal[:3, :3] @ needle.point(needle.TIP_ANGLE, stitch.radius) + nominal[:3, 3]
         shift = draw_in_ball(rng, START_SHIFT)
         outward = stitch.pair.entry.rotation[:, 2]
         if shift @ outward < -0.0005:
@@ -41,7 +40,7 @@ class Insert(Subtask):
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at 100° and where it ends."""
-        return poses.compose(simulation.needle(), _POINT), stitch.insert_point
+        return poses.compose(simulation.needle(), needle_frame_flat(INSERT_ANGLE, stitch.radius)), stitch.insert_point
 
 
 def draw_in_ball(rng: np.random.Generator, radius: float) -> np.ndarray:

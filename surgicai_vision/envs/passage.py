@@ -96,7 +96,7 @@ def _heights(simulation: Simulation, hole: Hole) -> tuple[float, float, float]:
     x, _, z = hole.centre
     px, _, pz, r0, r1, _, _, _, _, r6, r7, _ = simulation.needle()
     b, c = sine * r0 + cosine * r6, sine * r1 + cosine * r7
-    return sine * (px - x) + cosine * (pz - z), needle.RADIUS * math.hypot(b, c), math.atan2(b, c)
+    return sine * (px - x) + cosine * (pz - z), simulation.radius * math.hypot(b, c), math.atan2(b, c)
 
 
 def _within(point: Point, hole: Hole) -> bool:

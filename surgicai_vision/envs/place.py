@@ -6,7 +6,7 @@ from types import MappingProxyType
 import numpy as np
 
 from surgicai_vision.envs import poses
-from surgicai_vision.envs.geometry import Stitch, needle_frame
+from surgicai_vision.envs.geometry import Stitch, needle_frame_flat
 from surgicai_vision.envs.grasp import lying_needle
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import GRASP_ANGLES, SAFE_ANGLES, draw_grasp_error, grasp_pose, hold_needle
@@ -17,7 +17,6 @@ from surgicai_vision.scene.kinematics import Pose
 
 GRASP_SHIFT, GRASP_TILT = 0.0015, math.radians(12.0)
 """How far PSM2's grasp may be off at the start of place and insert (paper)."""
-_TIP = poses.flat(needle_frame(needle.TIP_ANGLE))
 
 
 def draw_psm2_grasp(rng: np.random.Generator, needle_pose: np.ndarray, stitch: Stitch) -> np.ndarray:
@@ -29,8 +28,8 @@ def draw_psm2_grasp(rng: np.random.Generator, needle_pose: np.ndarray, stitch: S
         stitch: leaves room for some angles.
     """
     angle, error = rng.uniform(*GRASP_ANGLES), draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
-    low, high = (limit - error.along / needle.RADIUS for limit in stitch.grasps(*SAFE_ANGLES))
-    return grasp_pose(PSM2, needle_pose, min(max(angle, low), high), error)
+    low, high = (limit - error.along / stitch.radius for limit in stitch.grasps(*SAFE_ANGLES))
+    return grasp_pose(PSM2, needle_pose, min(max(angle, low), high), error, stitch.radius)
 
 
 class Place(Subtask):
@@ -47,4 +46,4 @@ class Place(Subtask):
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at its tip and that frame in the entry."""
-        return poses.compose(simulation.needle(), _TIP), stitch.place_tip
+        return poses.compose(simulation.needle(), needle_frame_flat(needle.TIP_ANGLE, stitch.radius)), stitch.place_tip

@@ -6,7 +6,7 @@ from types import MappingProxyType
 import numpy as np
 
 from surgicai_vision.envs import poses
-from surgicai_vision.envs.geometry import HANDOFF_ANGLE, Stitch, needle_frame
+from surgicai_vision.envs.geometry import HANDOFF_ANGLE, Stitch, needle_frame_flat
 from surgicai_vision.envs.handoff import STRAIGHT, inserted_needle
 from surgicai_vision.envs.place import draw_psm2_grasp
 from surgicai_vision.envs.simulation import Simulation
@@ -19,7 +19,6 @@ GRASP_SHIFT, GRASP_TILT = 0.0015, math.radians(20.0)
 """How far PSM1's grasp may be off at the start (paper)."""
 RETREAT, RELEASED_JAW = 0.025, 0.5
 """Where PSM2 is after it let go: drawn back along its axis [m], jaw open [rad]."""
-_POINT = poses.flat(needle_frame(HANDOFF_ANGLE))
 
 
 class Pullout(Subtask):
@@ -37,10 +36,12 @@ class Pullout(Subtask):
         away[:3, 3] -= RETREAT * away[:3, 2]
         simulation.pose_arm(PSM2, simulation.to_base(PSM2, poses.flat(away)), RELEASED_JAW)
         error = draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
-        grasp = grasp_pose(PSM1, needle_pose, HANDOFF_ANGLE, error)
+        grasp = grasp_pose(PSM1, needle_pose, HANDOFF_ANGLE, error, stitch.radius)
         held = hold_needle(simulation, PSM1, needle_pose, grasp, STRAIGHT)
         return held and not simulation.touches_phantom(needle=False)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at 105° and where it ends."""
-        return poses.compose(simulation.needle(), _POINT), stitch.pullout_point
+        return poses.compose(
+            simulation.needle(), needle_frame_flat(HANDOFF_ANGLE, stitch.radius)
+        ), stitch.pullout_point

@@ -42,9 +42,12 @@ UNITS = MappingProxyType(
         "friction": (1.0,),
         "phantom_shift": (1e-3,) * 2,
         "kinematic_error": JOINT_ERROR * len(names.ARMS),
+        "needle_size": (1.0,),
     }
 )
 """Axis → what a magnitude of 1 is in each of its numbers (fractions, m, rad; the field of view in degrees)."""
+DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0")
+"""What MuJoCo derives from masses and places."""
 _EDGES = tuple(accumulate((len(unit) for unit in UNITS.values()), initial=0))
 _PLACES = {axis: slice(start, end) for axis, (start, end) in zip(UNITS, pairwise(_EDGES), strict=True)}
 SIZE = _EDGES[-1]
@@ -74,6 +77,11 @@ def joint_offsets(draws: Draws) -> dict[str, Draws]:
     return {arm: (*values[3 * index : 3 * index + 3], 0.0, 0.0, 0.0) for index, arm in enumerate(names.ARMS)}
 
 
+def needle_radius(draws: Draws) -> float:
+    """Return the radius of the needle's arc [m]."""
+    return needle.RADIUS * (1.0 + draws[_PLACES["needle_size"]][0])
+
+
 def shifted(pair: HolePair, draws: Draws) -> HolePair:
     """Return where a hole pair is when the phantom is shifted."""
     x, y = draws[_PLACES["phantom_shift"]]
@@ -92,7 +100,8 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
     shifts, turns = numbers["camera_shift"].reshape(-1, 3), numbers["camera_turn"].reshape(-1, 3)
     for cameras, shift, turn, fovy in zip(RIGS, shifts, turns, numbers["camera_fovy"], strict=True):
         _aim(source, model, cameras, shift, turn, fovy)
-    _thicken(source, model, scene.needle_geoms, 1.0 + float(numbers["needle_thickness"][0]))
+    size, thickness = (1.0 + float(numbers[axis][0]) for axis in ("needle_size", "needle_thickness"))
+    _shape_needle(source, model, scene.needle_geoms, size, thickness)
     model.geom_friction[:] = source.geom_friction * (1.0 + float(numbers["friction"][0]))
     phantom = source.body("phantom").id
     model.body_pos[phantom] = source.body_pos[phantom] + [*numbers["phantom_shift"], 0.0]
@@ -125,21 +134,41 @@ def _aim(
         model.cam_fovy[index] = source.cam_fovy[index] + fovy
 
 
-def _thicken(source: mujoco.MjModel, model: mujoco.MjModel, geoms: range, factor: float) -> None:
-    """Scale the needle's thickness: what collides, the bounds that find collisions, and what is drawn."""
-    of = slice(geoms.start, geoms.stop)
-    radius, half = source.geom_size[of, 0] * factor, source.geom_size[of, 1]
-    model.geom_size[of, 0] = radius
+def _shape_needle(source: mujoco.MjModel, model: mujoco.MjModel, geoms: range, size: float, thickness: float) -> None:
+    """Scale the needle's arc and its thickness: what collides, the bounds that find collisions, and what is drawn."""
+    of, body = slice(geoms.start, geoms.stop), source.body("needle").id
+    radius, half = source.geom_size[of, 0] * thickness, source.geom_size[of, 1] * size
+    model.geom_size[of, 0], model.geom_size[of, 1] = radius, half
+    model.geom_pos[of] = source.geom_pos[of] * size
     model.geom_rbound[of] = radius + half
     model.geom_aabb[of, 3:] = np.stack([radius, radius, radius + half], axis=1)
-    body = source.body("needle").id
     tree = slice(source.body_bvhadr[body], source.body_bvhadr[body] + source.body_bvhnum[body])
-    grown = max(0.0, float((radius - source.geom_size[of, 0]).max()))
-    model.bvh_aabb[tree, 3:] = source.bvh_aabb[tree, 3:] + grown
+    grown = max(0.0, float((radius - source.geom_size[of, 0] * size).max()))
+    model.bvh_aabb[tree] = source.bvh_aabb[tree] * size
+    model.bvh_aabb[tree, 3:] += grown
+    _weigh_needle(source, model, body, size)
     mesh = source.mesh("needle").id
     of = slice(source.mesh_vertadr[mesh], source.mesh_vertadr[mesh] + source.mesh_vertnum[mesh])
     turn, origin = quaternion_to_matrix(source.mesh_quat[mesh]), source.mesh_pos[mesh]
     points = source.mesh_vert[of] @ turn.T + origin
     angles = np.clip(np.arctan2(points[:, 1], -points[:, 0]), 0.0, needle.TIP_ANGLE)
     line = np.stack([-needle.RADIUS * np.cos(angles), needle.RADIUS * np.sin(angles), np.zeros_like(angles)], axis=1)
-    model.mesh_vert[of] = (line + (points - line) * factor - origin) @ turn
+    model.mesh_vert[of] = (line * size + (points - line) * thickness - origin) @ turn
+
+
+def _weigh_needle(source: mujoco.MjModel, model: mujoco.MjModel, body: int, size: float) -> None:
+    """Scale mass and inertia with the arc's length, move what is fixed to it, and derive MuJoCo's constants anew."""
+    model.body_mass[body] = source.body_mass[body] * size
+    model.body_inertia[body] = source.body_inertia[body] * size**3
+    model.body_ipos[body] = source.body_ipos[body] * size
+    for sites in np.flatnonzero(source.site_bodyid == body):
+        model.site_pos[sites] = source.site_pos[sites] * size
+    for thread in np.flatnonzero(source.body_parentid == body):
+        model.body_pos[thread] = source.body_pos[thread] * size
+    if size == 1.0:
+        for name in DERIVED:
+            getattr(model, name)[:] = getattr(source, name)
+        return
+    extent, centre = source.stat.extent, source.stat.center.copy()
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    model.stat.extent, model.stat.center[:] = extent, centre  # they place the cameras' near and far planes

@@ -71,6 +71,7 @@ class Simulation:
         self._ctrl, self._qpos, self._xpos, self._xmat = data.ctrl, data.qpos, data.xpos, data.xmat
         self.draws = randomisation.NOTHING
         self.offsets: dict[str, tuple[float, ...]] = {}
+        self.radius = needle.RADIUS
         self._welds = Welds(self.model, self.data) if welded else None
         self._own = own_model
         self._instrument = scene.config.instrument
@@ -112,6 +113,7 @@ class Simulation:
             raise InputError("The state is of a randomised episode; make the env with its randomisation.")
         randomisation.apply(self.scene, self.model, draws)
         self.draws, self.offsets = draws, randomisation.joint_offsets(draws)
+        self.radius = randomisation.needle_radius(draws)
 
     def refresh(self) -> None:
         """Recompute positions, velocities and contacts of the present state."""
@@ -311,7 +313,7 @@ class Simulation:
     def needle_point(self, angle: float) -> tuple[float, float, float]:
         """Return the needle's point at `angle` [rad] in world [m]."""
         x, y, z, r0, r1, _, r3, r4, _, r6, r7, _ = self.needle()
-        along, across = -needle.RADIUS * math.cos(angle), needle.RADIUS * math.sin(angle)
+        along, across = -self.radius * math.cos(angle), self.radius * math.sin(angle)
         return x + r0 * along + r1 * across, y + r3 * along + r4 * across, z + r6 * along + r7 * across
 
     def touching(self, arm: str) -> tuple[bool, bool]:

@@ -54,11 +54,13 @@ def draw_grasp_error(rng: np.random.Generator, shift: float, angle: float) -> Gr
     return GraspError(along, depth, (size * math.cos(direction), size * math.sin(direction)))
 
 
-def grasp_pose(arm: str, needle_pose: Matrix, angle: float, error: GraspError | None = None) -> Matrix:
-    """Return T_world_tip (4, 4) of a grasp of the needle's point at `angle` [rad], off by `error`."""
+def grasp_pose(
+    arm: str, needle_pose: Matrix, angle: float, error: GraspError | None = None, radius: float = needle.RADIUS
+) -> Matrix:
+    """Return T_world_tip (4, 4) of a grasp of the point at `angle` [rad] of an arc of `radius` [m], off by `error`."""
     if error is None:
-        return needle_pose @ grasp_in_needle(arm, angle)
-    grasp = needle_pose @ grasp_in_needle(arm, angle + error.along / needle.RADIUS, GRASP_DEPTH - error.depth)
+        return needle_pose @ grasp_in_needle(arm, angle, radius=radius)
+    grasp = needle_pose @ grasp_in_needle(arm, angle + error.along / radius, GRASP_DEPTH - error.depth, radius)
     pivot = np.eye(4)
     pivot[2, 3] = GRASP_DEPTH - error.depth
     turn = np.eye(4)

@@ -43,9 +43,9 @@ hold a round needle. With the default 0.005 m the grip crept 0.7° in ten second
 1.2°."""
 
 
-def point(angle: float) -> np.ndarray:
-    """Return the arc's point at `angle` [rad] in the needle frame, shape (3,) [m]."""
-    return np.array([-RADIUS * math.cos(angle), RADIUS * math.sin(angle), 0.0])
+def point(angle: float, radius: float = RADIUS) -> np.ndarray:
+    """Return the point at `angle` [rad] of an arc of `radius` [m] in the needle frame, shape (3,) [m]."""
+    return np.array([-radius * math.cos(angle), radius * math.sin(angle), 0.0])
 
 
 def tangent(angle: float) -> np.ndarray:
@@ -58,10 +58,10 @@ def radial(angle: float) -> np.ndarray:
     return np.array([-math.cos(angle), math.sin(angle), 0.0])
 
 
-def polyline(points: int = 61) -> np.ndarray:
+def polyline(points: int = 61, radius: float = RADIUS) -> np.ndarray:
     """Return points along the needle from base to tip in its frame, shape (points, 3) [m]."""
     angles = np.linspace(0.0, TIP_ANGLE, points)
-    return np.stack([-RADIUS * np.cos(angles), RADIUS * np.sin(angles), np.zeros_like(angles)], axis=1)
+    return np.stack([-radius * np.cos(angles), radius * np.sin(angles), np.zeros_like(angles)], axis=1)
 
 
 def thickness(angle: float) -> float:
