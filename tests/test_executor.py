@@ -72,6 +72,19 @@ def test_a_worker_killed_twice_is_an_error_and_keeps_the_rest(tmp_path):
     assert seen == [(2, 2, "jobs")]
 
 
+def test_a_run_that_is_told_of_failures_goes_on_after_them(tmp_path):
+    heard = {}
+
+    def ended(job, folder, error):
+        heard[job.name] = (folder.is_dir(), str(error) if error else "")
+
+    jobs = [Job("die", {}), Job("crash", {}), *squares([3])]
+    run(jobs, tmp_path / "store", workers=2, table=TABLE, attempts=3, ended=ended)
+    assert heard["square"] == (True, "")
+    assert not heard["die"][0] and "died 3 times" in heard["die"][1]
+    assert not heard["crash"][0] and "ZeroDivisionError" in heard["crash"][1]
+
+
 @pytest.mark.parametrize("workers", [0, 1])
 def test_failures_keep_their_kind_and_leave_nothing(tmp_path, workers):
     with pytest.raises(InputError, match="bad input"):

@@ -11,7 +11,7 @@ from fake_demos import render_with_fake_env, write_demos
 from surgicai_vision import names
 from surgicai_vision.commands import render_demos as command
 from surgicai_vision.config import TaskConfig
-from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, repair_dataset, view_dataset
+from surgicai_vision.dataset import check_dataset, encoding, open_dataset, render_demos, repair_dataset, view_dataset
 from surgicai_vision.dataset.video import CODECS
 from surgicai_vision.errors import InputError, OutputExists, UnknownName
 
@@ -80,6 +80,18 @@ def test_video_is_read_by_us_and_by_lerobot_and_its_error_is_measured(tmp_path, 
     assert after.meta["video_error"] == made.video_error
     with pytest.raises(OutputExists):
         render(demos, tmp_path / "video")
+
+
+def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(tmp_path, demos, monkeypatch):
+    render(demos, tmp_path / "set")
+    monkeypatch.setattr(encoding, "BLOCK_FRAMES", 8)
+    alone = view_dataset(tmp_path / "set", tmp_path / "alone", video="h264", workers=0)
+    monkeypatch.setattr(encoding, "_dataset", None)  # not in this process
+    together = view_dataset(tmp_path / "set", tmp_path / "together", video="h264", workers=2)
+    assert (alone.digest, alone.video_error) == (together.digest, together.video_error)
+    assert open_dataset(tmp_path / "alone").fingerprint == open_dataset(tmp_path / "together").fingerprint
+    assert len(list((tmp_path / "alone").rglob("*.mp4"))) == 4, "two views, three episodes in two blocks"
+    assert check_dataset(tmp_path / "together").problems == ()
 
 
 def test_views_of_a_video_dataset_and_its_repair(tmp_path, demos):

@@ -7,9 +7,14 @@ import numpy as np
 
 from surgicai_vision.errors import BadFile
 
-PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
-"""Run lengths after the filter: on a textured scene as fast as zlib's first level (2.4 ms at 224 × 224) and 5 %
-smaller; level 6 is 5 % smaller again and takes five times as long."""
+PNG = (
+    *(cv2.IMWRITE_PNG_COMPRESSION, 1),
+    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH),
+)
+"""One filter and no search for repetitions: 1.6 ms and 65 kB of a textured 224 × 224 picture. With a filter chosen for
+each row and run lengths it is 1 % smaller and takes 1.5 times as long; zlib's level 6 is 6 % smaller and takes seven
+times as long."""
 
 
 def encode(frame: np.ndarray) -> bytes:

@@ -101,7 +101,8 @@ def render_demos(
         shutil.rmtree(lossless, ignore_errors=True)
         assemble(shards, lossless, table, names.TASK_TEXTS[config.task], meta)
         if video:
-            write_view(open_dataset(lossless), result, views, video, {})
+            more: dict[str, Any] = {"store": store, "workers": workers, "engine": engine}
+            write_view(open_dataset(lossless), result, views, video, {}, progress, **more)
     return finished(out, request, started)
 
 

@@ -11,34 +11,28 @@ every frame is decoded again and compared with its picture, and what was lost is
 import dataclasses
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from surgicai_vision import names
 from surgicai_vision.dataset import layout
+from surgicai_vision.dataset.encoding import Encoded, Place, encode_views
 from surgicai_vision.dataset.lerobot_files import LeRobotFiles
 from surgicai_vision.dataset.metadata import (
     FILES_PER_CHUNK,
     INDEX_FEATURES,
-    VIDEO_FILE_MB,
     EpisodeRow,
     row_statistics,
-    video_path,
     write_metadata,
 )
 from surgicai_vision.dataset.reading import Dataset, open_dataset
-from surgicai_vision.dataset.video import CODECS, PIXELS, VideoWriter, read_frames
+from surgicai_vision.dataset.video import CODECS, PIXELS
 from surgicai_vision.dataset.writing import DataFiles
 from surgicai_vision.errors import BadFile, InputError, OutputExists, check_name
-from surgicai_vision.executor import Progress, building, work_folder
+from surgicai_vision.executor import LOCAL, Engine, Progress, building, work_folder
 from surgicai_vision.files import check_output, read_json, whole_folder, write_json
-
-Place = tuple[int, float, float]
-"""(number of the video file, first second, second after the last)."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +60,8 @@ def view_dataset(
     *,
     views: Sequence[str] | None = None,
     video: str | None = None,
+    workers: int = 1,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
 ) -> DatasetSummary:
     """Write `out`: the views `views` of the dataset `path`, as videos where `video` says so.
@@ -95,8 +91,9 @@ def view_dataset(
     request = {"dataset": dataset.meta["digest"], "views": list(views), "video": video or dataset.video}
     check_output(out, may_resume=names.META_FILE)
     if not (out / names.META_FILE).exists():
-        with building(out) as (_, result):
-            write_view(dataset, result, views, video, {"request": request}, progress)
+        with building(out) as (store, result):
+            more: dict[str, Any] = {"store": store, "workers": workers, "engine": engine}
+            write_view(dataset, result, views, video, {"request": request}, progress, **more)
     return finished(out, request, started)
 
 
@@ -127,21 +124,29 @@ def write_view(
     video: str | None,
     changes: Mapping[str, Any],
     progress: Progress | None = None,
+    *,
+    store: Path,
+    workers: int = 1,
+    engine: Engine = LOCAL,
 ) -> None:
-    """Write the folder `out`, whole; `changes` go into its `meta/surgicai.json`."""
+    """Write the folder `out`, whole; `changes` go into its `meta/surgicai.json`, jobs in `store` make videos."""
     files = LeRobotFiles(dataset.path)
     if len(files.rows) != int(dataset.meta["episodes"]):
         raise BadFile(f"{dataset.path} is damaged ({' '.join(files.problems)}); repair it first.")
     keys = [key for key, _, _ in layout.picture_keys(views, dataset.has_depth, dataset.has_segmentation)]
     features = _features(files, dataset, keys, video)
     with whole_folder(out) as folder:
+        encoded: list[dict[str, Encoded]] = []
         if video:
-            places = _encode(dataset, folder, views, video)
+            encoded = encode_views(
+                dataset, folder, views, video, store=store, workers=workers, engine=engine, progress=progress
+            )
+            places = [{key: item.place for key, item in episode.items()} for episode in encoded]
         else:
             places = _copy_videos(files, folder, [key for key in keys if key in dataset.video_keys])
         rows = _write_data(files, folder, features, places)
         write_metadata(folder, features, list(files.tasks.values()), rows, files.info)
-        digest, errors = _look(dataset, folder, keys, rows, bool(video), progress)
+        digest, errors = _look(dataset, keys, rows, encoded, progress)
         meta = {
             **dataset.meta,
             "views": list(views),
@@ -193,29 +198,6 @@ def _write_data(
     return rows
 
 
-def _encode(dataset: Dataset, folder: Path, views: Sequence[str], video: str) -> list[dict[str, Place]]:
-    """Encode every view; return where each episode is in its videos."""
-    places: list[dict[str, Place]] = [{} for _ in dataset.bounds()]
-    for view in views:
-        key = names.image_key(view)
-        file, frame = 0, 0
-        writer = VideoWriter(folder / video_path(key, file), video, names.FPS, dataset.image_size)
-        try:
-            for number, (start, stop) in enumerate(dataset.bounds()):
-                if writer.written >= VIDEO_FILE_MB * 2**20:
-                    writer.close()
-                    file, frame = file + 1, 0
-                    writer = VideoWriter(folder / video_path(key, file), video, names.FPS, dataset.image_size)
-                for picture in dataset.decoded(key, start, stop):
-                    writer.add(picture)
-                end = frame + stop - start
-                places[number][key] = (file, frame / names.FPS, end / names.FPS)
-                frame = end
-        finally:
-            writer.close()
-    return places
-
-
 def _copy_videos(files: LeRobotFiles, folder: Path, keys: Sequence[str]) -> list[dict[str, Place]]:
     """Take over the videos of `keys`; return where each episode is in them."""
     places: list[dict[str, Place]] = [{} for _ in files.rows]
@@ -233,35 +215,28 @@ def _copy_videos(files: LeRobotFiles, folder: Path, keys: Sequence[str]) -> list
 
 def _look(
     dataset: Dataset,
-    folder: Path,
     keys: Sequence[str],
     rows: Sequence[EpisodeRow],
-    encoded: bool,
+    encoded: Sequence[Mapping[str, Encoded]],
     progress: Progress | None,
 ) -> tuple[str, dict[str, float]]:
-    """Decode what was written; return the digest of the content and each video's error."""
+    """Return the digest of the content, and each new video's mean absolute error."""
     columns = dataset.columns()
-    digests, sums = [], dict.fromkeys(dataset.views, 0.0)
-    for row in rows:
+    digests = []
+    for number, row in enumerate(rows):
         digest = layout.EpisodeDigest(keys)
         for key in keys:
-            frames = dataset.decoded(key, row.start, row.stop)
-            if encoded and key in row.videos:
-                view = key.removeprefix(names.image_key(""))
-                for before, after in zip(frames, _decoded(folder, key, row), strict=True):
-                    sums[view] += float(np.abs(after.astype(np.int16) - before).mean())
-                    digest.add(key, after)
-            else:
-                for frame in frames:
-                    digest.add(key, frame)
+            if encoded and key in encoded[number]:
+                digest.take(key, encoded[number][key].digest)
+                continue
+            for frame in dataset.decoded(key, row.start, row.stop):
+                digest.add(key, frame)
         digests.append(digest.hexdigest({key: columns[key][row.start : row.stop] for key in layout.COLUMNS}))
-        if progress:
+        if progress and not encoded:
             progress(row.stop, dataset.length, "frames")
-    errors = {view: round(sums[view] / dataset.length, 4) for view in dataset.views if names.image_key(view) in keys}
+    errors = {}
+    for view in dataset.views if encoded else ():
+        if names.image_key(view) in keys:
+            total = sum(episode[names.image_key(view)].error for episode in encoded)
+            errors[view] = round(total / dataset.length, 4)
     return layout.dataset_digest(digests), errors
-
-
-def _decoded(folder: Path, key: str, row: EpisodeRow) -> Iterator[np.ndarray]:
-    """Yield an episode's frames of a video."""
-    file, begin, _ = row.videos[key]
-    return read_frames(folder / video_path(key, file), round(begin * names.FPS), row.stop - row.start, names.FPS)

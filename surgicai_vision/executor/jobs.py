@@ -41,6 +41,7 @@ JOBS: Mapping[str, JobKind] = MappingProxyType(
         "render-episode": JobKind(
             "surgicai_vision.dataset.rendering:render_episode", ("scene", "envs", "demos", "dataset")
         ),
+        "encode-video": JobKind("surgicai_vision.dataset.encoding:encode_block", ("dataset",), ("numpy", "av")),
         "sweep-features": JobKind("surgicai_vision.sweep.jobs:encode_features", _LEARN, _NUMERIC),
         "sweep-policy": JobKind("surgicai_vision.sweep.jobs:train_policy", _LEARN, _NUMERIC),
         "sweep-cell": JobKind("surgicai_vision.sweep.jobs:run_cell", _CELL, _NUMERIC),

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision import names
+from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import many_of, one_of, option
+from surgicai_vision.commands.options import many_of, one_of, option, positive
 from surgicai_vision.commands.render_demos import CODECS, say_error
 from surgicai_vision.errors import InputError
 
@@ -29,6 +30,7 @@ class Options:
         metavar="CODEC",
         default_text="as it is",
     )
+    workers: int = option(folders.CORES, "processes that encode videos", check=positive, metavar="N")
     out: str | None = option(
         None, "dataset to make", metavar="DIR2", default_text="DIR with the views and the codec in its name"
     )
@@ -46,7 +48,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         raise InputError("There is nothing to do: give --view VIEW[,VIEW], --video CODEC or both.")
     out = Path(options.out) if options.out else path.with_name(f"{path.name}-{ending}")
     with console.stage("writing", "frames") as progress:
-        summary = view_dataset(path, out, views=options.view, video=options.video, progress=progress)
+        summary = view_dataset(
+            path, out, views=options.view, video=options.video, workers=options.workers, progress=progress
+        )
     console.say(f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}")
     say_error(summary, console)
     return {**dataclasses.asdict(summary), "dataset": str(out)}
