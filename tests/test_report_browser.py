@@ -12,7 +12,7 @@ from test_report import painted_stage
 from test_report_sweep import find
 
 from surgicai_vision import pictures, report
-from surgicai_vision.report import page
+from surgicai_vision.report import sections
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.pairs import compare
 from surgicai_vision.report.reading import collect
@@ -126,7 +126,7 @@ def test_a_click_on_a_cell_shows_its_episodes(said, groups):
 
 
 def test_a_browser_shows_all_pairs_when_asked(said, groups):
-    assert said["pairs"] == len(compare(groups)) > page.PAIRS_SHOWN
+    assert said["pairs"] == len(compare(groups)) > sections.PAIRS_SHOWN
 
 
 def test_at_a_phones_width_nothing_but_marked_tables_is_wider(written, tmp_path):

@@ -12,7 +12,7 @@ from sweep_results import COMMAND, TASKS, add_curves, cell, evaluation, store_ce
 from test_report import assert_stands_alone, painted_stage
 
 from surgicai_vision import pictures, report, statistics
-from surgicai_vision.report import charts, films, paper, tables
+from surgicai_vision.report import beside, charts, films, formats, paper
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.pairs import compare, factor
 from surgicai_vision.report.reading import Condition, collect
@@ -79,7 +79,8 @@ def test_the_paper_stands_beside_ours_cell_by_cell(text, groups):
     assert rows["insert", "imagenet-lite"][0] == "not in the paper"
     assert rows["grasp", "r3m"][1] == "not run"
     assert rows["grasp", "clip"][1] == "not in this sweep"
-    assert tables.paper_rate(ours.condition) == 0.10
+    assert "Behaviour cloning from the state, its Table 1: grasp 96 %; place 100 %; insert 97 %" in text
+    assert beside.paper_rate(ours.condition) == 0.10
 
 
 def test_every_cell_is_there_with_its_count_and_interval(text, groups, written):
@@ -209,7 +210,7 @@ def test_curves_chain_and_probes_are_drawn_with_their_numbers(text, groups):
 
 
 def test_a_shifted_policy_is_no_cell_of_the_tables(text, groups):
-    assert not any(tables.paper_rate(item.condition) for item in groups if not item.condition.plain)
+    assert not any(beside.paper_rate(item.condition) for item in groups if not item.condition.plain)
     assert text.count('data-plain="no"') == 2 * sum(not item.condition.plain for item in groups)
 
 
@@ -223,6 +224,22 @@ def test_shifted_evaluations_alone_make_a_page(tmp_path, monkeypatch):
     assert "random on front, blur 0 solves 20 of 20 held-out starts of grasp" in text
     assert len(rows_of(text, "success")) == 3
     assert text.split('id="curves"')[1].count("<polyline") == 1
+
+
+def test_two_evaluations_of_the_same_thing_are_not_counted_as_one(tmp_path):
+    generator = np.random.default_rng(0)
+    for name in ("friction", "attach"):
+        evaluation(tmp_path / name, "grasp", "expert", 1.5, generator, {})
+    assert [(item.label, item.episodes) for item in group(collect(tmp_path))] == [
+        ("expert · attach", 20), ("expert · friction", 20),
+    ]  # fmt: skip
+
+
+def test_what_a_running_sweep_has_not_filed_is_no_result_yet(tmp_path):
+    write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
+    before = len(collect(tmp_path).results)
+    evaluation(tmp_path / "work/job/evaluation", "grasp", "expert", 1.5, np.random.default_rng(0), {})
+    assert len(collect(tmp_path).results) == before
 
 
 def test_films_show_every_condition_and_stay_within_the_budget(text, groups, written, monkeypatch):
@@ -288,7 +305,7 @@ def test_latex_has_the_structure_of_booktabs(written):
 
 
 def test_latex_escapes_what_it_would_read_as_a_command():
-    assert tables.escape_latex("50 % of a_b & {c} ~ \\x") == (
+    assert formats.escape_latex("50 % of a_b & {c} ~ \\x") == (
         r"50 \% of a\_b \& \{c\} \textasciitilde{} \textbackslash{}x"
     )
 

@@ -8,16 +8,14 @@ from typing import Any
 from markupsafe import Markup
 
 from surgicai_vision import names
-from surgicai_vision.report import charts, curves, paper, text
+from surgicai_vision.report import charts, curves, paper, sections, text
 from surgicai_vision.report.episodes import group_details, letters
 from surgicai_vision.report.films import Reel
-from surgicai_vision.report.groups import KINDS, MEASURES, Group, as_trained, best_trained, of_task
+from surgicai_vision.report.groups import Group, as_trained, best_trained, of_task
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.probing import probes
-from surgicai_vision.report.reading import Collected, Condition
-from surgicai_vision.report.tables import beside_paper, our_text, paper_text
+from surgicai_vision.report.reading import Collected
 
-PAIRS_SHOWN = 12
 FEW = 12
 """Rows up to which a table of every cell is open from the start."""
 
@@ -40,26 +38,29 @@ def numbers(collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]
     return {
         **headline(groups),
         "counts": _counts(collected),
-        "paper": _paper(groups, index),
+        "paper": sections.paper_rows(groups, index),
         "paper_source": paper.SOURCE,
         "paper_episodes": paper.EPISODES,
-        "heats": _heats(groups, index),
-        "rows": [_row(at, item, best.get(item.condition.task)) for at, item in enumerate(groups)],
+        "ceilings": sections.ceilings(groups),
+        "heats": sections.heat_maps(groups, index),
+        "rows": [sections.success_row(at, item, best.get(item.condition.task)) for at, item in enumerate(groups)],
         "across_seeds": any(item.across for item in groups),
         "shifted": len({item.condition.plain for item in groups}) > 1,
-        "filters": _filters(groups),
-        "caption": _caption(groups),
-        "kinds": [(kind.replace("_", " "), charts.KIND_COLOURS[kind]) for kind in ("success", *_kinds(groups))],
-        "measures": _measures(groups),
+        "filters": sections.filters(groups),
+        "caption": sections.caption(groups),
+        "kinds": [
+            (kind.replace("_", " "), charts.KIND_COLOURS[kind]) for kind in ("success", *sections.kinds(groups))
+        ],
+        "measures": sections.measures(groups),
         "data_curves": curves.data_curves(groups),
         "robustness": curves.robustness_curves(groups),
         "survival": curves.survival(groups),
         "paper_chain": ", ".join(text.percent(rate) for rate in paper.CHAIN),
         "probes": probes(collected.probes, groups),
-        "pairs": [_pair(at, pair) for at, pair in enumerate(pairs)],
-        "pairs_shown": PAIRS_SHOWN,
+        "pairs": [sections.pair_row(at, pair) for at, pair in enumerate(pairs)],
+        "pairs_shown": sections.PAIRS_SHOWN,
         "letters": letters(),
-        "missing": _missing(groups),
+        "missing": sections.missing_rows(groups),
     }
 
 
@@ -111,217 +112,6 @@ def _counts(collected: Collected) -> list[tuple[int, str]]:
     counts = [(trained, "done"), *((states.count(state), state) for state in sorted(set(states)))]
     episodes = sum(len(result.rows) for result in collected.results)
     return [(trained + len(states), "cells"), *counts, (episodes, "episodes")]
-
-
-def _paper(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, Any]]:
-    """Return the paper's table beside ours, one row a task and encoder."""
-    rows: list[dict[str, Any]] = []
-    for task, encoder, sides in beside_paper(groups):
-        cells = []
-        for rate, item in sides:
-            evaluated = item is not None and item.episodes > 0
-            drawing = Markup("")
-            if item is not None and evaluated:
-                drawing = charts.interval(item.rate, *item.interval, our_text(item), rate)
-            count = f"{item.successes}/{item.episodes}" if item is not None and evaluated else our_text(item)
-            cells.append(
-                {
-                    "paper": paper_text(task, encoder, rate),
-                    "ours": count,
-                    "interval": text.interval(item.interval) if item is not None and evaluated else "",
-                    "drawing": drawing,
-                    "group": index[item.condition] if item is not None else None,
-                    "state": "" if evaluated else "absent",
-                }
-            )
-        rows.append({"task": task, "encoder": encoder, "cells": cells, "starts": not rows or rows[-1]["task"] != task})
-    return rows
-
-
-def _heats(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, Any]]:
-    """Return one heat map a view set: task × policy; of several numbers of demonstrations the largest counts."""
-    plain = [item for item in groups if item.condition.plain and item.condition.task != names.SUTURE]
-    maps = []
-    for views in dict.fromkeys(item.condition.views for item in plain):
-        mine = [item for item in plain if item.condition.views == views]
-        columns = list(dict.fromkeys(item.condition.policy for item in mine))
-        tasks = [task for task in names.TASKS if of_task(mine, task)]
-        rows = []
-        for task in tasks:
-            known = {item.condition.policy: item for item in of_task(mine, task)}
-            rows.append({"task": task, "cells": [_heat(known.get(column), index) for column in columns]})
-        maps.append({"view": " + ".join(views) or "no pictures", "columns": columns, "rows": rows})
-    return maps if sum(len(found["rows"]) for found in maps) > len(maps) else []
-
-
-def _heat(item: Group | None, index: dict[Condition, int]) -> dict[str, Any]:
-    if item is None:
-        return {"text": "", "small": "", "title": "not in this sweep", "group": None, "state": "none"}
-    title, group = item.label, index[item.condition]
-    if not item.episodes:
-        cell = item.missing[0]
-        return {"text": cell.state, "small": "", "title": f"{title}: {cell.reason}", "group": group, "state": "absent"}
-    back, front = charts.heat(item.rate)
-    return {
-        "text": f"{100 * item.rate:.0f}",
-        "small": f"{100 * item.interval[0]:.0f}–{100 * item.interval[1]:.0f}",
-        "title": f"{title}: {our_text(item)}",
-        "group": group,
-        "state": "",
-        "back": back,
-        "front": front,
-    }
-
-
-def _row(at: int, item: Group, best: Group | None) -> dict[str, Any]:
-    """Return one line of the success table; `sort` holds what its columns are sorted by."""
-    condition = item.condition
-    row: dict[str, Any] = {
-        "group": at,
-        "task": condition.task,
-        "policy": condition.policy if condition.plain else condition.label,
-        "encoder": condition.encoder,
-        "views": condition.view or text.ABSENT,
-        "demonstrations": item.demonstrations,
-        "plain": condition.plain,
-        "kind": "" if condition.trained else "reference",
-        "note": _note(item),
-        "evaluated": item.episodes > 0,
-    }
-    if not item.episodes:
-        cell = item.missing[0]
-        return {**row, "kind": "absent", "state": cell.state, "reason": _short(cell.reason), "sort": {}}
-    low, high = item.interval
-    length, steps = item.on_successes("trajectory_length_mm"), item.on_successes("steps")
-    label = f"{text.percent(item.rate)}, 95 % interval {text.interval((low, high))}"
-    failures = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in item.failures.items())
-    return {
-        **row,
-        "kind": "best" if item is best and item.successes else row["kind"],
-        "successes": item.successes,
-        "episodes": item.episodes,
-        "rate": text.percent(item.rate),
-        "interval": text.interval((low, high)),
-        "drawing": charts.interval(item.rate, low, high, label),
-        "across": item.across_text().partition(" (")[0],
-        "bootstrap": text.interval(item.across.interval) if item.across else "",
-        "seeds": len(item.results),
-        "length": text.mean(length),
-        "steps": text.mean(steps),
-        "outcomes": charts.outcomes(item.successes, item.failures),
-        "failures": failures or "no failure",
-        "sort": {
-            "rate": item.rate,
-            "across": item.across.mean if item.across else item.rate,
-            "length": length["mean"],
-            "steps": steps["mean"],
-        },
-    }
-
-
-def _note(item: Group) -> str:
-    """Say which training seeds are missing beside some that are there."""
-    states = [cell.state for cell in item.missing]
-    if not item.episodes or not states:
-        return ""
-    parts = [f"{text.plural(states.count(state), 'training seed')} {state}" for state in dict.fromkeys(states)]
-    return ", ".join(parts)
-
-
-def _measures(groups: Sequence[Group]) -> dict[str, Any]:
-    """Return the columns that some row measured, and their medians."""
-    evaluated = [(at, item) for at, item in enumerate(groups) if item.episodes]
-    kept = [spec for spec in MEASURES if any(text.finite(item.values(spec[0])) for _, item in evaluated)]
-    rows = []
-    for at, item in evaluated:
-        cells = []
-        for column, *_ in kept:
-            found = text.quartiles(item.values(column))
-            middle, _, rest = text.spread(item.values(column)).partition(" ")
-            cells.append((middle, rest, found[1] if found else None))
-        condition = item.condition
-        rows.append({"group": at, "task": condition.task, "policy": item.label, "cells": cells,
-                     "encoder": condition.encoder, "views": condition.view or text.ABSENT, "plain": condition.plain,
-                     "kind": "" if condition.trained else "reference"})  # fmt: skip
-    explained = "; ".join(f"{what} [{unit}]: {why}" for _, what, unit, why in kept)
-    return {"head": [(what, unit) for _, what, unit, _ in kept], "rows": rows, "caption": explained}
-
-
-def _pair(at: int, pair: Pair) -> dict[str, Any]:
-    """Return one comparison as text."""
-    return {
-        "more": at >= PAIRS_SHOWN,
-        "task": pair.first.condition.task,
-        "first": pair.first.label,
-        "second": pair.second.label,
-        "factor": pair.factor,
-        "first_count": f"{pair.first.successes}/{pair.first.episodes}",
-        "second_count": f"{pair.second.successes}/{pair.second.episodes}",
-        "split": f"{pair.first_only} : {pair.second_only}",
-        "episodes": pair.episodes,
-        "p": text.probability(pair.p),
-        "adjusted": text.probability(pair.adjusted),
-        "sure": pair.adjusted < 0.05,
-    }
-
-
-def _missing(groups: Sequence[Group]) -> list[dict[str, Any]]:
-    """Return what has no result, one row for each condition, state and reason."""
-    rows: dict[tuple[str, ...], list[int]] = {}
-    for item in groups:
-        for cell in item.missing:
-            key = (item.condition.task, item.label, cell.state, " ".join(cell.reason.split()))
-            rows.setdefault(key, []).append(cell.seed)
-    return [
-        {"task": task, "policy": policy, "seeds": ", ".join(map(str, seeds)), "state": state, "reason": reason}
-        for (task, policy, state, reason), seeds in rows.items()
-    ]
-
-
-def _filters(groups: Sequence[Group]) -> list[tuple[str, list[str]]]:
-    """Return what the table can be filtered by: name, values; a single value is no choice."""
-    values = {
-        "task": [item.condition.task for item in groups],
-        "encoder": [item.condition.encoder for item in groups],
-        "views": [item.condition.view or text.ABSENT for item in groups],
-    }
-    found = [(name, list(dict.fromkeys(column))) for name, column in values.items()]
-    return [(name, column) for name, column in found if len(column) > 1]
-
-
-def _kinds(groups: Sequence[Group]) -> list[str]:
-    found = {kind for item in groups for kind in item.failures}
-    return [kind for kind in KINDS if kind in found]
-
-
-def _caption(groups: Sequence[Group]) -> str:
-    """Say what the numbers are and how the episodes were judged."""
-    results = [result for item in groups for result in item.results]
-    if not results:
-        return ""
-    config = results[0].config
-    first, last = (pick(row["seed"] for result in results for row in result.rows) for pick in (min, max))
-    kinds = {
-        "missed": "never touched the needle",
-        "dropped": "lost it",
-        "wrong_hole": "went into another hole",
-        "time": "held it when the time was over",
-        "physics": "diverged physics",
-        "error": "no start or no finite action",
-    }
-    failures = "; ".join(f"{kind.replace('_', ' ')} = {kinds[kind]}" for kind in _kinds(groups))
-    return (
-        f"Successes of n episodes with the exact (Clopper–Pearson) interval; the same starts, seeds {first}–{last}, "
-        "for every policy. Trajectory length and time steps: mean ± standard deviation over successful episodes"
-        + (f", of at most {config.max_steps} steps. " if len({r.config.max_steps for r in results}) == 1 else ". ")
-        + (f"Failures: {failures}. " if failures else "")
-        + f"Grasp by {config.scene.grasp}, {config.tolerance} tolerances."
-    )
-
-
-def _short(reason: str, most: int = 160) -> str:
-    line = " ".join(reason.split())
-    return line if len(line) <= most else line[: most - 1] + "…"
 
 
 def details(groups: Sequence[Group], reel: Reel, commands: dict[str, list[str]]) -> Markup:

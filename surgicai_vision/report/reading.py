@@ -5,6 +5,7 @@ the training seed, and the shift under which it was evaluated.
 """
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,6 +18,8 @@ from surgicai_vision.errors import BadFile
 from surgicai_vision.results import MARKER, find_evaluations, read_rows
 
 RUN_FILE, GRID_FILE, CELL_FILE, FAILED_FILE = "run.json", "sweep.json", "cell.json", "failed.json"
+WORK = "work"
+"""Folder of a sweep in which its jobs are at work."""
 REFERENCES = ("expert", "random", "zero", "replay")
 """Policies that were not trained: what the trained ones stand beside."""
 PROBES = ("probes.parquet", "probe.json")
@@ -88,6 +91,8 @@ class Result:
     about: dict[str, Any]
     rows: list[dict[str, Any]]
     cell: dict[str, Any] = field(default_factory=dict)
+    place: str = ""
+    """Where it stands, if another evaluation of the same condition and training seed stands elsewhere."""
 
     @property
     def trained(self) -> bool:
@@ -117,6 +122,7 @@ class Result:
         base = condition_of(self.cell) if self.cell else self._condition()
         return replace(
             base,
+            variant=" · ".join(part for part in (base.variant, self.place) if part),
             axis=str(shift.get("axis") or ""),
             strength=float(shift.get("strength") or 0.0),
             swap=str(self.about.get("swap") or base.swap),
@@ -185,14 +191,28 @@ def read_results(folder: Path, grid: dict[str, Any] | None = None, empty: bool =
     """Read all evaluations below `folder`; trained policies first."""
     results = []
     shared = _shared(grid or {})
+    work = folder / WORK if grid else None  # what a running sweep has not filed yet
     for place in find_evaluations(folder):
+        if work in place.parents:
+            continue
         stored = files.read_json(place / MARKER)
         cell = _json(place.parent / CELL_FILE).get("cell", {})
         mapping = {**shared, **_filled(cell)} if cell else {}
         results.append(Result(place, stored["summary"], stored["about"], read_rows(place), mapping))
     if not results and not empty:
         raise BadFile(f"{folder} holds no evaluation; run `surgicai-vision evaluate POLICY --out {folder}` first.")
-    return sorted(results, key=lambda result: (*order(result.condition), result.seed))
+    return sorted(_told_apart(results, folder), key=lambda result: (*order(result.condition), result.seed))
+
+
+def _told_apart(results: Sequence[Result], folder: Path) -> list[Result]:
+    """Name evaluations of the same condition and training seed by their folders: counted together they count twice."""
+    count = Counter((result.condition, result.seed) for result in results)
+    return [
+        replace(result, place=str(result.folder.relative_to(folder)))
+        if count[result.condition, result.seed] > 1
+        else result
+        for result in results
+    ]
 
 
 def condition_of(cell: Mapping[str, Any]) -> Condition:
