@@ -451,7 +451,7 @@ def test_topics_that_are_not_there_are_refused_with_those_that_are(trial, tmp_pa
             BagConfig(topics=Topics(needle="/needle")),
             r"no topic /needle \(needle\); it has /needle/measured_cp \(geom",
         ),
-        (BagConfig("ambf"), r"none of /CRTK/psm1/measured_cp, .*The topics are /PSM1/jaw/measured_js"),
+        (BagConfig("ambf"), r"none of /CRTK/psm1/measured_cp, .*The topics are /PSM1/measured_cp \(geom"),
         (
             BagConfig(topics=Topics(needle="/PSM1/jaw/measured_js")),
             "holds sensor_msgs/JointState; needle is read from",

@@ -1,5 +1,6 @@
 """Importing SurgicAI's recordings: what comes in is checked, what comes out stands where the recording says."""
 
+import dataclasses
 import os
 import pickle
 import subprocess
@@ -12,7 +13,15 @@ from surgicai_vision import names
 from surgicai_vision.config import STEPS
 from surgicai_vision.demos import foreign, replay, surgicai
 from surgicai_vision.demos.foreign import read_foreign
-from surgicai_vision.demos.importing import check_task, import_demos, infer_step, split
+from surgicai_vision.demos.importing import (
+    check_task,
+    import_demos,
+    infer_step,
+    is_wound,
+    roomy,
+    split,
+    unwound,
+)
 from surgicai_vision.demos.store import read_demo, read_marker
 from surgicai_vision.errors import BadFile, InputError, OutputExists, UnknownName
 from surgicai_vision.scene import kinematics, needle
@@ -140,6 +149,41 @@ def test_the_step_preset_is_inferred_and_deviations_counted(step):
     episodes[0].action[:] = 0.0
     with pytest.raises(InputError, match="No step size explains the motion"):
         infer_step(episodes)
+
+
+def test_a_step_that_is_no_preset_gets_the_smallest_larger_one():
+    """The first release's insertions: 0.25 mm, 2°."""
+    episodes = split(as_arrays(transitions(1, "paper")))
+    finer = dataclasses.replace(episodes[0], pose=episodes[0].pose * np.array([0.5, 0.5, 0.5, 1, 1, 1, 1]))
+    assert infer_step([finer]) == ("paper", 0)
+    coarser = dataclasses.replace(episodes[0], pose=episodes[0].pose * np.array([8, 8, 8, 1, 1, 1, 1]))
+    with pytest.raises(InputError, match="No step size explains the motion"):
+        infer_step([coarser])
+
+
+def test_the_yaw_goes_the_short_way():
+    episode = split(as_arrays(transitions(1)))[0]
+    yaw = np.linspace(3.0, 3.0 - 4.2, len(episode.pose))
+    wound = dataclasses.replace(episode, pose=np.column_stack([episode.pose[:, :5], yaw, episode.pose[:, 6]]))
+    short = unwound(wound)
+    assert (is_wound(wound), is_wound(short)) == (True, False)
+    assert is_wound(episode) is False
+    for row in (0, -1):
+        same, wanted = (replay.pose_matrix(some.pose[row]) for some in (short, wound))
+        np.testing.assert_allclose(same, wanted, atol=1e-12)
+    np.testing.assert_array_equal(short.pose[:, :5], wound.pose[:, :5])
+    assert np.abs(np.diff(short.pose[:, 5])).sum() == pytest.approx(2 * np.pi - 4.2)
+
+
+def test_actions_that_do_not_fit_the_inferred_step_get_a_larger_one():
+    """Roll, pitch and yaw at once make a rotation vector longer than each."""
+    episode = split(as_arrays(transitions(1, "paper")))[0]
+    assert roomy([episode], "paper") == "paper"
+    count = len(episode.pose)
+    turning = episode.pose.copy()
+    turning[:, 4] = 0.9
+    turning[:, 3], turning[:, 5] = np.radians(1.5) * np.arange(count), -np.radians(1.5) * np.arange(count)
+    assert roomy([dataclasses.replace(episode, pose=turning)], "paper") == "released"
 
 
 def as_arrays(rows):
@@ -302,3 +346,9 @@ def test_the_original_pickle_is_imported_whole(tmp_path, shared):
     assert (summary.disagreeing, summary.clipped, summary.skipped) == (0, 0, ())
     assert read_marker(tmp_path / "demos")["task"] == "handoff"
     assert all(read_demo(path).success[-1] for path in summary.paths)
+
+
+def test_insertions_that_turn_the_long_way_are_imported_too(tmp_path, shared):
+    summary = import_demos(shared / "surgicai/surgicai_insert_v2.npz", task="insert", out=tmp_path / "demos")
+    assert (len(summary.paths), summary.skipped, summary.clipped) == (50, (), 0)
+    assert summary.unwound == 25

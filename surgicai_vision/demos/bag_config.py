@@ -49,10 +49,13 @@ def clean(text: object, longest: int = 80) -> str:
 
 def listed(topics: Collection[str], wanted: str) -> str:
     """Return topics as one line, those like the wanted one first, as many as can be read."""
-    near = difflib.get_close_matches(wanted, topics, n=len(topics) or 1, cutoff=0.3)
     shown: list[str] = []
     room = 450
-    for topic in [*near, *sorted(set(topics) - set(near))]:
+
+    def unlike(topic: str) -> tuple[float, str]:
+        return -difflib.SequenceMatcher(None, wanted, topic.split(" ")[0]).ratio(), topic
+
+    for topic in sorted(topics, key=unlike):
         room -= len(topic) + 2
         if room < 0:
             return f"{', '.join(shown)} and {len(topics) - len(shown)} more"

@@ -23,15 +23,13 @@ from surgicai_vision.config import STEPS, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.demos.bag_config import BagConfig
 from surgicai_vision.demos.bag_pieces import Piece, take_apart
 from surgicai_vision.demos.record import finished
-from surgicai_vision.demos.replay import Replay, Track, moves
+from surgicai_vision.demos.replay import MOST_CLIPPED, Replay, Track, moves
 from surgicai_vision.demos.segments import held
 from surgicai_vision.demos.store import MARKER, Demo, list_demos, read_marker, write_demo, write_marker
 from surgicai_vision.errors import InputError, UnreachablePose, check_name
 from surgicai_vision.executor import Progress, building
 from surgicai_vision.files import check_output, code_version, sha256_file, whole_folder
 
-MOST_CLIPPED = 0.01
-"""Largest share of a task's steps that may exceed a step preset for it to serve."""
 Row = Mapping[str, Any]
 
 
@@ -163,13 +161,13 @@ def _build(
 
 
 def fastest(task: str, tracks: Sequence[Track]) -> str:
-    """Return the smallest step preset that nearly every step of some tracks stays within, or the largest."""
+    """Return the smallest step preset that nearly all steps of some tracks fit into, or the one that most fit into."""
     arm = names.ACTIVE_ARM[task]
     total = sum(len(track.needle) - 1 for track in tracks)
-    for step in STEPS:
-        if sum(moves(*track.arms[arm], step)[1] for track in tracks) <= MOST_CLIPPED * total:
-            return step
-    return step
+    clipped = {step: sum(moves(*track.arms[arm], step)[1] for track in tracks) for step in STEPS}
+    return next(
+        (step for step in STEPS if clipped[step] <= MOST_CLIPPED * total), min(STEPS, key=lambda s: clipped[s])
+    )
 
 
 def demonstration(replay: Replay, track: Track) -> tuple[Demo, int]:

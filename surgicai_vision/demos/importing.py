@@ -3,10 +3,14 @@
     summary = import_demos(Path("regrasp_all_episodes_merged.pkl"), task="handoff", out=Path("demos"))
 
 Read (`foreign`), cut into episodes, check that the motion can be the task's, infer the step preset, replay
-(`replay`), write. The recorded rotation increments are roll, pitch and yaw; ours are rotation vectors in the
-base's axes, so actions are recomputed from the poses and the recorded ones only tell the step preset.
+(`replay`), write. Half of the released insertions, and a few placements, turn the long way round, because the released
+code compares yaw angles without unwrapping them; our arm's roll joint cannot follow, so they are `unwound`: the same
+path, with the yaw going the short way at the same times. The recorded rotation increments are roll, pitch and yaw;
+ours are rotation vectors in the base's axes, so actions are recomputed from the poses and the recorded ones only tell
+the step size. Where more than one in a hundred would not fit into it, the next larger preset is taken.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +22,7 @@ from surgicai_vision import names
 from surgicai_vision.config import STEPS, TaskConfig
 from surgicai_vision.demos.foreign import read_foreign
 from surgicai_vision.demos.record import finished
-from surgicai_vision.demos.replay import Episode, Replay, grip_error, trimmed
+from surgicai_vision.demos.replay import MOST_CLIPPED, Episode, Replay, actions, grip_error, trimmed
 from surgicai_vision.demos.store import MARKER, list_demos, read_marker, write_demo, write_marker
 from surgicai_vision.errors import BadFile, InputError, UnreachablePose, check_name
 from surgicai_vision.executor import Progress, building
@@ -43,6 +47,7 @@ class ImportSummary:
         disagreeing: steps that differ from action × step size by more than `AGREEMENT`.
         clipped: steps whose action left [-1, 1] on conversion and was clipped.
         skipped: episodes that could not be replayed, {"episode", "reason"}.
+        unwound: episodes whose yaw was sent the short way.
     """
 
     paths: tuple[Path, ...]
@@ -51,6 +56,7 @@ class ImportSummary:
     disagreeing: int
     clipped: int
     skipped: tuple[Mapping[str, Any], ...]
+    unwound: int = 0
 
 
 def import_demos(file: Path, *, task: str, out: Path, progress: Progress | None = None) -> ImportSummary:
@@ -77,11 +83,14 @@ def import_demos(file: Path, *, task: str, out: Path, progress: Progress | None 
         check_task(episodes, task)
         episodes = [trimmed(episode, task) for episode in episodes]
         step, disagreeing = infer_step(episodes)
+        wound = sum(is_wound(episode) for episode in episodes)
+        episodes = [unwound(episode) for episode in episodes]
+        step = roomy(episodes, step)
         limit = max(STEP_LIMIT, *(len(episode.action) for episode in episodes))
         config = TaskConfig(task, step=step, tolerance="released", reward="dense", max_steps=limit)
         with building(out) as (_, result), whole_folder(result) as folder:
             notes, skipped = _write(folder, episodes, config, progress or (lambda done, total, unit: None))
-            notes.update(step=step, steps=sum(len(e.action) for e in episodes), disagreeing=disagreeing)
+            notes.update(step=step, steps=sum(len(e.action) for e in episodes), disagreeing=disagreeing, unwound=wound)
             kept = len(episodes) - len(skipped)
             details = {"request": request, "skipped": skipped, "episodes": kept, "notes": notes}
             write_marker(folder, task, "surgicai", code=code_version(), **details)
@@ -162,18 +171,73 @@ def check_task(episodes: list[Episode], task: str) -> None:
         )
 
 
+def roomy(episodes: list[Episode], step: str) -> str:
+    """Return the smallest preset from `step` on that nearly all actions fit into, or the one that most fit into."""
+    total = sum(len(episode.action) for episode in episodes)
+    sizes = list(STEPS)[list(STEPS).index(step) :]
+    clipped = {size: sum(actions(episode, size)[1] for episode in episodes) for size in sizes}
+    return next(
+        (size for size in sizes if clipped[size] <= MOST_CLIPPED * total), min(sizes, key=lambda s: clipped[s])
+    )
+
+
+def is_wound(episode: Episode) -> bool:
+    """Say whether an episode turns further than half a turn in yaw."""
+    return bool(abs(episode.pose[-1, 5] - episode.pose[0, 5]) > np.pi)
+
+
+def unwound(episode: Episode) -> Episode:
+    """Return an episode whose yaw ends where it ended, but goes there the short way."""
+    if not is_wound(episode):
+        return episode
+    travel = episode.pose[-1, 5] - episode.pose[0, 5]
+    short = travel - 2 * np.pi * np.round(travel / (2 * np.pi))
+    pose = episode.pose.copy()
+    pose[:, 5] = pose[0, 5] + (pose[:, 5] - pose[0, 5]) * short / travel
+    return dataclasses.replace(episode, pose=pose)
+
+
 def infer_step(episodes: list[Episode]) -> tuple[str, int]:
-    """Return the step preset that explains the motion best, and the steps it does not explain."""
+    """Return the step preset that explains the motion best, and the steps it does not explain.
+
+    The first release's insertions have a step of 0.25 mm, which is no preset of ours: a motion that any other constant
+    step explains gets the smallest preset that is as large.
+
+    Raises:
+        InputError: no constant step explains the motion.
+    """
     moves = np.concatenate([np.diff(episode.pose, axis=0) for episode in episodes])
-    actions = np.concatenate([episode.action for episode in episodes])
-    wrong = {}
-    for name, (metres, degrees, jaw) in STEPS.items():
-        sizes = np.array([metres] * 3 + [np.radians(degrees)] * 3 + [jaw])
-        wrong[name] = int((np.abs(moves / sizes - actions) > AGREEMENT).any(axis=1).sum())
+    told = np.concatenate([episode.action for episode in episodes])
+    sizes = {
+        name: np.array([metres] * 3 + [np.radians(degrees)] * 3 + [jaw])
+        for name, (metres, degrees, jaw) in STEPS.items()
+    }
+    wrong = {name: _unexplained(moves, told, size) for name, size in sizes.items()}
     best = min(wrong, key=lambda name: wrong[name])
-    if wrong[best] > len(actions) // 2:
+    if wrong[best] <= len(told) // 2:
+        return best, wrong[best]
+    own = _fitted(moves, told)
+    disagreeing = _unexplained(moves, told, own)
+    larger = [name for name, size in sizes.items() if (own[:6] <= size[:6] * (1.0 + AGREEMENT)).all()]
+    if disagreeing > len(told) // 2 or not larger:
         raise InputError(
-            f"No step size explains the motion: {wrong[best]} of {len(actions)} steps differ from action × step "
+            f"No step size explains the motion: {wrong[best]} of {len(told)} steps differ from action × step "
             f"even for '{best}'; is this a recording of SurgicAI?"
         )
-    return best, wrong[best]
+    return larger[0], disagreeing
+
+
+def _unexplained(moves: np.ndarray, actions: np.ndarray, size: np.ndarray) -> int:
+    """Return how many moves (N, 7) are not action × size (7,)."""
+    return int((np.abs(moves / size - actions) > AGREEMENT).any(axis=1).sum())
+
+
+def _fitted(moves: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Return the step size (7,) of a motion: the median of move over action, for translation and for rotation."""
+    size = np.full(7, STEPS["paper"][2])
+    for part in (slice(0, 3), slice(3, 6)):
+        told = np.abs(actions[:, part]) > AGREEMENT
+        size[part] = (
+            np.median((moves[:, part] / np.where(told, actions[:, part], 1.0))[told]) if told.any() else np.inf
+        )
+    return np.maximum(size, 1e-9)

@@ -41,6 +41,8 @@ LIFT = 0.005
 GRASP_ANGLE, HANDOFF_ANGLE, INSERT_ANGLE = (float(angle) for angle in np.radians([17.5, 105.0, 100.0]))
 INSERT_DEPTH = 0.002
 """Distance of the needle's 100° point beyond the exit at the goal of insert [m]."""
+MOST_CLIPPED = 0.01
+"""Largest share of a recording's steps that may exceed a step preset for it to serve."""
 HOLD_ANGLES = np.radians([15.0, 20.0, 25.0, 30.0, 10.0, 35.0, 40.0, 5.0])
 """Points of the needle at which PSM2 may hold it during the handoff, tried in this order: SurgicAI draws its
 grasps from 10°–50° after the approach's 5°–20°."""
