@@ -31,6 +31,8 @@ RATES = (0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 0.9, 0.95, 0.98)
 CORRELATIONS = (0.0, 0.05, 0.1, 0.2)
 SIZES = ((3, 20), (5, 20), (10, 20))
 PAPER = (5, 20)
+LENGTHS = 5
+"""Times as many repeats for lengths: few rows, and an interval that covers little more than it must."""
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 Interval = tuple[float, float]
@@ -128,9 +130,9 @@ def measure(repeats: int, resamples: int) -> dict[str, Any]:
         result[kind] = table(rows, repeats)
     rows = []
     for seeds, scatter in ((3, 0.0), (3, 10.0), (5, 0.0), (5, 3.0), (5, 10.0)):
-        share, width = count(lengths(seeds, 20, scatter, repeats, resamples))
+        share, width = count(lengths(seeds, 20, scatter, LENGTHS * repeats, resamples))
         rows.append({"seeds": seeds, "scatter_mm": scatter, "coverage": round(share, 4), "width": round(width, 1)})
-    result["lengths"] = table(rows, repeats)
+    result["lengths"] = table(rows, LENGTHS * repeats)
     shares = {spread: count(areas(20, spread, repeats)) for spread in (0.1, 0.3, 1.0, 5.0)}
     rows = [{"spread": key, "coverage": round(c, 4), "width": round(w, 3)} for key, (c, w) in shares.items()]
     result["area"] = table(rows, repeats)
