@@ -116,7 +116,9 @@ def test_cache_lists_measures_and_prunes(capsys: pytest.CaptureFixture[str]) -> 
     assert [(row["encoder"], row["view"], row["length"]) for row in listed["entries"]].count(("tiny", "back", 40)) == 1
     assert run(capsys, "cache", "size")["bytes"] == listed["bytes"] > 0
     assert run(capsys, "cache", "prune", "--keep", "the/dataset")["entries"] == []
-    assert len(run(capsys, "cache", "prune")["entries"]) == 2
+    assert "either --keep DIR or --all" in fails(capsys, "cache", "prune")
+    assert "takes neither" in fails(capsys, "cache", "list", "--all")
+    assert len(run(capsys, "cache", "prune", "--all")["entries"]) == 2
     assert run(capsys, "cache", "size")["bytes"] == 0
     assert "Did you mean 'prune'" in fails(capsys, "cache", "prun")
 

@@ -8,6 +8,7 @@ from typing import Any
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import one_of, option
+from surgicai_vision.errors import InputError
 
 EXAMPLE = "surgicai-vision cache list"
 ACTIONS = ("list", "size", "prune")
@@ -23,13 +24,19 @@ class Options:
     keep: tuple[str, ...] = option(
         (), "datasets whose features prune keeps, a comma list of folders", metavar="DIR[,DIR]"
     )
+    all: bool = option(False, "prune every entry")
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Show the entries, or delete those of no dataset that is kept."""
     from surgicai_vision.features import default_cache_root, list_cache, prune_cache
 
-    if options.action == "prune":
+    prune = options.action == "prune"
+    if not prune and (options.keep or options.all):
+        raise InputError(f"--keep and --all say what prune deletes; '{options.action}' takes neither.")
+    if prune and bool(options.keep) == options.all:
+        raise InputError(f"prune deletes features in {default_cache_root()}; give either --keep DIR or --all.")
+    if prune:
         kept = {folders.open_dataset(folder, "", ()).fingerprint for folder in options.keep}
         entries = prune_cache(keep_datasets=kept)
     else:
@@ -38,7 +45,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         for entry in entries:
             console.say(f"{entry.folder.name[:12]}  {_mb(entry.size):>10}  {_text(entry.manifest)}")
     total = sum(entry.size for entry in entries)
-    said = "removed" if options.action == "prune" else "held"
+    said = "removed" if prune else "held"
     console.say(f"{len(entries)} entries, {_mb(total)} {said} in {default_cache_root()}")
     rows = [_row(entry.folder, entry.size, entry.manifest) for entry in entries]
     return {"action": options.action, "entries": rows, "bytes": total, "folder": str(default_cache_root())}

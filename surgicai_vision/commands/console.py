@@ -51,7 +51,8 @@ class Console:
         try:
             yield move
         finally:
-            bars.stop()
+            if bars.live.is_started:
+                bars.stop()
 
 
 @final

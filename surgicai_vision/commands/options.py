@@ -67,6 +67,12 @@ def positive(name: str, value: float | None) -> None:
         raise InputError(f"{name} is {value}; it must be at least 1.")
 
 
+def picture_size(name: str, value: int) -> None:
+    """Refuse a size that the renderer has no room for [px]."""
+    if not 16 <= value <= 960:
+        raise InputError(f"{name} is {value}; it must be within 16 and 960 pixels.")
+
+
 def not_negative(name: str, value: float | None) -> None:
     """Refuse a number below 0."""
     if value is not None and value < 0:

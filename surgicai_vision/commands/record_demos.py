@@ -63,6 +63,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     from surgicai_vision.executor import Engine
     from surgicai_vision.statistics import clopper_pearson
 
+    if options.noise_from is not None and options.noise_from > options.noise:
+        raise InputError(f"--noise-from is {options.noise_from:g}; it must be at most --noise, {options.noise:g}.")
     engine = Engine(options.executor, options.address)
     config = task_config(options.task, options.env)
     out = Path(options.out) if options.out else folders.demos_folder(options.task)

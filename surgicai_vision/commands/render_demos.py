@@ -16,6 +16,7 @@ from surgicai_vision.commands.options import (
     not_negative,
     one_of,
     option,
+    picture_size,
     positive,
 )
 from surgicai_vision.errors import InputError
@@ -44,7 +45,7 @@ class Options:
     view: tuple[str, ...] = option(
         ("front", "back"), "views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]"
     )
-    size: int = option(224, "height and width of pictures [px]", check=positive, metavar="PX")
+    size: int = option(224, "height and width of pictures [px]", check=picture_size, metavar="PX")
     depth: bool = option(False, "render depth beside RGB")
     segmentation: bool = option(False, "render the parts beside RGB")
     video: str | None = option(

@@ -7,7 +7,15 @@ from typing import Any
 from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import config_only, many_of, not_negative, one_of, option, positive, task_config
+from surgicai_vision.commands.options import (
+    config_only,
+    many_of,
+    not_negative,
+    one_of,
+    option,
+    picture_size,
+    task_config,
+)
 from surgicai_vision.errors import InputError
 
 EXAMPLE = "surgicai-vision scene --task grasp --seed 0 --sheet sheet.png"
@@ -24,7 +32,7 @@ class Options:
     view: tuple[str, ...] = option(
         names.CAMERAS, "views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]"
     )
-    size: int = option(336, "height and width of each picture [px]", check=positive, metavar="PX")
+    size: int = option(336, "height and width of each picture [px]", check=picture_size, metavar="PX")
     quality: str = option("high", "fast (as datasets are rendered) or high", check=one_of("quality", QUALITIES))
     sheet: str | None = option(None, "where to write it", metavar="FILE.png", default_text="outputs/scene-<task>.png")
     film: str | None = option(
