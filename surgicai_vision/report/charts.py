@@ -69,19 +69,33 @@ def _luminance(*channels: int) -> float:
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
-def interval(rate: float, low: float, high: float, label: str, paper: float | None = None) -> Markup:
-    """Draw a rate with its interval on an axis from 0 to 1; the paper's rate as a hollow diamond."""
+def interval(
+    rate: float, low: float, high: float, label: str, paper: tuple[float, float, float] | None = None
+) -> Markup:
+    """Draw a rate with its interval on an axis from 0 to 1; below it the paper's rate and interval, where it has one.
+
+    Args:
+        rate: ours.
+        low: lower bound of its interval.
+        high: upper bound.
+        label: what a screen reader says.
+        paper: rate, lower and upper bound.
+    """
+    y = 12 if paper is None else 7
     x = [8 + 160 * value for value in (low, high, rate)]
-    diamond = ""
+    theirs = ""
     if paper is not None:
-        at = 8 + 160 * paper
-        diamond = f'<path class="paper" d="M{at:.1f} 5 l6 7 l-6 7 l-6 -7 z"/>'
+        at, left, right = (8 + 160 * value for value in paper)
+        theirs = (
+            f'<line class="paper-range" x1="{left:.1f}" x2="{right:.1f}" y1="18" y2="18"/>'
+            f'<path class="paper" d="M{at:.1f} 13 l4.5 5 l-4.5 5 l-4.5 -5 z"/>'
+        )
     return Markup(
         f'<svg class="interval" viewBox="0 0 176 24" role="img" aria-label="{escape(label)}">'
         '<line class="axis" x1="8" x2="168" y1="12" y2="12"/><line class="axis" x1="8" x2="8" y1="6" y2="18"/>'
         '<line class="axis" x1="88" x2="88" y1="9" y2="15"/><line class="axis" x1="168" x2="168" y1="6" y2="18"/>'
-        f'<line class="range" x1="{x[0]:.1f}" x2="{x[1]:.1f}" y1="12" y2="12"/>'
-        f'<circle class="point" cx="{x[2]:.1f}" cy="12" r="5"/>{diamond}</svg>'
+        f'<line class="range" x1="{x[0]:.1f}" x2="{x[1]:.1f}" y1="{y}" y2="{y}"/>'
+        f'<circle class="point" cx="{x[2]:.1f}" cy="{y}" r="{5 if paper is None else 4.5}"/>{theirs}</svg>'
     )
 
 

@@ -11,6 +11,7 @@ from surgicai_vision.report.beside import beside_paper, our_text, paper_text
 from surgicai_vision.report.groups import KINDS, MEASURES, Group, of_task
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.reading import Condition
+from surgicai_vision.statistics import clopper_pearson
 
 PAIRS_SHOWN = 12
 
@@ -24,7 +25,7 @@ def paper_rows(groups: Sequence[Group], index: dict[Condition, int]) -> list[dic
             evaluated = item is not None and item.episodes > 0
             drawing = Markup("")
             if item is not None and evaluated:
-                drawing = charts.interval(item.rate, *item.interval, our_text(item), rate)
+                drawing = charts.interval(item.rate, *item.interval, our_text(item), _of_paper(rate))
             count = f"{item.successes}/{item.episodes}" if item is not None and evaluated else our_text(item)
             cells.append(
                 {
@@ -38,6 +39,13 @@ def paper_rows(groups: Sequence[Group], index: dict[Condition, int]) -> list[dic
             )
         rows.append({"task": task, "encoder": encoder, "cells": cells, "starts": not rows or rows[-1]["task"] != task})
     return rows
+
+
+def _of_paper(rate: float | None) -> tuple[float, float, float] | None:
+    """Return the paper's rate with the exact interval of its episodes."""
+    if rate is None:
+        return None
+    return rate, *clopper_pearson(round(rate * paper.EPISODES), paper.EPISODES)
 
 
 def ceilings(groups: Sequence[Group]) -> str:
