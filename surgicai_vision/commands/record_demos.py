@@ -94,6 +94,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         "task": options.task,
         "episodes": len(paths),
         "starts": tried,
+        "share": len(paths) / tried,
         "interval": [low, high],
         "demos": str(out),
     }
