@@ -12,6 +12,8 @@ from sweep_results import COMMAND, TASKS, add_curves, cell, evaluation, store_ce
 from test_report import assert_stands_alone, painted_stage
 
 from surgicai_vision import pictures, report, statistics
+from surgicai_vision.cli import main
+from surgicai_vision.commands.report import Options
 from surgicai_vision.report import beside, charts, films, formats, paper
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.pairs import compare, factor
@@ -137,6 +139,24 @@ def test_a_plans_cells_that_nobody_came_to_are_pending(tmp_path):
         ("clip", 3, "not run"), ("imagenet", 0, "pending"),
     ]  # fmt: skip
     assert missing[0].reason == "no weights"
+
+
+def test_what_could_not_be_run_where_the_sweep_ran_stays_not_run_here(tmp_path):
+    write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
+    plan = [{**cell("grasp", "r3m", ("back",), 0), "state": "to do", "key": "a", "reason": ""}]
+    (missing,) = collect(tmp_path, plan).missing
+    assert (missing.state, missing.reason) == ("not run", "R3M's weights are not here; see its card.")
+
+
+def test_the_command_reports_a_sweep_whose_grid_it_cannot_read(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(pictures, "stage", painted_stage)
+    write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
+    assert main(["report", str(tmp_path), "--strips", "2", "--json"]) == 0
+    said = capsys.readouterr()
+    told = json.loads(said.out.splitlines()[-1])
+    assert (told["evaluations"], told["missing"]) == (5, 1)
+    assert "grid cannot be read" in said.err
+    assert Options(str(tmp_path)).strips == films.MOST_STRIPS
 
 
 def test_a_folder_where_every_cell_failed_has_a_report(tmp_path, monkeypatch):

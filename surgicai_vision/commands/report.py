@@ -8,7 +8,7 @@ from typing import Any
 
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import not_negative, option
-from surgicai_vision.errors import BadFile
+from surgicai_vision.errors import BadFile, SurgicaiError
 
 EXAMPLE = "surgicai-vision report outputs/quickstart"
 STRIPS = 160
@@ -24,7 +24,12 @@ class Options:
     out: str | None = option(
         None, "where to write the page; tables/ stands beside it", metavar="FILE.html", default_text="DIR/report.html"
     )
-    strips: int = option(STRIPS, "film strips at most, as far as the page's budget allows", check=not_negative)
+    strips: int = option(
+        STRIPS,
+        "film strips at most, as far as the page's budget allows",
+        check=not_negative,
+        metavar="N",
+    )
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
@@ -35,7 +40,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     folder = Path(options.dir)
     if not folder.is_dir():
         raise BadFile(f"{folder} is no folder; give one that quickstart, evaluate or sweep has written.")
-    cells = _cells(folder)
+    cells = _cells(folder, console)
     found = collect(folder, cells)
     with console.stage("report", "parts") as progress:
         out = Path(options.out) if options.out else None
@@ -47,8 +52,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     return {"report": str(page), "tables": str(tables), **counts, "bytes": page.stat().st_size}
 
 
-def _cells(folder: Path) -> Sequence[Mapping[str, Any]]:
-    """Return every cell of the sweep in `folder` with its state; nothing where it is no sweep."""
+def _cells(folder: Path, console: Console) -> Sequence[Mapping[str, Any]]:
+    """Return every cell of the sweep in `folder` with its state; nothing where it is no sweep, or not one of ours."""
     from surgicai_vision.config import from_mapping, to_mapping
     from surgicai_vision.files import read_json
     from surgicai_vision.report import GRID_FILE
@@ -57,8 +62,11 @@ def _cells(folder: Path) -> Sequence[Mapping[str, Any]]:
     path = folder / GRID_FILE
     if not path.exists():
         return ()
-    grid = from_mapping(Grid, read_json(path), str(path))
-    states = plan(grid, folder)
+    try:
+        states = plan(from_mapping(Grid, read_json(path), str(path)), folder)
+    except SurgicaiError as error:
+        console.note(f"The grid cannot be read here, so only cells with a result or a record are reported: {error}")
+        return ()
     return [
         {**to_mapping(state.cell), "key": state.key, "state": state.state, "reason": state.reason} for state in states
     ]

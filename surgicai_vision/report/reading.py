@@ -268,10 +268,15 @@ def _missing(
             state = PENDING if cell["state"] == "to do" else str(cell["state"])
             reason = str(cell.get("reason") or "the sweep has not come to it yet")
             add(cell, state, reason, str(cell.get("key", "")))
-    for line in () if cells else run.get("not_run", []):
+    for line in run.get("not_run", []):
         noted = _noted(str(line), shared)
-        if noted and (noted.condition, noted.seed) not in done:
-            found.setdefault((noted.condition, noted.seed), noted)
+        if noted is None or (noted.condition, noted.seed) in done:
+            continue
+        key = noted.condition, noted.seed
+        if key in found and found[key].state == PENDING:
+            found[key] = noted  # where the sweep ran, it could not be run; here it could
+        elif not cells:
+            found.setdefault(key, noted)
     return sorted(found.values(), key=lambda item: (*order(item.condition), item.seed))
 
 
