@@ -20,8 +20,8 @@ from surgicai_vision.scene.rotations import multiply_flat, rotvec_to_matrix_flat
 JAW_OPEN = 1.0
 """Largest commanded jaw angle [rad]; 0 is closed."""
 SQUEEZE, SQUEEZE_BELOW = 0.3, 0.1
-"""Below a command of 0.1 rad the jaw's servo is led up to 0.3 rad past it: the motor's torque limit then sets the
-force of the grip."""
+"""Below a command of 0.1 rad the jaw's servo is led up to 0.3 rad past it, gently at first: the motor's torque limit
+then sets the force of the grip, and the pads do not slam."""
 WORKSPACE = ((-0.09, -0.09, 0.060), (0.09, 0.14, 0.165))
 """Corners of the box the tips may move in [m, world]."""
 
@@ -90,4 +90,4 @@ def in_workspace(pose: Pose, base: Pose) -> bool:
 
 def jaw_servo(jaw: float) -> float:
     """Return the servo's set point for a commanded jaw angle [rad]."""
-    return jaw - SQUEEZE * max(0.0, 1.0 - jaw / SQUEEZE_BELOW)
+    return jaw - SQUEEZE * max(0.0, 1.0 - jaw / SQUEEZE_BELOW) ** 2
