@@ -27,9 +27,9 @@ PAD_OFFSET = BODY_RADIUS - 0.00005
 JAW_LIMITS = (-0.06, 1.0)
 """Angle of each finger [rad]; below 0 only when the jaws close on nothing."""
 JAW_GAIN, JAW_TORQUE, JAW_ARMATURE = 1.0, 0.05, 1e-4
-"""[N·m/rad, N·m, kg·m²]: the coupled fingers' servo has 70 rad/s. With an armature of 1e-5 (220 rad/s) the closing jaws
-struck the needle at 12 rad/s, 0.25 mm of the pads' way in one physics step: with friction drawn 15 % lower it shot out
-of them in one grasp of three."""
+"""[N·m/rad, N·m, kg·m²]: the coupled fingers' servo has 70 rad/s. With an armature of 1e-5 (220 rad/s) the closing
+jaws struck the needle at 12 rad/s, 0.25 mm of the pads' way in one physics step: with friction drawn 15 % lower it
+shot out of them in one grasp of three."""
 SHAFT_RADIUS, SHAFT_LENGTH = 0.004, 0.36
 WRIST_RADIUS = 0.003
 BANDWIDTH = 100.0
