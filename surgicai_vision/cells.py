@@ -320,7 +320,7 @@ def checkpoint_subject(folder: Path, weights: str | None = None, accept_licence:
     checkpoint = read_checkpoint(folder)
     if registry.policy_plugin(checkpoint.policy).target != names.ACTION:
         raise InputError(
-            f"{folder} chooses subtasks and does not act; name it in the file of a chain (configs/chain)."
+            f"{folder} chooses subtasks and does not act; name it as hlp: in the file of a chain (docs/chain.md)."
         )
     encoder = checkpoint.encoder
     if encoder:

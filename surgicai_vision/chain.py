@@ -9,7 +9,7 @@ until the subtask ends, and the high-level policy is asked again. A subtask ends
 
 After `decisions` decisions (paper: 50) both arms hold still.
 
-A chain is a YAML file, which `surgicai-vision evaluate chain.yaml` takes:
+A chain is a YAML file, which `surgicai-vision evaluate chain.yaml` takes (docs/chain.md):
 
     hlp: outputs/train/suture-hlp-…   # a checkpoint, or `order`: the subtasks in their order
     grasp: outputs/train/grasp-…      # a checkpoint of this subtask, LeRobot's too, or `expert`, `random`, `zero`

@@ -17,6 +17,7 @@ from surgicai_vision.checkpoint import read_checkpoint
 from surgicai_vision.cli import main
 from surgicai_vision.commands import folders, logs
 from surgicai_vision.config import TaskConfig
+from surgicai_vision.dataset.subtask import subtask_of
 from surgicai_vision.envs import suture
 from surgicai_vision.errors import InputError, UnknownName, check_name
 
@@ -169,6 +170,28 @@ def test_high_level_policy_learns_the_phase(
     kinds = [type(layer).__name__ for layer in policy.network.layers]
     assert kinds == ["BatchNorm1d", "Linear", "ReLU"] * 3 + ["Linear"]
     assert "does not act" in fails(capsys, "evaluate", folder)
+
+
+def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    whole = Dataset()
+    part = subtask_of(whole, "insert")  # type: ignore[arg-type]  # the stand-in has what is read
+    rows = np.flatnonzero(whole.columns()[names.PHASE] == 2)
+    assert part.length == len(rows) == 8 and part.episode_index.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert part.config == TaskConfig("insert") and part.task == "insert" and part.fingerprint != whole.fingerprint
+    np.testing.assert_array_equal(part.columns()[names.ACTION], whole.columns()[names.ACTION][rows])
+    frames = whole.frames("back", 0, 40)[rows]
+    for start, stop in ((0, 8), (1, 6), (3, 4), (2, 2)):
+        np.testing.assert_array_equal(part.frames("back", start, stop), frames[start:stop])
+    with pytest.raises(InputError, match="has 0 to 8"):
+        part.frames("back", 0, 9)
+    with pytest.raises(InputError, match="shows 'grasp'"):
+        subtask_of(Dataset(task="grasp"), "insert")  # type: ignore[arg-type]
+    arguments = ("train", "--subtask", "insert", "--encoder", "tiny", "--view", "back", "--epochs", "1")
+    folder = run(capsys, *arguments)["checkpoint"]
+    assert folder == "outputs/train/insert-of-suture-tiny-back-paper+1epochs-seed0"
+    checkpoint = read_checkpoint(Path(folder))
+    assert checkpoint.task == TaskConfig("insert") and checkpoint.frames == 6
+    assert "Did you mean 'insert'" in fails(capsys, "train", "--subtask", "inset")
 
 
 def test_labels_of_phases_are_ahead_within_their_episode() -> None:

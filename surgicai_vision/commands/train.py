@@ -28,6 +28,12 @@ class Options:
 
     task: str = option("grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
     dataset: str | None = option(None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>")
+    subtask: str | None = option(
+        None,
+        f"take one subtask's frames of a dataset of whole procedures, for a chain: {', '.join(names.SUBTASKS)}",
+        check=one_of("subtask", names.SUBTASKS),
+        metavar="SUBTASK",
+    )
     encoder: str = option(
         "imagenet-lite",
         f"one of {registry.encoder_choices()}; none for proprioception alone, state for the state with the goal",
@@ -76,8 +82,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         registry.find_weights(encoder, options.weights, options.accept_licence)
     from surgicai_vision.cells import Cell, train_cell
 
+    task = names.SUTURE if options.subtask else options.task
     cell = Cell(
-        options.task,
+        task,
         encoder,
         _views(options, encoder),
         options.seed,
@@ -89,9 +96,14 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         deviations=options.deviation,
     )
     registry.load_recipe(cell.policy, cell.recipe, cell.changes)
-    out = Path(options.out) if options.out else folders.train_folder(cell.task, cell.name, cell.seed)
+    label = f"{options.subtask}-of-{task}" if options.subtask else task
+    out = Path(options.out) if options.out else folders.train_folder(label, cell.name, cell.seed)
     folders.check_folder(out, "training.json")
-    dataset = folders.open_dataset(options.dataset, options.task, cell.view)
+    dataset = folders.open_dataset(options.dataset, task, cell.view)
+    if options.subtask:
+        from surgicai_vision.dataset.subtask import subtask_of
+
+        dataset = subtask_of(dataset, options.subtask)
     cell = replace(cell, task=dataset.task)
     with open_log(options.log, out) as log:
         train_cell(
