@@ -4,6 +4,8 @@ import json
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -20,6 +22,7 @@ from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.part import first_episodes
 from surgicai_vision.dataset.pictures import DEPTH_FAR, DEPTH_NEAR, grey
 from surgicai_vision.errors import InputError, UnknownName
+from surgicai_vision.executor import JOBS
 from surgicai_vision.sweep import Grid, estimate, plan, run_sweep
 from surgicai_vision.sweep.grid import chain_parts
 from surgicai_vision.sweep.lerobot import _arguments
@@ -187,3 +190,18 @@ def test_the_estimate_follows_the_cells_that_are_done(quiet, tmp_path):
     fresh = estimate(BLIND, tmp_path, plan(BLIND, tmp_path), 1)
     assert fresh["seconds"] > 0 and "another machine" in fresh["source"]
     assert estimate(BLIND, tmp_path, plan(BLIND, tmp_path), 2)["seconds"] <= fresh["seconds"] / 2 + 1
+
+
+def test_keys_count_every_module_that_can_change_a_cell():
+    """What a worker imports for a cell is counted in the cell's key, or named here as something that cannot matter."""
+    code = (
+        "import sys, surgicai_vision.sweep.jobs, surgicai_vision.lerobot_agent, surgicai_vision.training, "
+        "surgicai_vision.chain, surgicai_vision.evaluation, surgicai_vision.demos.record, surgicai_vision.dataset; "
+        "print(*{name.split('.')[1] for name in sys.modules if name.startswith('surgicai_vision.')})"
+    )
+    loaded = set(
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    )
+    counted = set(JOBS["sweep-cell"].stages) | {"names", "config"}
+    harmless = {"errors", "files", "executor", "provenance", "results"}
+    assert loaded - counted - harmless == set()

@@ -31,8 +31,11 @@ class JobKind:
 
 
 _DATA = ("scene", "envs", "demos", "dataset")
-_LEARN = (*_DATA, "features", "released", "training", "checkpoint", "registry", "cells", "encoders", "policies")
-_CELL = (*_LEARN, "sweep", "agents", "evaluation", "chain", "lerobot_agent")
+_LEARN = (
+    *_DATA, "features", "released", "training", "training_data", "checkpoint", "registry", "cells",
+    "encoders", "policies",
+)  # fmt: skip
+_CELL = (*_LEARN, "sweep", "agents", "evaluation", "rows", "statistics", "chain", "lerobot_agent")
 _NUMERIC = ("mujoco", "numpy", "torch", "timm", "lerobot")
 
 JOBS: Mapping[str, JobKind] = MappingProxyType(
@@ -45,6 +48,7 @@ JOBS: Mapping[str, JobKind] = MappingProxyType(
         "sweep-features": JobKind("surgicai_vision.sweep.jobs:encode_features", _LEARN, _NUMERIC),
         "sweep-policy": JobKind("surgicai_vision.sweep.jobs:train_policy", _LEARN, _NUMERIC),
         "sweep-cell": JobKind("surgicai_vision.sweep.jobs:run_cell", _CELL, _NUMERIC),
+        "sweep-probe": JobKind("surgicai_vision.sweep.jobs:run_probe", (*_LEARN, "probe"), _NUMERIC),
         "sweep-reference": JobKind("surgicai_vision.sweep.jobs:run_reference", _CELL, _NUMERIC),
     }
 )

@@ -28,7 +28,7 @@ from surgicai_vision.cells import (
 from surgicai_vision.config import TaskConfig, from_mapping
 from surgicai_vision.files import write_json
 from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES, SCRATCH, train_lerobot
-from surgicai_vision.sweep.planning import CELL_FILE, REFERENCE_FILE
+from surgicai_vision.sweep.planning import CELL_FILE, PROBE_FILE, REFERENCE_FILE
 
 Table = Mapping[str, Any]
 
@@ -85,6 +85,19 @@ def run_reference(
     about = {**subject.about, "command": command}
     summary = _evaluate(folder, dataclasses.replace(subject, about=about), episodes)
     write_json(folder / REFERENCE_FILE, {"summary": summary})
+
+
+def run_probe(
+    folder: Path, cell: Table, dataset: str, accept_licence: bool, options: Table, command: str, environment: Table
+) -> None:
+    """Job "sweep-probe": say what of the needle's pose can be read from what a cell sees."""
+    from surgicai_vision.probe import probe
+
+    os.environ.update(environment)
+    what, data = _cell(cell), _dataset(dataset)
+    features, _ = encode_cell(what, data, silent, accept_licence=accept_licence)
+    row = {"task": what.task, "encoder": what.encoder, "view": "+".join(what.view), "pool": what.pool}
+    write_json(folder / PROBE_FILE, {**row, **probe(data, features).row()})
 
 
 @contextmanager

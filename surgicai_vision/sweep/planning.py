@@ -2,7 +2,7 @@
 
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from surgicai_vision.sweep.grid import Grid, chain_parts
 from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES
 
 GRID_FILE, CELL_FILE, FAILED_FILE, REFERENCE_FILE = "sweep.json", "cell.json", "failed.json", "reference.json"
+PROBE_FILE = "probe.json"
 CACHED, TO_DO, NOT_RUN = "cached", "to do", "not run"
 FEATURE_SWITCHES = ("preprocessing", "batch_norm_drift", "bgr")
 """Deviations that change features."""
@@ -144,6 +145,17 @@ class Jobs:
         for seen in _seen(cell):
             arguments = {"cell": to_mapping(seen), **self._common(seen)}
             jobs.append(Job("sweep-features", arguments, tuple(self._inputs(seen)), label=LABELS))
+        return jobs
+
+    def probes(self, cells: Iterable[Cell]) -> dict[str, Job]:
+        """Return the probes of what cells see, by their folders' names; a chain and an `own` network have none."""
+        jobs = {}
+        for cell in cells:
+            if cell.encoder and cell.encoder != OWN and not cell.chain:
+                seen = Cell(cell.task, cell.encoder, cell.view, pool=cell.pool, deviations=())
+                arguments = {"cell": to_mapping(seen), **self._common(seen)}
+                name = digest(to_mapping(seen))[:16]
+                jobs[name] = Job("sweep-probe", arguments, tuple(self._inputs(seen)), label=LABELS)
         return jobs
 
     def reference(self, name: str, task: str) -> Job:

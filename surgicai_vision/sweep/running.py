@@ -26,13 +26,14 @@ from surgicai_vision.sweep.planning import (
     FAILED_FILE,
     GRID_FILE,
     NOT_RUN,
+    PROBE_FILE,
     REFERENCE_FILE,
     CellState,
     Jobs,
     plan,
 )  # fmt: skip
 
-EPISODES = "episodes.parquet"
+EPISODES, PROBES = "episodes.parquet", "probes.parquet"
 WORK = "work"
 ATTEMPTS = 3
 """How often a cell is started whose worker dies."""
@@ -66,13 +67,15 @@ def run_sweep(
         to_do = [state for state in states if state.state not in (CACHED, NOT_RUN)]
         sweep.prepare(to_do, workers, engine)
         sweep.do(to_do)
+        sweep.probe([state.cell for state in states if state.state != NOT_RUN and state.key not in sweep.errors])
         shutil.rmtree(out / WORK)
     skipped = [state for state in states if state.state == NOT_RUN]
     problems = [f"not run: {state.where}: {state.reason}" for state in skipped]
     problems += [f"failed: {state.where}: {sweep.errors[state.key]}" for state in to_do if state.key in sweep.errors]
     problems += sweep.problems
     table = _collect(grid, out)
-    _store_run(grid, out, problems)
+    _collect_probes(out)
+    _store_run(grid, out, problems, skipped)
     counts = {
         "cells": len(states),
         "done": len(to_do) - len(sweep.errors),
@@ -207,6 +210,17 @@ class _Sweep:
             with self.stage("cells", "cells") as progress:
                 self.run(left, self.out / WORK, unit="cells", progress=progress, ended=ended)
 
+    def probe(self, cells: Sequence[Cell]) -> None:
+        """Probe what the cells see, where the grid asks for it."""
+        wanted = self.jobs.probes(cells) if self.grid.probe else {}
+        places = {job.key(): (self.out / "probes" / name, PROBE_FILE, None) for name, job in wanted.items()}
+        errors = self._share("probes", [job for job in wanted.values() if not self._at(places[job.key()], job.key())])
+        for key, (place, record, _) in places.items():
+            if (self.out / WORK / key).is_dir():
+                _file(self.out / WORK / key, place, record, key)
+            if key in errors:
+                self.problems.append(f"failed: probe {place.name}: {' '.join(str(errors[key]).split())}")
+
     def _at(self, place: tuple[Path, str, CellState | None], key: str) -> bool:
         path = place[0] / place[1]
         return path.exists() and files.read_json(path).get("job") == key
@@ -258,6 +272,13 @@ def _collect(grid: Grid, out: Path) -> list[dict[str, Any]]:
     return table
 
 
+def _collect_probes(out: Path) -> None:
+    """Write `probes.parquet` of all probes there are, one row an encoder and view set."""
+    rows = [files.read_json(path) for path in sorted(out.glob(f"probes/*/{PROBE_FILE}"))]
+    if rows:
+        files.write_bytes(out / PROBES, parquet_bytes(rows))
+
+
 def _about(grid: Grid, key: str, cell: Cell) -> dict[str, Any]:
     """Return what a row says of its cell."""
     return {
@@ -273,7 +294,7 @@ def _about(grid: Grid, key: str, cell: Cell) -> dict[str, Any]:
     }
 
 
-def _store_run(grid: Grid, out: Path, problems: list[str]) -> None:
+def _store_run(grid: Grid, out: Path, problems: list[str], skipped: Sequence[CellState]) -> None:
     """Write what the report says of the run; only when something changed."""
     old = files.read_json(out / RUN_FILE) if (out / RUN_FILE).exists() else {}
     counts = ", ".join(map(str, grid.demonstrations))
@@ -282,6 +303,7 @@ def _store_run(grid: Grid, out: Path, problems: list[str]) -> None:
         f"{grid.size} × {grid.size}; {', '.join(grid.policy)}, recipe {', '.join(grid.recipe)}"
     )
     run = {"title": "sweep", "command": old.get("command") or command_line(), "data": data, "not_run": problems}
-    made = {**run, "provenance": old.get("provenance") or provenance()}
+    lacking = [{"key": state.key, "cell": to_mapping(state.cell), "reason": state.reason} for state in skipped]
+    made = {**run, "skipped": lacking, "provenance": old.get("provenance") or provenance()}
     if made != old:
         files.write_json(out / RUN_FILE, made)
