@@ -7,7 +7,7 @@ from types import MappingProxyType
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.rosbag2.enums import StoragePlugin
+from rosbags.rosbag2.enums import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
 import surgicai_vision.envs as envs
@@ -96,7 +96,7 @@ def streams(motion, jaw_scale=2.0, labels=True):
     return found
 
 
-def write_bag(path, form, found, topics=TOPICS, types=TYPES, late=0, frame="PSM_base", stamped=True):
+def write_bag(path, form, found, topics=TOPICS, types=TYPES, late=0, frame="PSM_base", stamped=True, packed=""):
     """Write streams as a bag.
 
     Args:
@@ -108,6 +108,7 @@ def write_bag(path, form, found, topics=TOPICS, types=TYPES, late=0, frame="PSM_
         late: by how much later than stamped a message is received, at most [ns], drawn at random.
         frame: frame_id of the headers.
         stamped: the headers have stamps.
+        packed: packed by zstd, or for ROS 1 by "bz2" or "lz4".
     """
     ros1 = form == "bag"
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
@@ -122,7 +123,13 @@ def write_bag(path, form, found, topics=TOPICS, types=TYPES, late=0, frame="PSM_
             message = _message(store, kind, value, stamp if stamped else 0, frame, ros1)
             rows.append((received, topics[role], kind, message))
     storage = StoragePlugin.MCAP if form == "mcap" else StoragePlugin.SQLITE3
-    with Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=storage) as writer:
+    writer = Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=storage)
+    if packed and ros1:
+        writer.set_compression(writer.CompressionFormat[packed.upper()])
+    elif packed:
+        mode = CompressionMode.STORAGE if form == "mcap" else CompressionMode.MESSAGE
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
         connections = {}
         for received, topic, kind, message in sorted(rows, key=lambda row: row[0]):
             if topic not in connections:

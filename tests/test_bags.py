@@ -71,6 +71,15 @@ def test_the_three_formats_and_single_files_say_the_same(tmp_path):
         assert all((other[key] == first[key]).all() for key in first)
 
 
+@pytest.mark.parametrize("form", ["bz2", "lz4", "mcap", "db3"])
+def test_packed_bags_say_the_same(tmp_path, form):
+    found = streams(shown("grasp"))
+    plain = write_bag(tmp_path / "plain", "mcap", found)
+    packed = write_bag(tmp_path / "packed", "bag" if form in ("bz2", "lz4") else form, found, packed=form)
+    one, other = (bags.read(path, BagConfig().all_topics) for path in (plain, packed))
+    assert all((one[key] == other[key]).all() for key in one)
+
+
 def test_actions_carry_the_arm_along_the_recorded_path(tmp_path):
     from surgicai_vision.envs.control import StepSize, moved
 

@@ -25,6 +25,9 @@ from surgicai_vision.scene.rotations import matrix_to_rpy
 
 CLOSED = ("place", "insert", "pullout")
 """Subtasks whose arm holds the needle from beginning to end: without a jaw on record it is closed."""
+SLACK = 0.005
+"""Furthest an inferred needle may lie outside the jaws that hold it [m]: the paper lets place and insert end that far
+from their goals."""
 START_JAW = kinematics.PSM1_START[6]
 """Jaw of an arm that does not hold the needle and whose jaw is not on record [rad]."""
 
@@ -157,6 +160,6 @@ def _inferred(tip: np.ndarray, jaw: np.ndarray, task: str, base: TaskConfig) -> 
     nothing = np.zeros(len(poses) - 1)
     episode = Episode(poses, poses[-1], np.zeros((len(nothing), 7)), nothing, nothing > 0)
     error = grip_error(episode, task)
-    if error > 0.0:
+    if error > SLACK:
         raise Unusable(f"with this end the needle would lie {error * 1e3:.0f} mm outside the jaws")
     return needle_path(episode, task)

@@ -16,6 +16,7 @@ import bz2
 import itertools
 import re
 import sqlite3
+from array import array
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -102,35 +103,35 @@ def _read(reader: Any, path: Path, topics: Mapping[str, str], needed: Collection
     for connection in wanted:
         _check_kind(connection, topics)
         layouts[connection.topic] = layout_of(_plain(connection.msgtype), ros1=ros1, text=connection.msgdef.data)
+    columns = {role: _Column(role, topic, path) for role, topic in topics.items() if topic in there}
+    if wanted:
+        _fill(reader, wanted, layouts, columns, ros1)
     arrays = {"topics": np.array(known, dtype=str)}
-    rows = _rows(reader, wanted, layouts, path, ros1) if wanted else {}
-    for role, topic in topics.items():
-        if rows.get(topic):
-            arrays |= _arrays(role, topic, there[topic], rows[topic], path)
+    for role, column in columns.items():
+        if len(column.times):
+            arrays |= column.arrays(there[topics[role]])
         elif role in needed:
-            raise InputError(f"{path} has no message on {topic} ({role}).")
+            raise InputError(f"{path} has no message on {topics[role]} ({role}).")
     return arrays
 
 
-Row = tuple[int, dict[str, Any]]
-
-
-def _rows(
-    reader: Any, wanted: list[Any], layouts: Mapping[str, Layout], path: Path, ros1: bool
-) -> dict[str, list[Row]]:
-    """Return (time received [ns], message) of each topic."""
-    rows: dict[str, list[Row]] = {}
+def _fill(
+    reader: Any, wanted: list[Any], layouts: Mapping[str, Layout], columns: Mapping[str, "_Column"], ros1: bool
+) -> None:
+    """Read the messages of the wanted connections into the columns of their roles."""
+    heard: dict[str, list[_Column]] = {}
+    for column in columns.values():
+        heard.setdefault(column.topic, []).append(column)
     for number, (connection, time, data) in enumerate(reader.messages(wanted)):
         if number >= MAX_MESSAGES or len(data) > MAX_MESSAGE:
-            raise BadFile(f"{path} has over {MAX_MESSAGES} messages, or one over {MAX_MESSAGE >> 20} MB; not read.")
+            raise BadFile(f"it has over {MAX_MESSAGES} messages, or one over {MAX_MESSAGE >> 20} MB.")
         try:
             message = decode(data, layouts[connection.topic], ros1=ros1)
         except ValueError as error:
-            raise BadFile(
-                f"{path}: a message on {connection.topic} is no {clean(_plain(connection.msgtype))} ({error})."
-            ) from None
-        rows.setdefault(connection.topic, []).append((time, message))
-    return rows
+            kind = clean(_plain(connection.msgtype))
+            raise BadFile(f"a message on {connection.topic} is no {kind} ({error}).") from None
+        for column in heard[connection.topic]:
+            column.add(time, message)
 
 
 def _check_kind(connection: Any, topics: Mapping[str, str]) -> None:
@@ -142,31 +143,61 @@ def _check_kind(connection: Any, topics: Mapping[str, str]) -> None:
             raise InputError(f"{topic} ({role}) holds {clean(kind)}; {role} is read from {', '.join(allowed)}.")
 
 
-def _arrays(role: str, topic: str, kind: str, rows: list[Row], path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of one role."""
-    read_value = _VALUES[role.rsplit("_", 1)[-1]]
-    try:
-        value = np.array([read_value(message) for _, message in rows])
-    except (IndexError, KeyError):
-        raise InputError(f"{path}: {topic} ({role}) has messages without the values that {role} needs.") from None
-    if value.dtype.kind == "f" and not np.isfinite(value).all():
-        raise BadFile(f"{path}: {topic} ({role}) holds numbers that are not finite.")
-    if value.ndim == 2 and value.shape[1] == 7:
-        lengths = np.linalg.norm(value[:, 3:], axis=1)
-        if np.abs(lengths - 1.0).max() > UNIT:
-            raise BadFile(f"{path}: {topic} ({role}) holds rotations that are no unit quaternions.")
-        value[:, 3:] /= lengths[:, None]
-    stamps = [row.get("header.sec", 0) * 10**9 + row.get("header.nanosec", 0) for _, row in rows]
-    frames = sorted({str(row.get("header.frame_id", "")) for _, row in rows})
-    if len(frames) > 1:
-        raise InputError(f"{path}: {topic} ({role}) changes its frame: {clean(', '.join(frames[:9]), 160)}.")
-    return {
-        f"{role}.time": np.array([time for time, _ in rows], dtype=np.int64),
-        f"{role}.stamp": np.array(stamps, dtype=np.int64),
-        f"{role}.value": value,
-        f"{role}.type": np.array(kind),
-        f"{role}.frame": np.array(frames[0]),
-    }
+class _Column:
+    """What one role's topic said: numbers by the hundred thousand, so kept as numbers.
+
+    Args:
+        role: one of `ROLES`.
+        topic: its topic.
+        path: the bag, for messages.
+    """
+
+    def __init__(self, role: str, topic: str, path: Path):
+        self.topic, self.times = topic, array("q")
+        self._name, self._where = role, f"{path}: {topic} ({role})"
+        self._read = _VALUES[role.rsplit("_", 1)[-1]]
+        self._stamps, self._numbers, self._width = array("q"), array("d"), 0
+        self._texts: list[str] = []
+        self._frames: set[str] = set()
+
+    def add(self, time: int, message: Mapping[str, Any]) -> None:
+        """Take a message that was received at `time` [ns]."""
+        try:
+            value = self._read(message)
+        except (IndexError, KeyError):
+            raise InputError(f"{self._where} has messages without the values that {self._name} needs.") from None
+        self.times.append(time)
+        self._stamps.append(message.get("header.sec", 0) * 10**9 + message.get("header.nanosec", 0))
+        self._frames.add(str(message.get("header.frame_id", "")))
+        if len(self._frames) > 1:
+            raise InputError(f"{self._where} changes its frame: {clean(', '.join(sorted(self._frames)), 160)}.")
+        if isinstance(value, str):
+            self._texts.append(value)
+        else:
+            self._numbers.extend(value)
+            self._width = len(value)
+
+    def arrays(self, kind: str) -> dict[str, np.ndarray]:
+        """Return the role's arrays.
+
+        Raises:
+            BadFile: numbers that are not finite, rotations that are none.
+        """
+        value = np.array(self._texts) if self._texts else np.array(self._numbers).reshape(-1, self._width)
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            raise BadFile(f"{self._where} holds numbers that are not finite.")
+        if self._width == 7:
+            lengths = np.linalg.norm(value[:, 3:], axis=1)
+            if np.abs(lengths - 1.0).max() > UNIT:
+                raise BadFile(f"{self._where} holds rotations that are no unit quaternions.")
+            value[:, 3:] /= lengths[:, None]
+        return {
+            f"{self._name}.time": np.array(self.times),
+            f"{self._name}.stamp": np.array(self._stamps),
+            f"{self._name}.value": value[:, 0] if self._width == 1 else value,
+            f"{self._name}.type": np.array(kind),
+            f"{self._name}.frame": np.array(next(iter(self._frames))),
+        }
 
 
 def _pose(message: Mapping[str, Any]) -> list[float]:
@@ -183,11 +214,11 @@ def _joints(message: Mapping[str, Any]) -> list[float]:
     return [float(value) for value in values[:6]]
 
 
-def _jaw(message: Mapping[str, Any]) -> float:
+def _jaw(message: Mapping[str, Any]) -> list[float]:
     if "data" in message:
-        return float(message["data"])
+        return [float(message["data"])]
     # AMBF's state of a PSM has its two fingers behind the six joints.
-    return float(message["position"][0] if "position" in message else message["joint_positions"][6])
+    return [float(message["position"][0] if "position" in message else message["joint_positions"][6])]
 
 
 _VALUES: Mapping[str, Callable[[Mapping[str, Any]], Any]] = MappingProxyType(

@@ -146,7 +146,7 @@ def _shifted(pose: Matrix, shift: Matrix) -> Matrix:
 # -- taking the needle ------------------------------------------------------------------------------------------------
 
 
-def _take(scene: Sight, goal: Matrix, back: float, opened: float) -> Wish:
+def take(scene: Sight, goal: Matrix, back: float, opened: float) -> Wish:
     """Go before the grasp with open jaws, go in, close.
 
     Args:
@@ -174,12 +174,12 @@ def _take(scene: Sight, goal: Matrix, back: float, opened: float) -> Wish:
 
 def _grasp(scene: Sight) -> Wish:
     goal = scene.needle @ grasp_in_needle(scene.arm, scene.memory.grasp_angle, radius=scene.stitch.radius)
-    return _take(scene, goal, HOVER, OPEN_ABOVE)
+    return take(scene, goal, HOVER, OPEN_ABOVE)
 
 
 def _handoff(scene: Sight) -> Wish:
     goal = scene.needle @ grasp_in_needle(scene.arm, HANDOFF_ANGLE + HANDOFF_OFFSET, radius=scene.stitch.radius)
-    return _take(scene, goal, HANDOFF_BACK, OPEN_HANDOFF)
+    return take(scene, goal, HANDOFF_BACK, OPEN_HANDOFF)
 
 
 # -- carrying the needle ----------------------------------------------------------------------------------------------

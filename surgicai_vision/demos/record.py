@@ -34,7 +34,11 @@ from surgicai_vision.executor import LOCAL, Engine, Job, Progress, building, run
 from surgicai_vision.files import check_output, code_version, read_json, sha256_file, whole_folder, write_json
 
 SOURCES: Mapping[str, str] = MappingProxyType(
-    {"expert": "surgicai_vision.demos.expert:Expert", "dmp": "surgicai_vision.demos.imitator:Imitator"}
+    {
+        "expert": "surgicai_vision.demos.expert:Expert",
+        "dmp": "surgicai_vision.demos.imitator:Imitator",
+        "search": "surgicai_vision.demos.searching:Searcher",
+    }
 )
 """Source → "module:class" of what acts; built as `class(env)`, or as `class(env, demos)` where it is `TAUGHT`."""
 TAUGHT = frozenset({"dmp"})

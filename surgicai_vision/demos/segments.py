@@ -174,6 +174,8 @@ def sustained(event: np.ndarray) -> np.ndarray:
 class _Lying:
     """A needle alone: what `envs.passage` asks of a simulation."""
 
+    radius = needle.RADIUS
+
     def __init__(self, pose: Pose):
         self._pose = pose
 
