@@ -31,6 +31,7 @@ class EncoderCard:
         dim: length of the global feature.
         paper: where the encoder was published.
         note: what a user must know before comparing it with others.
+        layers: where each pool's feature is taken.
         channel_order: order in which the channels are handed to the network, "RGB" or "BGR".
     """
 
@@ -50,6 +51,7 @@ class EncoderCard:
     dim: int
     paper: str
     note: str = ""
+    layers: str = ""
     channel_order: str = "RGB"
 
 

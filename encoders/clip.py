@@ -36,6 +36,7 @@ CARD = EncoderCard(
     interpolation="bicubic",
     dim=512,
     paper="Radford et al., CLIP, ICML 2021",
+    layers="the projected picture embedding (global)",
 )
 RN50 = replace(
     CARD,

@@ -35,6 +35,7 @@ CARD = EncoderCard(
     interpolation="bilinear",
     dim=2048,
     paper="He et al., Deep Residual Learning, CVPR 2016 (torchvision V1 weights)",
+    layers="layer4 (spatial, tokens), its mean over places (global)",
 )
 
 

@@ -33,6 +33,7 @@ CARD = EncoderCard(
     interpolation="bicubic",
     dim=1280,
     paper="Tan and Le, EfficientNet, ICML 2019 (the Lite variant of 2020)",
+    layers="conv_head (spatial, tokens), its mean over places (global)",
     note="Supervised on ImageNet-1k; not an encoder of the paper.",
 )
 

@@ -34,6 +34,7 @@ CARD = EncoderCard(
     interpolation="bilinear",
     dim=2048,
     paper="Nair et al., R3M, CoRL 2022",
+    layers="layer4 (spatial, tokens), its mean over places (global)",
 )
 
 

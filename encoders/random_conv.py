@@ -33,6 +33,7 @@ CARD = EncoderCard(
     interpolation="bilinear",
     dim=WIDTHS[-1],
     paper="not one of SurgicAI's",
+    layers="the fourth convolution (spatial, tokens), its mean over places (global)",
     note="Never trained; meant for pool 'spatial'. Its weights hash is recorded with every checkpoint.",
 )
 

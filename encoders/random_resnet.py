@@ -31,6 +31,7 @@ CARD = EncoderCard(
     interpolation="bilinear",
     dim=2048,
     paper="SurgicAI, NeurIPS 2024, Table 2 (random)",
+    layers="layer4 (spatial, tokens), its mean over places (global)",
     note="Never trained. Its weights hash is recorded with every checkpoint.",
 )
 

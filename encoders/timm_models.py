@@ -33,6 +33,7 @@ DINOV2_CARD = EncoderCard(
     interpolation="bicubic",
     dim=384,
     paper="Oquab et al., DINOv2, TMLR 2024",
+    layers="class and patch tokens after the last norm (tokens), the class token (global)",
     note="Position embeddings are resampled from 518 px to 224 px; the feature is the class token.",
 )
 SIGLIP2_CARD = replace(
@@ -46,6 +47,7 @@ SIGLIP2_CARD = replace(
     std=(0.5, 0.5, 0.5),
     dim=768,
     paper="Tschannen et al., SigLIP 2, 2025",
+    layers="patch tokens after the last norm (tokens), their attention pool (global)",
     note="The feature is the attention-pooled embedding.",
 )
 
@@ -110,6 +112,7 @@ def plugin_for(name: str) -> Plugin:
         std=tuple(config.std),
         interpolation="bilinear" if config.interpolation == "bilinear" else "bicubic",
         dim=_dim(with_tag),
+        layers="timm's forward_features (spatial or tokens) and its own pooling (global)",
         paper=config.paper_name or config.paper_ids or f"timm {with_tag}",
     )
     return Plugin(card, build)

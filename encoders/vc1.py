@@ -31,6 +31,7 @@ CARD = EncoderCard(
     interpolation="bicubic",
     dim=768,
     paper="Majumdar et al., Where are we in the search for an Artificial Visual Cortex?, NeurIPS 2023",
+    layers="class and patch tokens after the last norm (tokens), the class token (global)",
     note="No centre crop: the whole picture is resized.",
 )
 

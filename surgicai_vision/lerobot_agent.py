@@ -160,7 +160,9 @@ class LeRobotAgent:
         self._text = text
         self._together = bool(getattr(self._policy, "memoryless", False))
         self._encoder = _encoder(sight, weights) if sight.encoder else None
-        self._slots: dict[int, tuple[Any, Any]] = {}
+        device = str(next(self._policy.parameters()).device)
+        self._devices = ("cpu",) if device == "cpu" else ("cpu", device)
+        self._slots: dict[int, tuple[Any, dict[str, Any]]] = {}
 
     def begin(self, slot: int, env: Any, seed: int) -> None:
         """Give the slot a policy that remembers nothing, and the random numbers of its seed."""
@@ -171,7 +173,8 @@ class LeRobotAgent:
             tensors = itertools.chain(policy.parameters(), policy.buffers())
             policy = copy.deepcopy(policy, {id(tensor): tensor for tensor in tensors})
         policy.reset()
-        self._slots[slot] = policy, torch.Generator().manual_seed(seed).get_state()
+        states = {device: torch.Generator(device).manual_seed(seed).get_state() for device in self._devices}
+        self._slots[slot] = policy, states
 
     def restart(self, slot: int) -> None:
         """Forget what the slot's policy has planned: a chain begins the subtask anew."""
@@ -181,15 +184,17 @@ class LeRobotAgent:
         """Return the policy's actions (n, 7)."""
         import torch
 
-        with one_thread(), torch.inference_mode(), torch.random.fork_rng(devices=[]):
+        cuda = [device for device in self._devices if device != "cpu"]
+        with one_thread(), torch.inference_mode(), torch.random.fork_rng(devices=cuda):
             if self._together:
                 return self._act(self._policy, envs, observations)
             actions = []
             for slot, env, observation in zip(slots, envs, observations, strict=True):
-                policy, state = self._slots[slot]
-                torch.set_rng_state(state)
+                policy, states = self._slots[slot]
+                for device, state in states.items():
+                    _set_random(device, state)
                 actions.append(self._act(policy, [env], [observation]))
-                self._slots[slot] = policy, torch.get_rng_state()
+                self._slots[slot] = policy, {device: _random(device) for device in states}
             return np.concatenate(actions)
 
     def _act(self, policy: Any, envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
@@ -207,6 +212,23 @@ class LeRobotAgent:
         batch = {**preprocess_observation(raw), "task": [self._text or env.task_description for env in envs]}
         action = self._after(policy.select_action(self._before(batch)))
         return action.to("cpu", torch.float32).numpy()
+
+
+def _random(device: str) -> Any:
+    """Return the state of a device's random numbers."""
+    import torch
+
+    return torch.get_rng_state() if device == "cpu" else torch.cuda.get_rng_state(device)
+
+
+def _set_random(device: str, state: Any) -> None:
+    """Put a device's random numbers into a state."""
+    import torch
+
+    if device == "cpu":
+        torch.set_rng_state(state)
+    else:
+        torch.cuda.set_rng_state(state, device)
 
 
 def _load(folder: Path, weights: str | None) -> tuple[Any, Any, Any]:

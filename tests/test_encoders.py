@@ -143,6 +143,7 @@ def test_no_frames_give_no_rows(encoder: Encoder) -> None:
 def test_card_is_complete(name: str) -> None:
     card: EncoderCard = encoder_card(name)
     assert card.name == name and card.architecture and card.source and card.revision and card.licence and card.paper
+    assert "(global)" in card.layers
     assert card.channel_order == "RGB" and card.interpolation in ("bilinear", "bicubic")
     assert all(value > 0 for value in card.std) and card.dim > 0
     assert card.offline == (name in OFFLINE)
