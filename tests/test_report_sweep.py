@@ -14,7 +14,7 @@ from test_report import assert_stands_alone, painted_stage
 from surgicai_vision import pictures, report, statistics
 from surgicai_vision.cli import main
 from surgicai_vision.commands.report import Options
-from surgicai_vision.report import beside, charts, films, formats, paper
+from surgicai_vision.report import beside, charts, films, formats, paper, tables
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.pairs import compare, factor
 from surgicai_vision.report.reading import Condition, collect
@@ -121,6 +121,7 @@ def test_what_failed_or_was_not_run_is_told_with_its_reason(text, written, group
     assert missing.count('class="state failed"') == 1
     assert missing.count("R3M&#39;s weights are not here; see its card.") == 9
     assert "RuntimeError: the disk is full" in missing
+    assert "failed: replay-grasp: the mean demonstration is empty" in missing
     assert "1 training seed failed" in text
     states = pq.read_table(written / "tables/cells.parquet")["state"].to_pylist()
     assert (states.count("not run"), states.count("failed")) == (18, 1)
@@ -146,6 +147,29 @@ def test_what_could_not_be_run_where_the_sweep_ran_stays_not_run_here(tmp_path):
     plan = [{**cell("grasp", "r3m", ("back",), 0), "state": "to do", "key": "a", "reason": ""}]
     (missing,) = collect(tmp_path, plan).missing
     assert (missing.state, missing.reason) == ("not run", "R3M's weights are not here; see its card.")
+
+
+def test_a_cell_that_the_run_skipped_is_told_whatever_its_name(tmp_path):
+    write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
+    run = json.loads((tmp_path / "run.json").read_text())
+    skipped = cell("grasp", "clip", ("front",), 0, epochs=2)
+    run["skipped"] = [{"key": "a", "cell": skipped, "reason": "its licence"}]
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    missing = collect(tmp_path, [{**skipped, "state": "to do", "key": "a", "reason": ""}]).missing
+    assert [(item.condition.label, item.state, item.reason) for item in missing] == [
+        ("clip · 2 epochs on front", "not run", "its licence")
+    ]
+
+
+def test_cells_keep_their_columns_where_the_first_has_no_result(tmp_path):
+    write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),), encoders={"random": 0.5})
+    missing = json.loads((tmp_path / "run.json").read_text())
+    missing["skipped"] = [{"key": "a", "cell": cell("grasp", "clip", ("back",), 0), "reason": "its licence"}]
+    (tmp_path / "run.json").write_text(json.dumps(missing))
+    found = group(collect(tmp_path))
+    assert not found[0].episodes
+    table = pq.read_table(tables.write_tables(tmp_path, found, [], "title") / "cells.parquet")
+    assert {"low", "high", "command", "missed"} <= set(table.column_names)
 
 
 def test_the_command_reports_a_sweep_whose_grid_it_cannot_read(tmp_path, monkeypatch, capsys):

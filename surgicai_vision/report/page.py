@@ -61,6 +61,7 @@ def numbers(collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]
         "pairs_shown": sections.PAIRS_SHOWN,
         "letters": letters(),
         "missing": sections.missing_rows(groups),
+        "notes": collected.notes,
     }
 
 

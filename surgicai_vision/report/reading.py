@@ -166,6 +166,11 @@ class Collected:
     grid: dict[str, Any]
     probes: list[dict[str, Any]]
 
+    @property
+    def notes(self) -> list[str]:
+        """What went wrong in the run beside its cells."""
+        return [str(line) for line in self.run.get("not_run", []) if not PROBLEM.match(str(line))]
+
 
 def collect(folder: Path, cells: Sequence[Mapping[str, Any]] = ()) -> Collected:
     """Read the results below `folder`.
@@ -263,6 +268,8 @@ def _missing(
     for path in sorted(folder.rglob(FAILED_FILE)):
         stored = files.read_json(path)
         add(stored["cell"], FAILED, _last_line(str(stored.get("error", ""))), path.parent.name)
+    for skipped in run.get("skipped", []):
+        add(skipped["cell"], NOT_RUN, str(skipped["reason"]), str(skipped["key"]))
     for cell in cells:
         if cell["state"] in ("to do", NOT_RUN, FAILED):
             state = PENDING if cell["state"] == "to do" else str(cell["state"])

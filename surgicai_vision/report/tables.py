@@ -30,7 +30,7 @@ def write_tables(folder: Path, groups: Sequence[Group], pairs: Sequence[Pair], t
         "table.md": markdown(groups, title).encode(),
         "table.tex": latex(groups, title).encode(),
         "table.csv": _csv([condition_record(item) for item in groups]),
-        "cells.parquet": parquet_bytes(list(cell_records(groups))),
+        "cells.parquet": parquet_bytes(_filled(list(cell_records(groups)))),
         "pairs.csv": _csv([_pair_record(pair) for pair in pairs]),
     }
     for name, content in contents.items():
@@ -109,6 +109,12 @@ def evaluate_command(result: Result) -> str | None:
 
         return f"surgicai-vision evaluate {shlex.quote(str(about['folder']))} {ending}"
     return f"surgicai-vision evaluate {name} {ending}" if name in REFERENCES[:3] else None
+
+
+def _filled(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Give every row every column: a table's columns are those of its first row."""
+    columns = dict.fromkeys(name for row in sorted(rows, key=len, reverse=True) for name in row)
+    return [{name: row.get(name) for name in columns} for row in rows]
 
 
 def _identity(condition: Condition) -> dict[str, Any]:
