@@ -162,6 +162,13 @@ def test_jitter_and_lost_messages_do_not_show_after_resampling(tmp_path, lost, l
     np.testing.assert_allclose(recording.arms["psm2"].jaw, 0.5 * (0.4 + 0.2 * np.sin(seconds)), atol=1e-3)
 
 
+def test_speed_stretches_the_motion(tmp_path):
+    bag = write_bag(tmp_path / "trial", "mcap", streams(shown("grasp")))
+    normal, slow = recorded(bag), recorded(bag, BagConfig(speed=0.5))
+    assert abs(len(slow) - 2 * len(normal)) <= 1
+    np.testing.assert_allclose(slow.arms["psm2"].tip[::2], normal.arms["psm2"].tip, atol=1e-9)
+
+
 def test_without_stamps_the_time_of_reception_counts(tmp_path):
     times = irregular(200, 2, 3)
     bag = write_bag(tmp_path / "trial", "bag", {"psm2_pose": (times, swinging(times / 1e9))}, stamped=False)

@@ -97,7 +97,7 @@ def _import_bags(path: Path, options: Options, console: Console) -> dict[str, An
     if not bags:
         raise BadFile(f"Cannot read {path}: it is a folder without bags (*.bag, *.db3, *.mcap, folders of ROS 2).")
     out = Path(options.out) if options.out else folders.demos_folder("bag")
-    with console.stage(f"importing {path.name}", "demonstrations") as progress:
+    with console.stage(f"importing {path.name}", "bags") as progress:
         summaries = import_bags(
             bags, task=options.task, out=out, config=_config(options), env=options.env, progress=progress
         )

@@ -77,7 +77,7 @@ def import_bags(
         out: folder to make; the same import of the same bags finds it finished.
         config: how to read them.
         env: fields of `TaskConfig`, among them the scene with its hole pair and instrument.
-        progress: called with (demonstrations done, demonstrations, "demonstrations").
+        progress: called with (bags read, bags, "bags"), then (demonstrations done, demonstrations, "demonstrations").
 
     Raises:
         UnknownName: an unknown task.
@@ -90,7 +90,9 @@ def import_bags(
         check_output(out, may_resume=MARKER)
     pieces: list[Piece] = []
     skipped: list[Row] = []
-    for bag in bags:
+    for number, bag in enumerate(bags):
+        if progress:
+            progress(number, len(bags), "bags")
         found, unusable = take_apart(bag, task, config, base)
         pieces, skipped = pieces + found, [*skipped, *unusable]
     if not pieces:
