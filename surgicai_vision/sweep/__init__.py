@@ -2,10 +2,11 @@
 
 `out` holds `sweep.json` (the grid), `data/<task>/` (demonstrations and dataset), `cells/<key>/` with `policy/`,
 `evaluation/` and `cell.json`, `policies/<key>/` (what chains share), `references/` (expert, replay),
-`episodes.parquet` (one row an episode), `probes.parquet` (where asked for) and `run.json` for the report. The key is the digest of everything a cell is;
-`cell.json` names the job, which counts code and versions too. So running again does only what is missing or was made
-by other code; a cell that failed is tried again, one whose weights cannot be had is reported as not run, with the
-reason. Finished jobs wait in `work/` until they are filed; nothing else is needed to go on after a kill.
+`episodes.parquet` (one row an episode), `probes.parquet` (where asked for) and `run.json` for the report. The key is
+the digest of everything a cell is; `cell.json` names the job, which counts code and versions too. So running again
+does only what is missing or was made by other code; a cell that failed is tried again, one whose weights cannot be had
+is reported as not run, with the reason. Finished jobs wait in `work/` until they are filed; nothing else is needed to
+go on after a kill.
 """
 
 from surgicai_vision.sweep.estimating import estimate
