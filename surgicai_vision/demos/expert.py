@@ -36,7 +36,7 @@ Matrix = NDArray[np.float64]
 
 HOVER, HANDOFF_BACK = 0.010, 0.009
 """Where the jaws wait before they go in: above the needle, before the handoff grasp [m]."""
-OPEN_ABOVE, OPEN_HANDOFF = 0.35, 0.25
+OPEN_ABOVE, OPEN_HANDOFF = 0.35, 0.18
 """Jaw angles [rad] wide enough for the needle and narrow enough for its neighbours."""
 ALIGNED, ALIGNED_ANGLE = 0.0006, math.radians(4.0)
 CLOSING, CLOSING_ANGLE = 0.002, math.radians(20.0)
