@@ -32,6 +32,7 @@ ACTIONS = len(names.ACTION_NAMES)
 VECTORS: Mapping[str, int] = MappingProxyType(
     {
         names.STATE: len(names.STATE_NAMES),
+        names.CLOCKED_STATE: len(names.STATE_NAMES) + 1,
         names.BOTH_ARMS: len(names.BOTH_ARMS_NAMES),
         names.PRIVILEGED_STATE: len(names.PRIVILEGED_NAMES),
     }
@@ -55,6 +56,7 @@ class Recipe:
         split: "episode", or "transition" as the released code did (neighbouring frames leak).
         validation: share of the episodes (or transitions) held out of training.
         proprioception: feed tip pose and jaw too: the active arm's, for a high-level policy both arms'.
+        clock: feed how long the subtask has been on as well (needs proprioception): for demonstrations that act by it.
         privileged: feed the 21 values of obs_type "state", goal included, in place of all else: a ceiling.
         deviations: of the released code, outside its training.
     """
@@ -69,6 +71,7 @@ class Recipe:
     split: str = "episode"
     validation: float = 0.1
     proprioception: bool = True
+    clock: bool = False
     privileged: bool = False
     deviations: Deviations = field(default_factory=Deviations)
 
@@ -81,6 +84,8 @@ class Recipe:
             raise InputError(f"epochs is {self.epochs}, batch_size {self.batch_size}; at least 1 and 2.")
         if not self.learning_rate > 0:
             raise InputError(f"learning_rate is {self.learning_rate}; it must be above 0.")
+        if self.clock and (self.privileged or not self.proprioception):
+            raise InputError("clock goes with proprioception; switch it on, and privileged off.")
         if not self.weight_decay >= 0:
             raise InputError(f"weight_decay is {self.weight_decay}; it must be at least 0.")
         if not 0 <= self.validation < 1:

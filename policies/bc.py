@@ -20,8 +20,7 @@ class BCPolicy(Policy):
     """The MLP of behaviour cloning."""
 
     def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
-        vector = names.PRIVILEGED_STATE if recipe.privileged else names.STATE if recipe.proprioception else None
-        super().__init__(Inputs(visual, vector))
+        super().__init__(Inputs(visual, _vector(recipe)))
         self.network = FeatureMLP(recipe, self.inputs, ACTIONS)
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
@@ -31,6 +30,15 @@ class BCPolicy(Policy):
     def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the mean squared error of the actions (B, 7)."""
         return nn.functional.mse_loss(self(observed), target)
+
+
+def _vector(recipe: Recipe) -> str | None:
+    """Return what is fed beside the features."""
+    if recipe.privileged:
+        return names.PRIVILEGED_STATE
+    if recipe.clock:
+        return names.CLOCKED_STATE
+    return names.STATE if recipe.proprioception else None
 
 
 BC = Plugin("bc", Recipe, BCPolicy)

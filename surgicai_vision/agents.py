@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision import names
+from surgicai_vision.config import SUBTASK_STEPS
 from surgicai_vision.errors import UnreachablePose
 
 
@@ -119,6 +120,7 @@ def mean_demonstration(action: NDArray[np.float32], episode_index: NDArray[np.in
 VECTORS: Mapping[str, Callable[[Any], NDArray[np.float32]]] = MappingProxyType(
     {
         names.STATE: lambda env: env.agent_pos(),
+        names.CLOCKED_STATE: lambda env: env.agent_pos(),  # the agent itself adds the clock
         names.BOTH_ARMS: lambda env: env.both_arms(),
         names.PRIVILEGED_STATE: lambda env: env.state_vector(),
     }
@@ -159,6 +161,8 @@ class PolicyAgent:
         self.cameras = tuple(dict.fromkeys(map(names.camera_of, views)))
         self.depth = any(view in names.DEPTH_VIEWS for view in views)
         self._policy, self._encoder, self._vector = policy, encoder, VECTORS[vector]
+        self._clocked = vector == names.CLOCKED_STATE
+        self._ticks: dict[int, int] = {}
         self._shared: Shared | None = None
 
     def share(self, features: "Shared") -> None:
@@ -166,16 +170,34 @@ class PolicyAgent:
         self._shared = features
 
     def begin(self, slot: int, env: Any, seed: int) -> None:
-        """Nothing to forget: the policy has no memory."""
+        """Start the slot's clock; the policy has no other memory."""
+        self.restart(slot)
+
+    def restart(self, slot: int) -> None:
+        """Start the slot's clock anew: its subtask begins."""
+        self._ticks[slot] = 0
 
     def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
         """Return the policy's actions (n, 7)."""
-        return self.answer(envs, observations)
+        ticks = [self._ticks[slot] for slot in slots]
+        self._ticks.update({slot: tick + 1 for slot, tick in zip(slots, ticks, strict=True)})
+        return self.answer(envs, observations, ticks)
 
-    def answer(self, envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
-        """Return the policy's answers (n, …): actions, or a high-level policy's logits."""
+    def answer(
+        self, envs: Sequence[Any], observations: Sequence[Any], ticks: Sequence[int] | None = None
+    ) -> NDArray[np.float32]:
+        """Return the policy's answers (n, …): actions, or a high-level policy's logits.
+
+        Args:
+            envs: the envs, for proprioception.
+            observations: their observations.
+            ticks: control steps since each env's subtask began, for a policy with a clock.
+        """
         with one_thread():
             vectors = np.stack([self._vector(env) for env in envs])
+            if self._clocked and ticks is not None:
+                clock = np.array(ticks, np.float32)[:, None] / SUBTASK_STEPS
+                vectors = np.concatenate([vectors, clock], axis=1, dtype=np.float32)
             return np.asarray(self._policy.act(self._features(observations), vectors), np.float32)
 
     def _features(self, observations: Sequence[Any]) -> NDArray[np.float32] | None:

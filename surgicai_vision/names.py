@@ -65,6 +65,9 @@ BOTH_ARMS = "both_arms"
 PRIVILEGED_STATE = "privileged_state"
 """The 21 values of obs_type "state", goal included. No LeRobot key, so that no policy is fed it by default."""
 
+CLOCKED_STATE = "clocked_state"
+"""STATE and, last, the control steps since the subtask began, as a share of its limit of `config.SUBTASK_STEPS`."""
+
 META_FILE = "meta/surgicai.json"
 """Our own sidecar inside a LeRobot dataset: cameras, units, renderer, hashes, versions."""
 

@@ -36,7 +36,7 @@ from surgicai_vision.config import digest, to_mapping
 from surgicai_vision.errors import InputError, OutputExists, SurgicaiError, UnknownName
 from surgicai_vision.features import Features
 from surgicai_vision.files import check_output, read_json, write_bytes, write_json
-from surgicai_vision.training_data import TrainingData, cuts, over_places, split
+from surgicai_vision.training_data import TrainingData, cuts, over_places, split, with_clock
 
 REQUEST, STATE = "training.json", "training_state.pt"
 STATE_EVERY = 5  # epochs between training states: a broken-off training loses at most these
@@ -144,9 +144,9 @@ def _check(task: _Task) -> None:
             raise InputError(f"The features of view '{entry.view}' are of another dataset; encode this one.")
     if len({entry.manifest["encoder_fingerprint"] for entry in task.features}) > 1:
         raise InputError("The features come from several encoders; encode every view by the same one.")
-    columns = task.dataset.columns()
     with torch.random.fork_rng(devices=[]):
         vector = task.untrained().inputs.vector
+    columns = with_clock(task.dataset.columns(), vector)
     for key in (vector or names.STATE, task.policy.target):
         if key not in columns:
             raise UnknownName("column", key, columns)
@@ -173,7 +173,7 @@ class _Training:
 
     def __init__(self, task: _Task, start: Any, device: torch.device) -> None:
         self.task, self.device = task, device
-        columns = task.dataset.columns()
+        columns = with_clock(task.dataset.columns(), task.untrained().inputs.vector)
         index = np.asarray(task.dataset.episode_index)
         self.rows, self.held_rows, self.held_episodes = split(index, task.recipe, task.seed)
         self.demonstrations = len(np.unique(index[self.rows]))

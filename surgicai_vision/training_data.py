@@ -7,7 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from surgicai_vision.config import TaskConfig
+from surgicai_vision import names
+from surgicai_vision.config import SUBTASK_STEPS, TaskConfig
 
 
 class TrainingData(Protocol):
@@ -21,6 +22,14 @@ class TrainingData(Protocol):
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return what policies are fed and learn, by key: (N, 7) state and action, (N,) phase, …"""
+
+
+def with_clock(columns: dict[str, np.ndarray], vector: str | None) -> dict[str, np.ndarray]:
+    """Return the columns, and `names.CLOCKED_STATE` (N, 8) beside them where that is the `vector` asked for."""
+    if vector != names.CLOCKED_STATE:
+        return columns
+    clock = np.asarray(columns["frame_index"], np.float32)[:, None] / SUBTASK_STEPS
+    return {**columns, vector: np.concatenate([columns[names.STATE], clock], axis=1, dtype=np.float32)}
 
 
 def split(episode_index: np.ndarray, recipe: Any, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:

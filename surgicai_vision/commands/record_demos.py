@@ -29,7 +29,10 @@ class Options:
 
     task: str = option("grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
     episodes: int = option(50, "successful episodes to keep", check=positive, metavar="N")
-    source: str = option("expert", "who acts: expert, or dmp: movement primitives learned from --from")
+    source: str = option(
+        "expert",
+        "who acts: expert; search: the expert without the grasp's goal; dmp: movement primitives learned from --from",
+    )
     from_: str | None = option(None, "demonstrations to learn from (--source dmp)", metavar="DEMOS")
     demos_used: int = option(1, "how many of them to learn from", check=positive, metavar="N")
     seed: int = option(names.TRAIN_SEED, "seed of the first start; each episode takes the next", check=not_negative)

@@ -4,8 +4,8 @@
 
 Each topic has its own times, with jitter and messages lost. Times are those of the headers where there are headers
 (shifted by the median delay, so that they agree with topics that have none), or else those of reception. Positions,
-joints and jaws are interpolated linearly between the two messages around a sample, rotations by slerp, labels are
-those last heard. A sample between two messages further apart than `max_gap` is not `valid`.
+joints and jaws are interpolated linearly between the two messages around a sample, rotations by slerp; labels and commands
+(a jaw from `servo_jp`) are those last heard. A sample between two messages further apart than `max_gap` is not `valid`.
 """
 
 from collections.abc import Mapping
@@ -26,6 +26,8 @@ LONGEST = 3600.0
 """Longest recording that is resampled [s]."""
 AMBF_UNIT = 0.1
 """Metres in a unit of length of the challenge's AMBF scenes (its `SimToSI`)."""
+COMMANDS = ("servo_jp", "move_jp")
+"""Last words of CRTK's topics that command joints."""
 ELSEWHERE = ("ecm", "cam")
 """What the name of a frame that is no arm's base contains: poses relative to the endoscope."""
 
@@ -48,7 +50,7 @@ class Recording:
         arms: arm → its motion; arms that were not recorded are missing.
         needle: T_world_needle (N, 4, 4), or None.
         label: label last heard, (N,) texts, "" before the first; or None.
-        valid: (N,) bool; False in a gap of any topic but the labels'.
+        valid: (N,) bool; False in a gap of any topic but labels and commands.
         time: since the first sample, as recorded, (N,) [s].
         topics: every topic of the bag with its type, for messages.
     """
@@ -78,35 +80,49 @@ def recording_of(arrays: Arrays, config: BagConfig, instrument: str) -> Recordin
     """
     times = _times(arrays, config)
     roles = _roles(arrays, config)
-    begin = max(times[role].min() for role in roles)
-    end = min(times[role].max() for role in roles)
+    steady = [role for role in roles if not _told(role, config)]
+    begin = max(times[role].min() for role in steady)
+    end = min(times[role].max() for role in steady)
     if not begin < end <= begin + LONGEST * 1e9 * config.speed:
         raise InputError(
             f"The topics overlap in {(end - begin) / 1e9:.1f} s; that must be above 0 and at most {LONGEST:.0f} s."
         )
     step = 1e9 / RATE * config.speed
     grid = np.arange(0.0, (end - begin) + 1e-6 * step, step)
+    tracks = {role: _distinct(times[role], arrays[f"{role}.value"], begin) for role in roles}
     valid = np.ones(len(grid), bool)
+    for role in steady:
+        valid &= _covered(tracks[role][0], grid, config.max_gap * 1e9)
     arms: dict[str, Arm] = {}
-    needle = None
     for role in roles:
-        own = _distinct(times[role], arrays[f"{role}.value"], begin)
-        valid &= _covered(own[0], grid, config.max_gap * 1e9)
-        if role == "needle":
-            needle = _needle(own, grid, arrays, config)
-        elif not role.endswith("_jaw"):
-            arm = role.split("_")[0]
-            jaw_role = f"{arm}_jaw"
-            jaw = None
-            if jaw_role in roles:
-                angle = _distinct(times[jaw_role], arrays[f"{jaw_role}.value"], begin)
-                jaw = config.jaw * np.interp(grid, *angle)
-            arms[arm] = Arm(_tip(role, own, grid, arrays, config, instrument), jaw)
+        arm, _, kind = role.partition("_")
+        if kind in ("pose", "joints"):
+            jaw = _jaw(f"{arm}_jaw", tracks, grid, config)
+            arms[arm] = Arm(_tip(role, tracks[role], grid, arrays, config, instrument), jaw)
+    needle = _needle(tracks["needle"], grid, arrays, config) if "needle" in tracks else None
     label = None
     if "label.value" in arrays:
-        heard = np.searchsorted(times["label"] - begin, grid, side="right") - 1
-        label = np.where(heard >= 0, arrays["label.value"][np.maximum(heard, 0)], "")
+        spoken = _distinct(times["label"], arrays["label.value"], begin)
+        label = np.where(spoken[0][0] <= grid, _last(spoken, grid), "")
     return Recording(arms, needle, label, valid, grid / 1e9, tuple(map(str, arrays["topics"])))
+
+
+def _told(role: str, config: BagConfig) -> bool:
+    """Say whether a role's topic has commands, which come when something changes and hold until the next."""
+    return role.endswith("_jaw") and config.all_topics[role].rsplit("/", 1)[-1] in COMMANDS
+
+
+def _last(track: "Track", grid: np.ndarray) -> np.ndarray:
+    """Return the value last heard at each sample, before the first one the first."""
+    times, values = track
+    return values[np.maximum(np.searchsorted(times, grid, side="right") - 1, 0)]
+
+
+def _jaw(role: str, tracks: Mapping[str, "Track"], grid: np.ndarray, config: BagConfig) -> np.ndarray | None:
+    """Return one finger's angle (N,) [rad]; None where it is not on record."""
+    if role not in tracks:
+        return None
+    return config.jaw * (_last(tracks[role], grid) if _told(role, config) else np.interp(grid, *tracks[role]))
 
 
 def _roles(arrays: Arrays, config: BagConfig) -> list[str]:

@@ -1,0 +1,71 @@
+"""Count how often a grasp can succeed without knowing which point of the needle is asked for.
+
+    python benchmarks/grasp_ceiling.py --episodes 200
+
+`once`: the expert takes the needle in the middle of the range of goals, seeing everything else. `search`: it takes it
+twice (`surgicai_vision.demos.searching`). Both bound what a policy can reach that sees pictures alone.
+"""
+
+import argparse
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from common import chunks, emit, median, spread
+
+from surgicai_vision import envs
+from surgicai_vision.config import TaskConfig
+from surgicai_vision.demos.searching import Searcher
+from surgicai_vision.statistics import clopper_pearson
+
+MIDDLE = math.radians(12.5)
+
+
+class Once(Searcher):
+    """Takes the needle once, in the middle of the range."""
+
+    ATTEMPTS, AGAIN = (MIDDLE, MIDDLE), 1_000_000
+
+
+WAYS: dict[str, Callable[[Any], Searcher]] = {"once": Once, "search": Searcher}
+
+
+def play(seeds: range, way: str) -> list[tuple[bool, int]]:
+    """Play the seeds; success and steps of each."""
+    env, rows = envs.make(TaskConfig("grasp")), []
+    for seed in seeds:
+        env.reset(seed=seed)
+        actor, ended, steps, info = WAYS[way](env), False, 0, {"is_success": False}
+        while not ended:
+            _, _, terminated, truncated, info = env.step(actor.action())
+            ended, steps = terminated or truncated, steps + 1
+        rows.append((bool(info["is_success"]), steps))
+    return rows
+
+
+def main() -> None:
+    """Measure both ways and print one JSON line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=900_000)
+    parser.add_argument("--workers", type=int, default=2)
+    given = parser.parse_args()
+    table = {}
+    for way in WAYS:
+        rows = sum(spread(partial(play, way=way), chunks(given.seed, given.episodes), given.workers), [])
+        wins = [steps for success, steps in rows if success]
+        low, high = clopper_pearson(len(wins), len(rows))
+        table[way] = {
+            "k": len(wins),
+            "n": len(rows),
+            "low": low,
+            "high": high,
+            "steps": median(wins),
+            "max": max(wins),
+        }
+    emit("grasp_ceiling", {"task": "grasp", **table})
+
+
+if __name__ == "__main__":
+    main()

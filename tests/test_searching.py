@@ -1,0 +1,76 @@
+"""Searching: grasps without the goal; the clock that lets a policy learn them."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_training import FakeDataset
+
+from policies.base import Recipe
+from policies.bc import BC
+from surgicai_vision import envs, names
+from surgicai_vision.agents import PolicyAgent
+from surgicai_vision.config import SUBTASK_STEPS, TaskConfig
+from surgicai_vision.demos.searching import Searcher
+from surgicai_vision.errors import InputError
+from surgicai_vision.registry import load_policy
+from surgicai_vision.training import train
+
+
+def grasp(env: envs.SuturingEnv, seed: int, goal: float | None = None) -> tuple[bool, np.ndarray]:
+    env.reset(seed=seed)
+    if goal is not None:
+        env.simulation.memory.grasp_angle = math.radians(goal)
+    actor, actions, ended, info = Searcher(env), [], False, {}
+    while not ended:
+        actions.append(actor.action())
+        _, _, terminated, truncated, info = env.step(actions[-1])
+        ended = terminated or truncated
+    return info["is_success"], np.stack(actions)
+
+
+def test_it_meets_every_goal_and_reads_none() -> None:
+    env = envs.make(TaskConfig("grasp"))
+    for seed, goals in ((500_000, (5.0, 9.0, 13.0)), (500_001, (12.0, 16.0, 20.0))):
+        tried = [grasp(env, seed, goal) for goal in goals]
+        assert all(success for success, _ in tried)
+        shortest = min(len(actions) for _, actions in tried)
+        for _, actions in tried[1:]:
+            np.testing.assert_array_equal(actions[:shortest], tried[0][1][:shortest])
+    assert len(grasp(env, 500_000, 5.0)[1]) < Searcher.AGAIN < len(grasp(env, 500_000, 20.0)[1]) < SUBTASK_STEPS
+
+
+class Stepped(FakeDataset):
+    """A dataset whose action is the clock's."""
+
+    def columns(self) -> dict[str, np.ndarray]:
+        columns = super().columns()
+        step = np.tile(np.arange(self.steps), self.episodes)
+        clock = np.where(step >= self.steps // 2, 0.5, -0.5).astype(np.float32)
+        return {**columns, "frame_index": step, names.ACTION: np.repeat(clock[:, None], 7, axis=1)}
+
+
+class Still:
+    """An env whose proprioception never changes."""
+
+    def agent_pos(self) -> np.ndarray:
+        return np.zeros(7, np.float32)
+
+
+def test_a_policy_with_a_clock_acts_by_it(tmp_path: Path) -> None:
+    recipe = Recipe(hidden=(32,), epochs=60, batch_size=32, learning_rate=1e-2, clock=True)
+    train(Stepped(), [], BC, recipe, out=tmp_path / "clocked")
+    policy = load_policy(tmp_path / "clocked")
+    agent = PolicyAgent("clocked", policy, None, (), 224, policy.inputs.vector)
+    agent.begin(0, Still(), 0)
+    early = [agent.act([0], [Still()], [None])[0, 0] for _ in range(40)]
+    assert np.mean(early[:18]) < -0.3 and np.mean(early[22:]) > 0.3
+    agent.restart(0)
+    assert agent.act([0], [Still()], [None])[0, 0] == early[0]
+
+
+def test_a_clock_goes_with_proprioception() -> None:
+    with pytest.raises(InputError, match="clock goes with proprioception"):
+        replace(Recipe(), clock=True, proprioception=False)
