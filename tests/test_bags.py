@@ -162,6 +162,22 @@ def test_jitter_and_lost_messages_do_not_show_after_resampling(tmp_path, lost, l
     np.testing.assert_allclose(recording.arms["psm2"].jaw, 0.5 * (0.4 + 0.2 * np.sin(seconds)), atol=1e-3)
 
 
+def test_a_commanded_jaw_holds_until_the_next_command(tmp_path):
+    """The challenge publishes no measured jaw; its command comes when it changes."""
+    motion = shown("grasp")
+    found = streams(motion)
+    times = found["psm2_pose"][0]
+    middle = times[len(times) // 2]
+    found["psm2_jaw"] = np.array([times[3], middle]), [0.5, 0.1]
+    topics = {**TOPICS, "psm2_jaw": "/CRTK/psm2/jaw/servo_jp"}
+    config = BagConfig(jaw_scale=1.0, topics=Topics(psm2_jaw="/CRTK/psm2/jaw/servo_jp"))
+    recording = recorded(write_bag(tmp_path / "trial", "mcap", found, topics), config)
+    assert len(recording) == len(motion)
+    assert recording.valid.all()
+    wanted = np.where(times < middle, 0.5, 0.1)
+    np.testing.assert_array_equal(recording.arms["psm2"].jaw, wanted)
+
+
 def test_speed_stretches_the_motion(tmp_path):
     bag = write_bag(tmp_path / "trial", "mcap", streams(shown("grasp")))
     normal, slow = recorded(bag), recorded(bag, BagConfig(speed=0.5))

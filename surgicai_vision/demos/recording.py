@@ -4,8 +4,9 @@
 
 Each topic has its own times, with jitter and messages lost. Times are those of the headers where there are headers
 (shifted by the median delay, so that they agree with topics that have none), or else those of reception. Positions,
-joints and jaws are interpolated linearly between the two messages around a sample, rotations by slerp; labels and commands
-(a jaw from `servo_jp`) are those last heard. A sample between two messages further apart than `max_gap` is not `valid`.
+joints and jaws are interpolated linearly between the two messages around a sample, rotations by slerp; labels and
+commands (a jaw from `servo_jp`) are those last heard. A sample between two messages further apart than `max_gap` is
+not `valid`.
 """
 
 from collections.abc import Mapping
