@@ -53,7 +53,8 @@ def main() -> None:
     given = parser.parse_args()
     table = {}
     for way in WAYS:
-        rows = sum(spread(partial(play, way=way), chunks(given.seed, given.episodes), given.workers), [])
+        played = spread(partial(play, way=way), chunks(given.seed, given.episodes), given.workers)
+        rows = [row for part in played for row in part]
         wins = [steps for success, steps in rows if success]
         low, high = clopper_pearson(len(wins), len(rows))
         table[way] = {

@@ -2,8 +2,8 @@
 
 The goal of a grasp is a point of the needle drawn from 5° to 20° (2.7 mm of its arc), which no picture shows. Success
 is 1 mm: whoever takes the needle in the middle meets at most 11.3° of those 15°. `Searcher` takes it at 8.75°, and
-where the episode then has not ended by step `Searcher.AGAIN`, opens, and takes it at 16.25°: each attempt reaches 5.6° to both
-sides. Its labels depend on what is seen and on the time, so that a policy with a clock can learn them
+where the episode then has not ended by its step `AGAIN`, opens, and takes it at 16.25°: each attempt reaches 5.6° to
+both sides. Its labels depend on what is seen and on the time, so that a policy with a clock can learn them
 (`benchmarks/grasp_ceiling.py` measures both ways). In every other subtask it is the expert.
 """
 
