@@ -8,7 +8,9 @@ every episode takes all its steps. One env at a time: one process, one slot (the
 process for each core, eight slots in each (the encoder sees up to eight frames at once). Start-up of processes and the
 loading of the encoder count on both sides. Both must give the same row for every seed, and the same states.
 
-A and B take turns; figures are medians over the turns, ratios medians of the turns' ratios.
+A and B take turns; figures are medians over the turns, ratios medians of the turns' ratios. Beside the wall's time
+stands the CPU time of all processes over their number: what the wall would show if each had a core of its own. On a
+machine that others use too only the latter means something.
 """
 
 import argparse
@@ -55,18 +57,27 @@ def same(one: list[Episode], other: list[Episode]) -> int:
     return sum(repr(a.row) == repr(b.row) and np.array_equal(a.film.states, b.film.states) for a, b in pairs)
 
 
+def cpu_time() -> float:
+    """Return the CPU time of this process and of its ended children [s]."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
+
+
 def measure(episodes: int, steps: int, repeats: int) -> dict[str, Any]:
     """Time both and compare them row by row."""
     config, seeds = TaskConfig("grasp", max_steps=steps), range(names.TEST_SEED, names.TEST_SEED + episodes)
     kinds: tuple[dict[str, Any], ...] = ({"batch": 1, "workers": 1}, {})
     times: tuple[list[float], list[float]] = ([], [])
+    cpu: tuple[list[float], list[float]] = ([], [])
+    processes = (1, min(len(os.sched_getaffinity(0)), -(-episodes // 4)))
     equal = episodes
     for turn in range(repeats):
         found: dict[int, list[Episode]] = {}
         for index in (0, 1) if turn % 2 else (1, 0):
-            start = time.perf_counter()
+            start, used = time.perf_counter(), cpu_time()
             found[index] = evaluate(make_agent, config, seeds, **kinds[index])
             times[index].append(time.perf_counter() - start)
+            cpu[index].append((cpu_time() - used) / processes[index])
         equal = min(equal, same(found[0], found[1]))
     total = sum(episode.row.steps for episode in found[0])
     return {
@@ -75,6 +86,9 @@ def measure(episodes: int, steps: int, repeats: int) -> dict[str, Any]:
         "one_env_at_a_time_steps_per_s": round(total / median(times[0], 9), 1),
         "default_steps_per_s": round(total / median(times[1], 9), 1),
         "times_as_fast": median([a / b for a, b in zip(*times, strict=True)]),
+        "one_env_at_a_time_cpu_s": median(cpu[0]),
+        "default_cpu_s_a_process": median(cpu[1]),
+        "times_as_fast_by_cpu": median([a / b for a, b in zip(*cpu, strict=True)]),
         "paired_rows": episodes,
         "equal_rows": equal,
     }
