@@ -279,6 +279,10 @@ FORBIDDEN = {
     "shell": "import os; os.system('true')",
     "fork": "import os; os.fork()",
     "another file": "open({other!r}, 'w')",
+    "folder": "import os; os.mkdir({other!r})",
+    "removal": "import os; os.remove(os.__file__ + 'x')",
+    "signal": "import os; os.kill(os.getppid(), 0)",
+    "packed folder": "import shutil; shutil.copytree('/etc', {other!r})",
     "memory": "x = bytearray(3 * 2**30)",
 }
 

@@ -5,7 +5,7 @@
 
 The child sets its limits before it opens the file: memory, processor time, size of what it writes, and, where the
 kernel lets it, a network namespace of its own with nothing in it; an audit hook that cannot be removed then ends
-every attempt to start a process, to open a socket or to open any file for writing (its one result is open by then).
+every attempt to start a process, to open a socket, to change or to write any file (its one result is open by then).
 It hands back plain arrays (npz without pickles). Whatever goes wrong in it is a `BadFile`, or the `InputError` of its
 reader.
 """
@@ -45,6 +45,17 @@ REFUSED = (
     "os.spawn",
     "ctypes.",
     "pty.",
+    "os.chmod",
+    "os.kill",
+    "os.link",
+    "os.mkdir",
+    "os.remove",
+    "os.rename",
+    "os.rmdir",
+    "os.symlink",
+    "os.truncate",
+    "shutil.",
+    "tempfile.",
 )
 """Audit events (by their beginning) that end the child."""
 
