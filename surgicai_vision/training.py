@@ -18,11 +18,12 @@ The split is by episode unless the recipe says otherwise. The validation loss is
 nothing: the last epoch is the checkpoint. The same seed gives the same weights on one machine.
 """
 
+import ctypes
 import io
 import json
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,8 @@ from surgicai_vision.training_data import TrainingData, cuts, over_places, split
 
 REQUEST, STATE = "training.json", "training_state.pt"
 STATE_EVERY = 5  # epochs between training states: a broken-off training loses at most these
-STATISTICS_ROWS = 4096  # rows summed at a time
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of malloc.h
+STATISTICS_ROWS = 1024  # rows summed at a time
 SMALLEST_STD = 1e-6  # an input that varies less is constant, and only its mean is removed
 
 Progress = Callable[[int, int], None]
@@ -99,10 +101,21 @@ def train(
         return read_checkpoint(out)
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / REQUEST, request)
+    _keep_memory()
     with torch.random.fork_rng(devices=[]), _one_thread():
         checkpoint = _Training(task, start, torch.device(device)).run(out, save_every, progress, log)
     (out / STATE).unlink(missing_ok=True)
     return checkpoint
+
+
+def _keep_memory() -> None:
+    """Let glibc keep what is freed: a batch of feature maps is allocated anew each step, and handing its pages back
+    and forth costs 1.5 times the arithmetic (221 against 84 ms of CPU a step of 256 maps of 48 × 28 × 28).
+    """
+    with suppress(OSError, AttributeError):  # another C library
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(MMAP_THRESHOLD, 1 << 30)
+        mallopt(TRIM_THRESHOLD, (1 << 31) - 1)
 
 
 @contextmanager
