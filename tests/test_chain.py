@@ -154,6 +154,8 @@ def test_policies_of_a_chain_share_features() -> None:
     agents = [PolicyAgent("a", policy, encoder, ("back",), 4) for _ in range(2)]
     for one in agents:
         one.share(shared)
+        for slot in range(3):
+            one.begin(slot, None, 0)
     observations = [{"pixels": {"back": np.full((4, 4, 3), value, np.uint8)}} for value in (1, 2, 3)]
     envs = [SimpleNamespace(agent_pos=lambda: np.zeros(7, np.float32))] * 3
     assert agents[0].act([0, 2], envs[:2], observations[::2])[:, 0].tolist() == [1, 3]
@@ -178,3 +180,11 @@ def test_wrong_chains_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "chain.yaml").write_text("hlp: order\ngrasp: expert\n")
     assert main(["evaluate", str(tmp_path / "chain.yaml")]) == 2
     assert "'place'" in capsys.readouterr().err
+
+
+def test_the_documented_chain_is_one(root: Path) -> None:
+    import yaml
+
+    text = (root / "docs" / "chain.md").read_text(encoding="utf-8")
+    made = from_mapping(Chain, yaml.safe_load(text.split("```yaml\n")[1].split("```")[0]))
+    assert made.termination in chain.TERMINATIONS and all(f"{s}-of-suture-state" in getattr(made, s) for s in EXPERTS)
