@@ -49,6 +49,8 @@ DRIVE = math.radians(1.8)
 """Rotation of the needle per control step on the circle [rad]."""
 LEAD = math.radians(9.0)
 """Furthest the command may run ahead of the needle [rad]."""
+BLOCKED = 0.001
+"""A needle this far off its path [m] is held back: in `3dmed_straight` PSM2's wrist meets the ridge's steep flank."""
 HANDOFF_OFFSET = math.radians(4.0)
 """The expert takes the needle a little nearer to the tip than the goal, away from the tissue."""
 
@@ -237,11 +239,14 @@ def _insert(scene: Sight) -> Wish:
 
 
 def _drive(scene: Sight, turned: float, last: float) -> Wish:
-    """Move the needle on along its path, up to `last` [rad]."""
+    """Move the needle on along its path, up to `last` [rad]; once it is through and off the path, press no further."""
     start = scene.stitch.place()
     commanded = turn_about_wound(start, scene.commanded_needle)
-    ahead = max(min(commanded, turned + LEAD), turned - LEAD)
-    return Wish(scene.carrying(on_path(scene.stitch, min(max(ahead, 0.0) + DRIVE, last))), 0.0)
+    ahead = max(min(commanded, turned + LEAD), turned - LEAD) + DRIVE
+    off = scene.needle[:3, 3] - on_path(scene.stitch, min(max(turned, 0.0), last))[:3, 3]
+    if scene.memory.passed >= 2.0 and float(np.linalg.norm(off)) > BLOCKED:
+        ahead = min(ahead - DRIVE, turned)
+    return Wish(scene.carrying(on_path(scene.stitch, min(max(ahead, 0.0), last))), 0.0)
 
 
 def _pullout(scene: Sight) -> Wish:
