@@ -21,12 +21,14 @@ FRAMES: Mapping[str, int] = MappingProxyType(
     {"grasp": 70, "place": 90, "insert": 90, "handoff": 110, "pullout": 90, "suture": 450}
 )
 """Frames of a demonstration by the expert, about."""
-RECORD, RENDER = 0.0025, 0.009
+RECORD, RENDER = 0.0045, 0.008
 """Per frame recorded; per view and frame rendered and written [s]."""
-ENCODE: Mapping[str, float] = MappingProxyType({"imagenet-lite": 0.01, "random": 0.03})
+ENCODE: Mapping[str, float] = MappingProxyType({"imagenet-lite": 0.017, "random": 0.035})
 ENCODE_ELSE = 0.08
 """Per frame encoded [s]: the two light encoders, and a ResNet-50 or a small transformer."""
-TRAIN = 3e-5
+LIVE = 2.5
+"""Encoding in an evaluation takes so many times as long a frame: eight at a time at most, and seldom as many."""
+TRAIN = 4e-5
 """Per frame and epoch [s]."""
 EPOCHS = 30
 STEP, SEE = 0.002, 0.006
@@ -90,5 +92,5 @@ def _train(grid: Grid, cell: Cell) -> float:
 def _cell_seconds(grid: Grid, cell: Cell) -> float:
     """Return the estimate of one cell: training, unless chains share it, and evaluation."""
     steps = grid.episodes * 200 * (len(names.SUBTASKS) if cell.task == names.SUTURE else 1)
-    look = len(cell.view) * (SEE + _encode(cell.encoder))
+    look = len(cell.view) * (SEE + LIVE * _encode(cell.encoder))
     return START + (0.0 if cell.chain else _train(grid, cell)) + steps * (STEP + look)
