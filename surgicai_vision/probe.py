@@ -25,7 +25,7 @@ from surgicai_vision.scene.needle import TIP_ANGLE, point
 from surgicai_vision.scene.rotations import quaternion_to_matrix
 
 FOLDS = 5
-FRAMES = 1500
+FRAMES = 1000
 FEWEST = 5  # episodes: fewer leave no episodes to choose a penalty on
 PENALTIES = np.logspace(-7, 2, 28)
 """Tried penalties, as shares of the features' total variance."""

@@ -107,7 +107,7 @@ def test_frames_are_spread_over_every_episode() -> None:
     index = np.repeat(np.arange(4), [3, 1000, 1000, 1000])
     rows = spread(index, FRAMES)
     counts = np.bincount(index[rows])
-    assert counts.tolist() == [3, 375, 375, 375] and len(set(rows.tolist())) == len(rows)
+    assert counts.tolist() == [3, 250, 250, 250] and len(set(rows.tolist())) == len(rows)
     assert rows[3] == 3 and rows[-1] == len(index) - 1
 
 
