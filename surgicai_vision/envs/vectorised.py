@@ -269,16 +269,17 @@ def _merged(parts: list[dict[str, Any]], sizes: list[int]) -> dict[str, Any]:
     if len(parts) == 1:
         return parts[0]
     merged: dict[str, Any] = {}
-    for key in dict.fromkeys(key for part in parts for key in part):
-        values = [part.get(key) for part in parts]
+    for key in dict.fromkeys(itertools.chain.from_iterable(parts)):
+        values: list[Any] = [part.get(key) for part in parts]
         known = next(value for value in values if value is not None)
         if isinstance(known, dict):
             merged[key] = _merged([value or {} for value in values], sizes)
             continue
-        empty = None if known.dtype == object else 0
-        rows = [
-            np.full((size, *known.shape[1:]), empty, known.dtype) if value is None else value
-            for value, size in zip(values, sizes, strict=True)
-        ]
-        merged[key] = np.concatenate(rows)
+        if any(value is None for value in values):
+            empty = None if known.dtype == object else 0
+            values = [
+                np.full((size, *known.shape[1:]), empty, known.dtype) if value is None else value
+                for value, size in zip(values, sizes, strict=True)
+            ]
+        merged[key] = np.concatenate(values)
     return merged
