@@ -16,7 +16,6 @@ from surgicai_vision.agents import BASELINES, NoisyAgent, PolicyAgent, ReplayAge
 from surgicai_vision.config import DEVIATIONS, Deviations, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.evaluation import Agent, MakeAgent, evaluate
-from surgicai_vision.executor import LOCAL, Engine
 from surgicai_vision.provenance import command_line, provenance
 from surgicai_vision.results import MARKER, write_evaluation
 
@@ -135,34 +134,6 @@ def policy_name(
     return "-".join([*([] if policy == "bc" else [policy]), name.replace(":", "-"), *unusual])
 
 
-def prepare_dataset(
-    config: TaskConfig,
-    folder: Path,
-    stage: Stage,
-    *,
-    demonstrations: int,
-    views: Sequence[str],
-    size: int,
-    depth: bool,
-    workers: int,
-    engine: Engine = LOCAL,
-) -> Path:
-    """Record demonstrations into `folder`/demos and render them into `folder`/dataset; return the latter."""
-    from surgicai_vision.dataset import render_demos
-    from surgicai_vision.demos.record import record
-
-    with stage(f"demos: {demonstrations} of {config.task}", "episodes") as progress:
-        record(
-            config, episodes=demonstrations, out=folder / "demos", workers=workers, engine=engine, progress=progress
-        )
-    with stage(f"dataset: {', '.join(views)} at {size} px", "frames") as progress:
-        render_demos(
-            folder / "demos", folder / "dataset", views=views, size=size, depth=depth, workers=workers,
-            engine=engine, progress=progress,
-        )  # fmt: skip
-    return folder / "dataset"
-
-
 def train_cell(
     cell: Cell,
     dataset: Any,
@@ -172,6 +143,7 @@ def train_cell(
     *,
     accept_licence: bool = False,
     start: Path | None = None,
+    subtask: str | None = None,
     save_every: int = 0,
     log: Callable[[int, dict[str, float]], None] | None = None,
 ) -> None:
@@ -185,19 +157,23 @@ def train_cell(
         weights: file with the encoder's pretrained weights.
         accept_licence: accept weights under a non-commercial licence.
         start: checkpoint folder to start from (fine-tuning).
+        subtask: train on this subtask's frames of the dataset's whole procedures.
         save_every: also keep a checkpoint every so many epochs.
         log: called with (epoch, losses by name).
     """
     from surgicai_vision import registry
     from surgicai_vision.dataset.part import first_episodes
+    from surgicai_vision.dataset.subtask import subtask_of
     from surgicai_vision.training import train
 
     recipe = registry.load_recipe(cell.policy, cell.recipe, cell.changes)
     begin = registry.load_policy(start) if start else None
     features, beside = encode_cell(cell, dataset, stage, weights, accept_licence=accept_licence)
-    if cell.demonstrations is not None:
-        dataset = first_episodes(dataset, cell.demonstrations)
-        features = [entry.first(dataset.length, dataset.fingerprint) for entry in features]
+    parts: tuple[tuple[Any, Callable[..., Any]], ...] = ((cell.demonstrations, first_episodes), (subtask, subtask_of))
+    for which, take in parts:
+        if which is not None:
+            dataset = take(dataset, which)
+            features = [entry.part(dataset.rows, dataset.fingerprint) for entry in features]
     with stage(f"policy: {cell.name}", "epochs") as progress:
         plugin = registry.policy_plugin(cell.policy)
         train(

@@ -98,10 +98,10 @@ class Features:
         """Length of one row."""
         return self.rows.shape[1]
 
-    def first(self, length: int, dataset: str) -> "Features":
-        """Return the first `length` rows as the features of that part, whose fingerprint is `dataset`; no copy."""
-        manifest = {**self.manifest, "length": length, "dataset": dataset}
-        return replace(self, manifest=manifest, rows=self.rows[:length])
+    def part(self, rows: Any, dataset: str) -> "Features":
+        """Return some rows, a slice or (n,) indices, as the features of that part, whose fingerprint is `dataset`."""
+        taken = self.rows[rows]
+        return replace(self, manifest={**self.manifest, "length": len(taken), "dataset": dataset}, rows=taken)
 
 
 default_cache_root = cache_root

@@ -16,7 +16,6 @@ from surgicai_vision.cells import (
     baseline_subject,
     checkpoint_subject,
     evaluate_once,
-    prepare_dataset,
     timed,
     train_cell,
 )  # fmt: skip
@@ -105,6 +104,8 @@ def run_quickstart(plan: Quickstart, out: Path, stage: Stage, workers: int) -> d
     run = _open_run(plan, out)
     config, seeds = TaskConfig(plan.task), range(names.TEST_SEED, names.TEST_SEED + plan.episodes)
     with timed(stage, run["seconds"]) as measured:
+        from surgicai_vision.dataset.preparing import prepare_dataset
+
         dataset_folder = prepare_dataset(
             config, out, measured, demonstrations=plan.demonstrations, views=plan.view, size=plan.size,
             depth=plan.depth, workers=workers,

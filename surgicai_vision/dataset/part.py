@@ -42,6 +42,11 @@ class DatasetPart:
         self.task, self.views, self.image_size = dataset.task, dataset.views, dataset.image_size
         self.length = dataset.bounds()[episodes - 1][1]
 
+    @property
+    def rows(self) -> slice:
+        """Which frames of the whole it holds."""
+        return slice(0, self.length)
+
     @functools.cached_property
     def fingerprint(self) -> str:
         """sha256 (hex) over the whole's fingerprint and what is left of it."""

@@ -52,6 +52,11 @@ class SubtaskPart:
         self.config: TaskConfig = replace(dataset.config, task=subtask, max_steps=limit)
         self.views, self.image_size, self.length = dataset.views, dataset.image_size, len(self._rows)
 
+    @property
+    def rows(self) -> np.ndarray:
+        """Which frames of the whole it holds, (N,) int64."""
+        return self._rows
+
     @functools.cached_property
     def fingerprint(self) -> str:
         """sha256 (hex) over the whole's fingerprint and the subtask."""

@@ -43,9 +43,9 @@ def estimate(grid: Grid, out: Path, states: Sequence[CellState], workers: int) -
     """Return {"seconds": of the whole run with so many workers, "source": what the estimate stands on}."""
     to_do = [state.cell for state in states if state.state == TO_DO]
     jobs = Jobs(grid, out)
-    tasks = {task for cell in to_do for task in jobs.tasks(cell) if not jobs.dataset_digest(task)}
+    tasks = {cell.task for cell in to_do if not jobs.dataset_digest(cell.task)}
     shared = sum(_data_seconds(grid, task) for task in tasks)
-    seen = {(part.task, part.encoder, view) for cell in to_do for part in _parts(cell) for view in part.view}
+    seen = {(cell.task, cell.encoder, view) for cell in to_do for view in cell.view}
     shared += sum(_frames(grid, task) * _encode(encoder) for task, encoder, view in seen)
     shared += sum(_train(grid, part) for part in {part for cell in to_do if cell.chain for part in _parts(cell)})
     ratios = _ratios(grid, jobs, states)

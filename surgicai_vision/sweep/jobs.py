@@ -47,7 +47,7 @@ def train_policy(
 ) -> None:
     """Job "sweep-policy": train one policy of a chain."""
     os.environ.update(environment)
-    train_cell(_cell(cell), _dataset(dataset), folder, silent, accept_licence=accept_licence)
+    train_cell(_cell(cell), _dataset(dataset), folder, silent, accept_licence=accept_licence, **options)
 
 
 def run_cell(

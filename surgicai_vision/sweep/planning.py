@@ -3,7 +3,7 @@
 import functools
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -108,13 +108,9 @@ class Jobs:
                 self._digests[task] = None
         return self._digests[task]
 
-    def tasks(self, cell: Cell) -> tuple[str, ...]:
-        """Return the tasks whose datasets a cell needs."""
-        return tuple(part.task for part in chain_parts(cell).values()) if cell.chain else (cell.task,)
-
     def cell_key(self, cell: Cell) -> str | None:
         """Return the key of a cell's job; None where it cannot be known yet."""
-        return self.cell(cell).key() if all(map(self.dataset_digest, self.tasks(cell))) else None
+        return self.cell(cell).key() if self.dataset_digest(cell.task) else None
 
     def cell(self, cell: Cell) -> Job:
         """Return the job that trains and evaluates a cell, or evaluates the chain of policies made before."""
@@ -131,14 +127,14 @@ class Jobs:
         return Job("sweep-cell", arguments, tuple(inputs), label=(*LABELS, "final", "policies"))
 
     def policy(self, part: Cell) -> Job:
-        """Return the job that trains one policy of a chain."""
-        arguments = {"cell": to_mapping(part), **self._common(part)}
-        return Job("sweep-policy", arguments, tuple(self._inputs(part)), label=LABELS)
+        """Return the job that trains one policy of a chain, on its subtask's frames of whole procedures."""
+        whole = replace(part, task=names.SUTURE)
+        subtask = {} if part.task == names.SUTURE else {"subtask": part.task}
+        arguments = {"cell": to_mapping(whole), **self._common(whole), "options": subtask}
+        return Job("sweep-policy", arguments, tuple(self._inputs(whole)), label=LABELS)
 
     def features(self, cell: Cell) -> list[Job]:
         """Return the jobs that encode what a cell, or a chain's policies, see."""
-        if cell.chain:
-            return [job for part in chain_parts(cell).values() for job in self.features(part)]
         if not cell.encoder or cell.encoder == OWN:
             return []
         jobs = []

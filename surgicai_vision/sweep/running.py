@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, final
 
 from surgicai_vision import files
-from surgicai_vision.cells import Cell, Stage, prepare_dataset
+from surgicai_vision.cells import Cell, Stage
 from surgicai_vision.config import TaskConfig, digest, to_mapping
 from surgicai_vision.errors import InputError, OutputExists, SurgicaiError
 from surgicai_vision.executor import LOCAL, Engine, Job, claim, run
@@ -130,7 +130,9 @@ class _Sweep:
 
     def prepare(self, to_do: Sequence[CellState], workers: int, engine: Engine) -> None:
         """Make the datasets, features and policies that cells share; a task whose dataset fails fails its cells."""
-        needed = {task: None for state in to_do for task in self.jobs.tasks(state.cell)}
+        from surgicai_vision.dataset.preparing import prepare_dataset  # a sweep that is done renders nothing
+
+        needed = {state.cell.task: None for state in to_do}
         replayed = [task for task in self.grid.task if self.grid.replay and not self._filed_reference("replay", task)]
         for task in [*needed, *(task for task in replayed if task not in needed)]:
             try:
@@ -141,7 +143,7 @@ class _Sweep:
                 )  # fmt: skip
             except SurgicaiError as error:
                 for state in to_do:
-                    if task in self.jobs.tasks(state.cell):
+                    if task == state.cell.task:
                         self._fail(state, error)
         self._renew()
         live = [state.cell for state in to_do if state.key not in self.errors]

@@ -1,0 +1,35 @@
+"""Prepare: a task's demonstrations and its dataset in one folder, each made where it is missing."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision.config import TaskConfig
+from surgicai_vision.dataset.rendering import render_demos
+from surgicai_vision.demos.record import record
+from surgicai_vision.executor import LOCAL, Engine
+
+
+def prepare_dataset(
+    config: TaskConfig,
+    folder: Path,
+    stage: Any,
+    *,
+    demonstrations: int,
+    views: Sequence[str],
+    size: int,
+    depth: bool,
+    workers: int,
+    engine: Engine = LOCAL,
+) -> Path:
+    """Record demonstrations into `folder`/demos and render them into `folder`/dataset; return the latter."""
+    with stage(f"demos: {demonstrations} of {config.task}", "episodes") as progress:
+        record(
+            config, episodes=demonstrations, out=folder / "demos", workers=workers, engine=engine, progress=progress
+        )
+    with stage(f"dataset: {', '.join(views)} at {size} px", "frames") as progress:
+        render_demos(
+            folder / "demos", folder / "dataset", views=views, size=size, depth=depth, workers=workers,
+            engine=engine, progress=progress,
+        )  # fmt: skip
+    return folder / "dataset"
