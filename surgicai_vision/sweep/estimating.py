@@ -35,6 +35,8 @@ STEP, SEE = 0.002, 0.006
 """Per control step of an evaluation; and per view seen [s]."""
 LEROBOT: Mapping[str, float] = MappingProxyType({"act": 0.15, "diffusion": 0.25})
 """Per picture of a batch in one update [s]."""
+ACT: Mapping[str, float] = MappingProxyType({"act": 0.02, "diffusion": 0.1})
+"""Per control step, what LeRobot's policies take themselves [s]."""
 START = 3.0
 """Per cell [s]: what each needs to begin."""
 
@@ -93,4 +95,4 @@ def _cell_seconds(grid: Grid, cell: Cell) -> float:
     """Return the estimate of one cell: training, unless chains share it, and evaluation."""
     steps = grid.episodes * 200 * (len(names.SUBTASKS) if cell.task == names.SUTURE else 1)
     look = len(cell.view) * (SEE + LIVE * _encode(cell.encoder))
-    return START + (0.0 if cell.chain else _train(grid, cell)) + steps * (STEP + look)
+    return START + (0.0 if cell.chain else _train(grid, cell)) + steps * (STEP + look + ACT.get(cell.policy, 0.0))
