@@ -238,7 +238,7 @@ class NoisyAgent:
 
     def __init__(self, agent: Any, noise: float):
         self.name, self.cameras, self.image_size = agent.name, agent.cameras, agent.image_size
-        self.depth = agent.depth
+        self.depth = getattr(agent, "depth", False)
         self._agent, self._noise = agent, noise
         self._generators: dict[int, np.random.Generator] = {}
 

@@ -255,6 +255,8 @@ def evaluate_into(
         workers: processes.
         progress: called as progress(steps done, steps at most).
     """
+    from surgicai_vision.scene import build_scene
+
     seeds = range(seeds[0], seeds[0] + subject.rounds * len(seeds)) if subject.rounds > 1 else seeds
     episodes = evaluate(subject.make_agent, subject.config, seeds, workers=workers, progress=progress)
     wins = [episode.row.success for episode in episodes]
@@ -264,6 +266,7 @@ def evaluate_into(
     about = {
         "command": command_line(),
         "provenance": provenance(),
+        "scene_hash": build_scene(subject.config.scene).hash,
         **subject.about,
         **rounds,
         "task_config": to_mapping(subject.config),
