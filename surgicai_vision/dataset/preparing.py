@@ -6,7 +6,7 @@ from typing import Any
 
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.dataset.rendering import render_demos
-from surgicai_vision.demos.record import record
+from surgicai_vision.demos.record import CALM, Disturbance, record
 from surgicai_vision.executor import LOCAL, Engine
 
 
@@ -21,12 +21,15 @@ def prepare_dataset(
     depth: bool,
     workers: int,
     engine: Engine = LOCAL,
+    source: str = "expert",
+    disturbance: Disturbance = CALM,
 ) -> Path:
     """Record demonstrations into `folder`/demos and render them into `folder`/dataset; return the latter."""
     with stage(f"demos: {demonstrations} of {config.task}", "episodes") as progress:
         record(
-            config, episodes=demonstrations, out=folder / "demos", workers=workers, engine=engine, progress=progress
-        )
+            config, episodes=demonstrations, out=folder / "demos", workers=workers, engine=engine, progress=progress,
+            source=source, disturbance=disturbance,
+        )  # fmt: skip
     with stage(f"dataset: {', '.join(views)} at {size} px", "frames") as progress:
         render_demos(
             folder / "demos", folder / "dataset", views=views, size=size, depth=depth, workers=workers,

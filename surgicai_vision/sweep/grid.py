@@ -9,11 +9,15 @@ from surgicai_vision import names, registry
 from surgicai_vision.cells import OWN, Cell
 from surgicai_vision.chain import TERMINATIONS
 from surgicai_vision.config import digest, to_mapping
+from surgicai_vision.demos.record import CALM, SOURCES, TAUGHT, Disturbance
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES
 
 AXES = ("task", "encoder", "view", "recipe", "policy", "deviation", "demonstrations", "seed", "chain")
 """Keys of a grid that hold lists; one value alone may be written without brackets."""
+
+TEACHERS = tuple(name for name in SOURCES if name not in TAUGHT)
+"""Sources of demonstrations that need none themselves."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,8 @@ class Grid:
         pool: what is taken from the encoders.
         deviation: sets of `config.Deviations` switches to be on; none takes the recipe's.
         demonstrations: numbers of the expert's demonstrations of each task; the smaller set lies within the larger.
+        source: who demonstrates: `expert`, or `search`, which does not know the goal of a grasp.
+        noise: what they execute is disturbed by up to so much; each episode draws its deviation between 0 and this.
         chain: add, for the whole procedure, a high-level policy over a policy for each subtask, by how subtasks end:
             `privileged` or `learned`.
         swap: add each such chain with the expert in the place of each subtask's policy.
@@ -56,6 +62,8 @@ class Grid:
     pool: str = "global"
     deviation: tuple[tuple[str, ...], ...] = ()
     demonstrations: tuple[int, ...] = (50,)
+    source: str = "expert"
+    noise: float = 0.0
     chain: tuple[str, ...] = ()
     swap: bool = False
     accept_licence: bool = False
@@ -77,6 +85,8 @@ class Grid:
                 registry.check_encoder_name(name)
         for name in self.policy:
             check_name("policy", name, (*registry.POLICIES, *LEROBOT_POLICIES))
+        check_name("source", self.source, TEACHERS)
+        Disturbance(self.noise)  # refuses what is not within 0 and 1
         for name in self.chain:
             check_name("termination", name, TERMINATIONS)
         numbers = [(name, getattr(self, name)) for name in ("episodes", "size", "steps", "batch")]
@@ -144,6 +154,11 @@ class Grid:
         return self.depth or any(view in names.DEPTH_VIEWS for view in self.views)
 
     @property
+    def disturbance(self) -> Disturbance:
+        """What disturbs the demonstrations."""
+        return Disturbance(self.noise, noise_from=0.0) if self.noise else CALM
+
+    @property
     def recorded(self) -> int:
         """Demonstrations recorded of each task: the largest number; cells with fewer train on the first of them."""
         return max(self.demonstrations)
@@ -153,6 +168,7 @@ class Grid:
         lerobot = {"steps": self.steps, "batch": self.batch} if cell.policy in LEROBOT_POLICIES else {}
         shared = {name: getattr(self, name) for name in ("episodes", "size", "depth")}
         shared |= {"views": list(self.views), "demonstrations": self.recorded, **lerobot}
+        shared |= {"source": self.source, "noise": self.noise}
         return digest({"cell": to_mapping(cell), **shared})[:16]
 
 

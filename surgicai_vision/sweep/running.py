@@ -139,7 +139,7 @@ class _Sweep:
                 prepare_dataset(
                     TaskConfig(task), self.jobs.data_folder(task), self.stage, engine=engine, workers=workers,
                     demonstrations=self.grid.recorded, views=self.grid.cameras or ("front",), size=self.grid.size,
-                    depth=self.grid.has_depth,
+                    depth=self.grid.has_depth, source=self.grid.source, disturbance=self.grid.disturbance,
                 )  # fmt: skip
             except SurgicaiError as error:
                 for state in to_do:
@@ -300,8 +300,9 @@ def _store_run(grid: Grid, out: Path, problems: list[str], skipped: Sequence[Cel
     """Write what the report says of the run; only when something changed."""
     old = files.read_json(out / RUN_FILE) if (out / RUN_FILE).exists() else {}
     counts = ", ".join(map(str, grid.demonstrations))
+    noise = f", executed with noise up to {grid.noise:g}" if grid.noise else ""
     data = (
-        f"{counts} demonstrations of each task by the scripted expert; {', '.join(grid.views)} at "
+        f"{counts} demonstrations of each task by the scripted {grid.source}{noise}; {', '.join(grid.views)} at "
         f"{grid.size} × {grid.size}; {', '.join(grid.policy)}, recipe {', '.join(grid.recipe)}"
     )
     run = {"title": "sweep", "command": old.get("command") or command_line(), "data": data, "not_run": problems}
