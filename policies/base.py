@@ -57,6 +57,8 @@ class Recipe:
         validation: share of the episodes (or transitions) held out of training.
         proprioception: feed tip pose and jaw too: the active arm's, for a high-level policy both arms'.
         clock: feed how long the subtask has been on as well (needs proprioception): for demonstrations that act by it.
+        map_head: what takes in a feature map: "softmax" (where each of 32 patterns lies) or "convolutions".
+        every: train on every so-manieth frame of each episode alone, from its first: neighbours say nearly the same.
         privileged: feed the 21 values of obs_type "state", goal included, in place of all else: a ceiling.
         deviations: of the released code, outside its training.
     """
@@ -72,12 +74,17 @@ class Recipe:
     validation: float = 0.1
     proprioception: bool = True
     clock: bool = False
+    map_head: str = "softmax"
+    every: int = 1
     privileged: bool = False
     deviations: Deviations = field(default_factory=Deviations)
 
     def __post_init__(self) -> None:
         check_name("split", self.split, ("episode", "transition"))
         check_name("schedule", self.schedule, ("constant", "one_cycle"))
+        check_name("map_head", self.map_head, ("softmax", "convolutions"))
+        if self.every < 1:
+            raise InputError(f"every is {self.every}; it must be at least 1.")
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1 or more.")
         if self.epochs < 1 or self.batch_size < 2:

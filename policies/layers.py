@@ -1,7 +1,7 @@
 """Layers the members share: what takes in each kind of feature, and the paper's MLP.
 
-A global feature (the paper's) enters as it is; a feature map passes a trained spatial softmax, and tokens a
-trained attention, before the MLP.
+A global feature (the paper's) enters as it is; a feature map passes a trained spatial softmax or trained
+convolutions, and tokens a trained attention, before the MLP.
 """
 
 import math
@@ -49,6 +49,32 @@ class SpatialSoftmax(nn.Module):
 
 
 @final
+class MapConvolutions(nn.Module):
+    """Trained convolutions over a map, halved until at most 7 × 7 are left, then `FEATURES` numbers of them all.
+
+    They see the needle's arc as a whole, where a softmax's 1 × 1 patterns see one place at a time.
+    """
+
+    FEATURES, WIDTH, SMALLEST = 64, 32, 7
+
+    def __init__(self, channels: int, height: int, width: int):
+        super().__init__()
+        self.shape = (channels, height, width)
+        self.dim = self.FEATURES
+        layers: list[nn.Module] = []
+        while max(height, width) > self.SMALLEST:
+            layers += [nn.Conv2d(channels, self.WIDTH, 3, stride=2, padding=1), nn.ReLU()]
+            channels, height, width = self.WIDTH, (height + 1) // 2, (width + 1) // 2
+        self.layers = nn.Sequential(
+            *layers, nn.Flatten(), nn.Linear(channels * height * width, self.FEATURES), nn.ReLU()
+        )
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return (B, `FEATURES`) for flattened maps (B, C·h·w)."""
+        return self.layers(rows.unflatten(1, self.shape))
+
+
+@final
 class TokenAttention(nn.Module):
     """A trained attention over tokens: one learned query chooses what to average."""
 
@@ -64,19 +90,17 @@ class TokenAttention(nn.Module):
         return (self.query(tokens).softmax(dim=1) * tokens).sum(dim=1)
 
 
-HEADS: Mapping[int, Callable[..., GlobalFeature | SpatialSoftmax | TokenAttention]] = {
-    1: GlobalFeature,
-    3: SpatialSoftmax,
-    2: TokenAttention,
-}
-"""Number of axes of a view's feature → the layer that takes it in."""
+Head = GlobalFeature | SpatialSoftmax | MapConvolutions | TokenAttention
+MAP_HEADS: Mapping[str, Callable[..., Head]] = {"softmax": SpatialSoftmax, "convolutions": MapConvolutions}
+"""`Recipe.map_head` → the layer that takes in a feature map."""
 
 
-def _head(shape: tuple[int, ...]) -> GlobalFeature | SpatialSoftmax | TokenAttention:
+def _head(shape: tuple[int, ...], map_head: str) -> Head:
     """Return the first layer for a feature of `shape`."""
-    if len(shape) not in HEADS:
+    heads: Mapping[int, Callable[..., Head]] = {1: GlobalFeature, 2: TokenAttention, 3: MAP_HEADS[map_head]}
+    if len(shape) not in heads:
         raise InputError(f"A feature of shape {shape} cannot be taken in; allowed are (dim,), (C, h, w) and (N, C).")
-    return HEADS[len(shape)](*shape)
+    return heads[len(shape)](*shape)
 
 
 @final
@@ -86,7 +110,7 @@ class FeatureMLP(nn.Module):
     def __init__(self, recipe: Recipe, inputs: Inputs, answers: int):
         super().__init__()
         self.inputs = inputs
-        heads = [_head(shape) for shape in inputs.visual]
+        heads = [_head(shape, recipe.map_head) for shape in inputs.visual]
         self.heads = nn.ModuleList(heads)
         layers: list[nn.Module] = []
         width = sum(head.dim for head in heads) + inputs.dim - inputs.features

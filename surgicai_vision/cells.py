@@ -164,11 +164,13 @@ def train_cell(
     from surgicai_vision import registry
     from surgicai_vision.dataset.part import first_episodes
     from surgicai_vision.dataset.subtask import subtask_of
+    from surgicai_vision.dataset.thinning import thinned
     from surgicai_vision.training import train
 
     recipe = registry.load_recipe(cell.policy, cell.recipe, cell.changes)
+    dataset = thinned(dataset, recipe.every)
     begin = registry.load_policy(start) if start else None
-    features, beside = encode_cell(cell, dataset, stage, weights, accept_licence=accept_licence)
+    features, beside = _encode(cell, dataset, recipe, stage, weights, accept_licence)
     parts: tuple[tuple[Any, Callable[..., Any]], ...] = ((cell.demonstrations, first_episodes), (subtask, subtask_of))
     for which, take in parts:
         if which is not None:
@@ -185,18 +187,27 @@ def train_cell(
 def encode_cell(
     cell: Cell, dataset: Any, stage: Stage, weights: str | None = None, *, accept_licence: bool = False
 ) -> tuple[list[Any], dict[str, bytes]]:
-    """Encode the cell's views, all frames of the dataset, or find them in the cache.
+    """Encode the cell's views, all frames that its recipe takes, or find them in the cache.
 
     Returns:
         The features of each view, and what of the encoder the checkpoint has to keep.
     """
+    from surgicai_vision import registry
+    from surgicai_vision.dataset.thinning import thinned
+
+    recipe = registry.load_recipe(cell.policy, cell.recipe, cell.changes)
+    return _encode(cell, thinned(dataset, recipe.every), recipe, stage, weights, accept_licence)
+
+
+def _encode(
+    cell: Cell, dataset: Any, recipe: Any, stage: Stage, weights: str | None, accept_licence: bool
+) -> tuple[list[Any], dict[str, bytes]]:
+    """Encode the cell's views, all frames of `dataset`."""
     if not cell.encoder:
         return [], {}
-    from surgicai_vision import registry
     from surgicai_vision.features import encode
 
-    deviations = registry.load_recipe(cell.policy, cell.recipe, cell.changes).deviations
-    encoder, beside = _encoder(cell, deviations, dataset, stage, weights, accept_licence)
+    encoder, beside = _encoder(cell, recipe.deviations, dataset, stage, weights, accept_licence)
     features = []
     for view in cell.view:
         with stage(f"features: {cell.encoder}, {view}", "frames") as progress:

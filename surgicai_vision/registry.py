@@ -27,6 +27,7 @@ from surgicai_vision.errors import BadFile, InputError, UnknownName, check_name
 ENCODERS: Mapping[str, str] = MappingProxyType(
     {
         "imagenet-lite": "encoders.imagenet_lite:IMAGENET_LITE",
+        "imagenet-lite-early": "encoders.imagenet_lite_early:IMAGENET_LITE_EARLY",
         "random": "encoders.random_resnet:RANDOM",
         "random-conv": "encoders.random_conv:RANDOM_CONV",
         "r3m": "encoders.r3m:R3M",
@@ -48,7 +49,7 @@ OPEN_ENCODERS: Mapping[str, str] = MappingProxyType({"timm:": "encoders.timm_mod
 POOLS = ("global", "spatial", "tokens")
 """What may be taken from an encoder; a test compares this with `encoders.base`."""
 
-OFFLINE_ENCODERS = ("imagenet-lite", "random", "random-conv")
+OFFLINE_ENCODERS = ("imagenet-lite", "imagenet-lite-early", "random", "random-conv")
 """Encoders that never download; a test compares this with their cards."""
 
 POLICIES: Mapping[str, str] = MappingProxyType({"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP"})

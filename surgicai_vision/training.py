@@ -21,6 +21,7 @@ nothing: the last epoch is the checkpoint. The same seed gives the same weights 
 import ctypes
 import io
 import json
+import math
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -198,7 +199,7 @@ class _Training:
         self.vector = np.asarray(columns[vector], np.float32) if vector else None
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
         last = np.searchsorted(index, index, side="right") - 1
-        ahead = np.minimum(np.arange(len(index)) + task.policy.ahead, last)
+        ahead = np.minimum(np.arange(len(index)) + math.ceil(task.policy.ahead / task.recipe.every), last)
         self.target = torch.from_numpy(target[ahead].astype(kind))
         if start is None:
             self._measure()

@@ -10,8 +10,10 @@ import pytest
 import torch
 from photographs import hopper
 
-from encoders.base import Encoder
+from encoders.base import Encoder, read_torch
 from encoders.card import EncoderCard
+from encoders.imagenet_lite import network_from, packaged_file
+from encoders.imagenet_lite_early import IMAGENET_LITE_EARLY
 from surgicai_vision import registry
 from surgicai_vision.errors import BadFile, InputError, MissingWeights, UnknownName
 from surgicai_vision.registry import encoder_card, encoder_names, load_encoder
@@ -181,7 +183,6 @@ def test_imagenet_lite_classifies() -> None:
     import timm
 
     from encoders.base import read_torch
-    from encoders.imagenet_lite import packaged_file
 
     network = timm.create_model("tf_efficientnet_lite0")
     tensors = read_torch(packaged_file())
@@ -201,6 +202,17 @@ def test_maps_and_tokens_average_to_the_global_feature(pool: str, shape: tuple[i
     whole = load_encoder("random")
     np.testing.assert_allclose(mean, whole(hopper())[0], rtol=0.02, atol=0.05)
     assert whole.fingerprint != encoder.fingerprint
+
+
+def test_early_features_are_the_whole_networks_on_the_way() -> None:
+    whole = network_from(read_torch(packaged_file()), packaged_file()).eval()
+    wanted = []
+    whole.blocks[2].register_forward_hook(lambda module, given, answer: wanted.append(answer))
+    early = Encoder(*IMAGENET_LITE_EARLY.build(IMAGENET_LITE_EARLY.card, None), pool="spatial", dtype=torch.float32)
+    assert early.shape == (40, 28, 28)
+    with torch.inference_mode():
+        whole((torch.from_numpy(hopper()).permute(0, 3, 1, 2).float() - 127) / 128)
+    np.testing.assert_allclose(early(hopper()).reshape(1, 40, 28, 28), wanted[0].numpy(), rtol=2e-3, atol=2e-3)
 
 
 def test_unknown_encoder_suggests() -> None:

@@ -21,6 +21,7 @@ from surgicai_vision.commands.sweep import read_grid
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.part import first_episodes
 from surgicai_vision.dataset.pictures import DEPTH_FAR, DEPTH_NEAR, grey
+from surgicai_vision.dataset.thinning import thinned
 from surgicai_vision.errors import InputError, UnknownName
 from surgicai_vision.executor import JOBS
 from surgicai_vision.sweep import Grid, estimate, plan, run_sweep
@@ -113,6 +114,26 @@ def test_smaller_sets_of_demonstrations_lie_within_larger(quiet):
     trained = {state.cell.demonstrations: read_checkpoint(out / "cells" / state.key / "policy") for state in
                plan(BLIND, out) if state.cell.seed == 0}  # fmt: skip
     assert {asked: card.frames for asked, card in trained.items()}[1] == part.length
+
+
+def test_thinned_frames_are_those_of_the_whole(quiet):
+    out, _ = quiet
+    dataset = open_dataset(out / "data/grasp/dataset")
+    part = thinned(dataset, 7)
+    rows = np.concatenate([np.arange(first, stop, 7) for first, stop in dataset.bounds()])
+    np.testing.assert_array_equal(part.rows, rows)
+    for key, values in dataset.columns().items():
+        np.testing.assert_array_equal(part.columns()[key], values[rows])
+    whole = dataset.frames("front")
+    np.testing.assert_array_equal(part.frames("front"), whole[rows])
+    np.testing.assert_array_equal(part.frames("front", 2, 5), whole[rows[2:5]])
+    assert part.frames("front", 3, 3).shape == (0, 32, 32, 3)
+    assert [stop - first for first, stop in part.bounds()] == np.bincount(part.episode_index).tolist()
+    assert part.fingerprint not in (dataset.fingerprint, thinned(dataset, 6).fingerprint)
+    assert thinned(dataset, 1) is dataset
+    assert first_episodes(part, 1).length == part.bounds()[0][1]
+    with pytest.raises(InputError, match="every is 0"):
+        thinned(dataset, 0)
 
 
 def test_a_failing_cell_is_recorded_the_rest_goes_on_and_it_is_tried_again(tmp_path):

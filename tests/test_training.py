@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from policies.base import Recipe
-from policies.bc import BC
-from policies.layers import SpatialSoftmax
+from policies.bc import BC, BCPolicy
+from policies.layers import MapConvolutions, SpatialSoftmax
 from surgicai_vision import names
 from surgicai_vision.checkpoint import CARD, WEIGHTS, check_encoder, check_task, read_checkpoint
 from surgicai_vision.config import TaskConfig
+from surgicai_vision.dataset.thinning import thinned
 from surgicai_vision.errors import BadFile, InputError, OutputExists, UnknownName
 from surgicai_vision.features import Features
 from surgicai_vision.registry import load_policy, load_recipe, recipe_names
@@ -31,6 +32,8 @@ class FakeDataset:
     episodes: int = 5
     steps: int = 40
     config: TaskConfig = field(default_factory=TaskConfig)
+    task: str = "grasp"
+    views: tuple[str, ...] = ()
     image_size: int = 224
     fingerprint: str = "fake"
 
@@ -221,6 +224,53 @@ def test_spatial_softmax_finds_the_bright_place() -> None:
     picture = torch.zeros(1, 1, 5, 5)
     picture[0, 0, 4, 0] = 1.0
     np.testing.assert_allclose(head(picture.flatten(1)).detach()[0, :2], [-1, 1], atol=1e-5)
+
+
+def test_convolutions_read_where_an_arc_lies_after_little_training() -> None:
+    torch.manual_seed(0)
+    head = torch.nn.Sequential(MapConvolutions(1, 28, 28), torch.nn.Linear(MapConvolutions.FEATURES, 2))
+    places = torch.randint(4, 24, (600, 2))
+    maps = torch.zeros(600, 28, 28)
+    for index, (y, x) in enumerate(places.tolist()):
+        maps[index, y - 3 : y + 4, x] = maps[index, y, x - 3 : x + 1] = 1.0
+    rows, wanted = maps.flatten(1), places.float() / 14 - 1
+    optimiser = torch.optim.Adam(head.parameters(), 1e-3)
+    for _ in range(150):
+        batch = torch.randint(500, (64,))
+        optimiser.zero_grad()
+        torch.nn.functional.mse_loss(head(rows[batch]), wanted[batch]).backward()
+        optimiser.step()
+    with torch.no_grad():
+        error = (head(rows[500:]) - wanted[500:]).abs().mean() * 14
+    assert error < 1.0, "in places of the map; a guess errs by 5"
+
+
+def test_recipes_name_how_maps_are_taken_in_and_how_many_frames() -> None:
+    best = load_recipe("bc", "best")
+    assert BC.make(best, ((40, 28, 28),)).network.heads[0].dim == MapConvolutions.FEATURES  # type: ignore[attr-defined]
+    with pytest.raises(UnknownName, match="convolutions"):
+        Recipe(map_head="convolution")
+    with pytest.raises(InputError, match="every is 0"):
+        Recipe(every=0)
+
+
+def test_thinned_labels_of_a_policy_that_looks_ahead_stay_at_their_time(tmp_path: Path) -> None:
+    """A target ten frames ahead is five frames ahead of every second frame."""
+    seen = []
+
+    class Watched(BCPolicy):
+        def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+            seen.append(torch.cat([observed[:, :1] * self.input_std[0] + self.input_mean[0], target[:, :1]], dim=1))
+            return super().loss(observed, target)
+
+    dataset = FakeDataset(episodes=2, steps=40)
+    number = np.tile(np.arange(40, dtype=np.float32), 2)[:, None].repeat(7, 1)
+    dataset._columns = {names.STATE: number, names.ACTION: number / 100}
+    plugin = replace(BC, make=lambda recipe, visual: Watched(recipe, visual), ahead=10)
+    recipe = replace(QUICK, every=2, validation=0.0, epochs=1)
+    train(thinned(dataset, 2), [], plugin, recipe, out=tmp_path / "a")
+    state, target = torch.cat(seen).T
+    np.testing.assert_allclose(target * 100, np.minimum(state.round() + 10, 38), atol=1e-3)
 
 
 def test_epoch_checkpoints_and_fine_tuning(tmp_path: Path) -> None:

@@ -186,11 +186,14 @@ LABELS = ("dataset", "accept_licence", "command", "environment")
 
 def _seen(cell: Cell) -> list[Cell]:
     """Return what a cell sees, view by view where that is possible, so that cells share it."""
+    common: dict[str, Any] = {"pool": cell.pool, "deviations": ()}
     on: tuple[str, ...] = ()
     if cell.policy not in LEROBOT_POLICIES:
-        deviations = registry.load_recipe(cell.policy, cell.recipe, cell.changes).deviations
-        on = tuple(switch for switch in FEATURE_SWITCHES if getattr(deviations, switch))
-    common: dict[str, Any] = {"pool": cell.pool, "deviations": on}
+        recipe = registry.load_recipe(cell.policy, cell.recipe, cell.changes)
+        on = tuple(switch for switch in FEATURE_SWITCHES if getattr(recipe.deviations, switch))
+        common["deviations"] = on
+        if recipe.every > 1:
+            common["recipe"] = cell.recipe
     if "batch_norm_drift" in on:  # the statistics are of these views and this seed
         return [Cell(cell.task, cell.encoder, cell.view, cell.seed, **common)]
     return [Cell(cell.task, cell.encoder, (view,), **common) for view in cell.view]

@@ -1,0 +1,54 @@
+"""`imagenet-lite-early`: the first three stages of `imagenet-lite`, for a trained head on its map (`--pool spatial`).
+
+A map of 28 × 28 places still says where a thin needle lies, which the last layer's 7 × 7 and a global feature lose
+(docs/results/best.md compares), at a third of the whole network's arithmetic.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from encoders import imagenet_lite
+from encoders.card import EncoderCard, Plugin
+
+if TYPE_CHECKING:
+    from torch import nn
+
+STAGES, CHANNELS = 3, 40
+
+CARD = replace(
+    imagenet_lite.CARD,
+    name="imagenet-lite-early",
+    architecture="timm tf_efficientnet_lite0, stem and the first three stages",
+    dim=CHANNELS,
+    layers="the third stage (spatial, tokens), its mean over places (global)",
+    note="Supervised on ImageNet-1k; not an encoder of the paper. Meant for pool 'spatial'.",
+)
+
+
+def early_of(network: Any) -> "nn.Module":
+    """Return the network (B, 3, 224, 224) → (B, 40), map (B, 40, 28, 28), of timm's EfficientNet-Lite0."""
+    import torch
+    from torch import nn
+
+    class Stages(nn.Sequential):
+        """Stem and stages; the global feature is the mean over places."""
+
+        def forward_features(self, pictures: torch.Tensor) -> torch.Tensor:
+            """Return the feature map (B, 40, 28, 28)."""
+            return super().forward(pictures)
+
+        def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+            """Return the mean feature (B, 40)."""
+            return self.forward_features(pictures).mean((2, 3))
+
+    return Stages(network.conv_stem, network.bn1, *network.blocks[:STAGES])
+
+
+def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
+    """Build the network from the packaged file of `imagenet-lite` or from `path`."""
+    card, network = imagenet_lite.build(card, path)
+    return card, early_of(network)
+
+
+IMAGENET_LITE_EARLY = Plugin(CARD, build)
