@@ -31,7 +31,10 @@ ARMS = (PSM1, PSM2)
 ACTIVE_ARM = MappingProxyType({"grasp": PSM2, "place": PSM2, "insert": PSM2, "handoff": PSM1, "pullout": PSM1})
 """Subtask → the arm its action moves."""
 
-CAMERAS = ("front", "front_right", "back", "wrist_psm1", "wrist_psm2")
+FIXED_CAMERAS, WRIST_CAMERAS = ("front", "front_right", "back"), ("wrist_psm1", "wrist_psm2")
+FOLLOWING_CAMERAS = ("front_psm1", "front_psm2", "back_psm1", "back_psm2")
+"""What a fixed camera sees about an arm's jaws, larger (`scene.cameras`)."""
+CAMERAS = (*FIXED_CAMERAS, *WRIST_CAMERAS, *FOLLOWING_CAMERAS)
 DEPTH_VIEWS = tuple(f"{camera}_depth" for camera in CAMERAS)
 """What a policy may see of a camera in the place of colours: its depth as a grey picture (`dataset.pictures.grey`)."""
 VIEWS = (*CAMERAS, *DEPTH_VIEWS)

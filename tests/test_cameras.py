@@ -8,9 +8,11 @@ import pytest
 
 from surgicai_vision.config import SceneConfig
 from surgicai_vision.errors import UnknownName
-from surgicai_vision.names import ARMS, CAMERAS, PARTS
+from surgicai_vision.names import ARMS, CAMERAS, FOLLOWING_CAMERAS, PARTS
 from surgicai_vision.scene import build_scene, kinematics
 from surgicai_vision.scene.cameras import (
+    FOLLOWED,
+    FOLLOWING_SPAN,
     WORLD_CAMERAS,
     add_wrist_camera,
     extrinsics,
@@ -43,7 +45,8 @@ def start(request):
 
 def test_the_scene_has_the_named_cameras(start):
     model, _ = start
-    assert [model.camera(index).name for index in range(model.ncam)] == list(CAMERAS)
+    assert {model.camera(index).name for index in range(model.ncam)} == set(CAMERAS)
+    assert model.ncam == len(CAMERAS)
 
 
 @pytest.mark.parametrize("name", sorted(WORLD_CAMERAS))
@@ -83,6 +86,32 @@ def test_wrist_cameras_see_their_own_jaws(start, arm):
         u, v = np.rint((intrinsics(model, camera, *SIZE) @ pad_in_camera / pad_in_camera[2])[:2]).astype(int)
         seen += parts[v, u] == part and abs(depth[v, u] - pad_in_camera[2]) < 0.003
     assert seen >= 1  # one finger may hide the other
+
+
+@pytest.mark.parametrize("camera", FOLLOWING_CAMERAS)
+def test_following_cameras_see_the_jaws_in_their_middle_from_where_the_fixed_one_stands(start, camera):
+    model, data = start
+    base, arm = camera.split("_")
+    for move in (0.0, 0.3):
+        data.joint(f"{arm}_outer_yaw").qpos += move
+        mujoco.mj_forward(model, data)
+        pose = extrinsics(model, data, camera)
+        assert np.allclose(pose[:3, 3], WORLD_CAMERAS[base].position, atol=1e-12)
+        grasp = (np.linalg.inv(pose) @ [*data.site(f"{arm}_grasp").xpos, 1.0])[:3]
+        np.testing.assert_allclose(grasp[:2], 0.0, atol=1e-9)
+        assert grasp[2] > 0
+        assert -pose[2, 1] > 0.5  # the world's up is up in the picture
+        data.joint(f"{arm}_outer_yaw").qpos -= move
+    mujoco.mj_forward(model, data)
+
+
+def test_following_cameras_see_smaller_things_than_the_fixed_ones(start):
+    model, data = start
+    for camera in FOLLOWING_CAMERAS:
+        focal = intrinsics(model, camera, *SIZE)[0, 0]
+        assert focal > 1.9 * intrinsics(model, camera.split("_")[0], *SIZE)[0, 0]
+        distance = math.dist(extrinsics(model, data, camera)[:3, 3], FOLLOWED)
+        assert math.isclose(SIZE[0] * distance / focal, FOLLOWING_SPAN, rel_tol=1e-6)
 
 
 @pytest.mark.parametrize("camera", ["front", "front_right", "back"])

@@ -54,8 +54,8 @@ class PictureWatch:
     def __init__(
         self, key: str, size: int, views: Sequence[str], rows: Mapping[str, np.ndarray], lossless: bool = True
     ):
-        # A wrist camera need not see what moved, and a part's outline can stay the same.
-        still = [view for view in views if not view.startswith("wrist")]
+        # A camera that moves along need not see what moved, and a part's outline can stay the same.
+        still = [view for view in views if view in names.FIXED_CAMERAS]
         self._watched = lossless and key in {
             name(view) for view in still for name in (names.image_key, names.depth_key)
         }

@@ -24,8 +24,13 @@ from surgicai_vision.scene.rotations import matrix_to_quaternion, quaternion_to_
 Array = NDArray[np.float64]
 Draws = tuple[float, ...]
 
-RIGS = (("front", "front_right"), ("back",), ("wrist_psm1",), ("wrist_psm2",))
-"""Cameras that move as one, about the first."""
+RIGS = (
+    ("front", "front_right", "front_psm1", "front_psm2"),
+    ("back", "back_psm1", "back_psm2"),
+    ("wrist_psm1",),
+    ("wrist_psm2",),
+)
+"""Cameras that move as one, about the first; those that follow the jaws are shifted with them, and see them still."""
 TISSUE, SURROUNDINGS = ("tissue", "flesh"), ("drape", "tray")
 """Materials of one tint."""
 JOINT_ERROR = (math.radians(5.0), math.radians(5.0), 0.005)
@@ -125,13 +130,17 @@ def _tint(source: mujoco.MjModel, model: mujoco.MjModel, factors: Array) -> None
 def _aim(
     source: mujoco.MjModel, model: mujoco.MjModel, cameras: tuple[str, ...], shift: Array, turn: Array, fovy: float
 ) -> None:
-    """Shift a rig [m], turn it about its first camera [rad], both in its carrier's axes; widen its view [deg]."""
-    rotation, pivot = rotvec_to_matrix(turn), source.cam_pos[source.camera(cameras[0]).id]
+    """Shift a rig [m], turn it about its first camera [rad], both in its carrier's axes; widen its view [deg].
+
+    Where a rig's first camera sees so much more, the others see more by the same factor.
+    """
+    first = source.camera(cameras[0]).id
+    rotation, pivot = rotvec_to_matrix(turn), source.cam_pos[first]
     for name in cameras:
         index = source.camera(name).id
         model.cam_pos[index] = pivot + rotation @ (source.cam_pos[index] - pivot) + shift
         model.cam_quat[index] = matrix_to_quaternion(rotation @ quaternion_to_matrix(source.cam_quat[index]))
-        model.cam_fovy[index] = source.cam_fovy[index] + fovy
+        model.cam_fovy[index] = source.cam_fovy[index] * (1.0 + fovy / source.cam_fovy[first])
 
 
 def _shape_needle(source: mujoco.MjModel, model: mujoco.MjModel, geoms: range, size: float, thickness: float) -> None:

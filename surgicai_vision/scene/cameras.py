@@ -7,6 +7,9 @@ the principal point of a W × H picture is ((W - 1) / 2, (H - 1) / 2). A point p
 Sources: "front" is the left endoscope of SurgicAI's scene, moved as `ENDOSCOPE` says; "front_right" the right one;
 "back" the camera opposite to them. The surgical robotics challenge also puts a camera on each insertion link; there it
 looks along the shaft and sees little else, so ours stand off it and aim at the jaws.
+
+"front_psm2" and its like follow an arm's jaws from where "front" or "back" stands: what one cuts out of a picture of
+higher resolution about the jaws, whose place the arm's joints tell, and scales to the size of the others.
 """
 
 import math
@@ -18,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.errors import UnknownName
-from surgicai_vision.names import ARMS, PSM1, PSM2
+from surgicai_vision.names import ARMS, FOLLOWING_CAMERAS, PSM1, PSM2
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.rotations import matrix_to_quaternion
 
@@ -102,6 +105,31 @@ def wrist_camera(arm: str, instrument: str) -> CameraPose:
     )
 
 
+FOLLOWING_SPAN = 0.050
+"""Height of what a following camera sees at the holes [m]: at 224 × 224 pixels 0.22 mm a pixel, where "front" and
+"back" have 0.43 and 0.47; two and a half needles, and the jaws at their middle."""
+FOLLOWED = (0.0, 0.050, 0.075)
+"""Point in world [m] at whose distance that holds: between the holes and the needle's home."""
+
+
+def following_fovy(camera: str) -> float:
+    """Return the vertical field of view [rad] of the cameras that stand where `camera` stands and follow the jaws."""
+    return 2.0 * math.atan(FOLLOWING_SPAN / 2.0 / math.dist(WORLD_CAMERAS[camera].position, FOLLOWED))
+
+
+def add_following_cameras(spec: mujoco.MjSpec) -> None:
+    """Add "front_psm1" … "back_psm2"; the arms, with their bodies `{arm}_grasp`, must be there."""
+    for name in FOLLOWING_CAMERAS:
+        camera, arm = name.split("_")
+        spec.worldbody.add_camera(
+            name=name,
+            pos=list(WORLD_CAMERAS[camera].position),
+            mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
+            targetbody=f"{arm}_grasp",
+            fovy=math.degrees(following_fovy(camera)),
+        )
+
+
 def add_world_cameras(spec: mujoco.MjSpec) -> None:
     """Add "front", "front_right" and "back" to the world."""
     for name, pose in WORLD_CAMERAS.items():
@@ -122,6 +150,7 @@ def add_cameras(spec: mujoco.MjSpec, instrument: str = "400006") -> None:
     add_world_cameras(spec)
     for arm in ARMS:
         add_wrist_camera(spec, arm, instrument)
+    add_following_cameras(spec)
 
 
 def look_at(direction: Vector, up: Vector) -> Array:

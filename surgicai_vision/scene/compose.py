@@ -20,7 +20,7 @@ from surgicai_vision import names
 from surgicai_vision.config import SceneConfig
 from surgicai_vision.errors import UnknownName
 from surgicai_vision.scene import arm, holes, kinematics, look, needle, phantom, rotations, thread
-from surgicai_vision.scene.cameras import add_world_cameras, add_wrist_camera
+from surgicai_vision.scene.cameras import add_following_cameras, add_world_cameras, add_wrist_camera
 
 TIMESTEP = 0.002
 USER_DATA = 176
@@ -128,6 +128,7 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
             arm.add_weld(spec, name)
     look.dress(spec, config.layout, config.instrument)
     add_world_cameras(spec)
+    add_following_cameras(spec)
     return spec
 
 
