@@ -291,7 +291,15 @@ def baseline_subject(name: str, config: TaskConfig) -> Subject:
 
 
 def replay_subject(dataset: Any) -> Subject:
-    """Return the subject that replays the mean demonstration of an opened dataset, blind."""
+    """Return the subject that replays the mean demonstration of an opened dataset, blind.
+
+    Raises:
+        InputError: a dataset without every step's frame.
+    """
+    if dataset.fps != names.FPS:
+        raise InputError(
+            f"{dataset.path} holds {dataset.fps} frames a second; a replay needs each step's: {names.FPS}."
+        )
     actions = mean_demonstration(dataset.columns()[names.ACTION], dataset.episode_index)
     about = {"dataset": dataset.fingerprint}
     return Subject(ReplayAgent.name, dataset.config, functools.partial(ReplayAgent, actions), about)

@@ -229,3 +229,10 @@ def digest(value: Any) -> str:
     """sha256 (hex) of the canonical JSON of a dataclass or of plain data."""
     plain = dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
     return hashlib.sha256(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def check_every(every: int) -> None:
+    """Raise `InputError` unless a frame every so many steps makes a whole number of frames a second."""
+    if every < 1 or names.FPS % every:
+        allowed = ", ".join(str(number) for number in range(1, names.FPS + 1) if names.FPS % number == 0)
+        raise InputError(f"every is {every}; it must divide the {names.FPS} frames a second: {allowed}.")

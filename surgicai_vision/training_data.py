@@ -28,7 +28,7 @@ def with_clock(columns: dict[str, np.ndarray], vector: str | None) -> dict[str, 
     """Return the columns, and `names.CLOCKED_STATE` (N, 8) beside them where that is the `vector` asked for."""
     if vector != names.CLOCKED_STATE:
         return columns
-    clock = np.asarray(columns["frame_index"], np.float32)[:, None] / SUBTASK_STEPS
+    clock = np.asarray(columns["timestamp"], np.float32)[:, None] * names.FPS / SUBTASK_STEPS
     return {**columns, vector: np.concatenate([columns[names.STATE], clock], axis=1, dtype=np.float32)}
 
 

@@ -13,9 +13,11 @@ from fake_demos import write_demos
 from fake_env import FakeEnv
 
 from surgicai_vision import names
+from surgicai_vision.cells import replay_subject
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.dataset import check_dataset, layout, metadata, open_dataset, pictures, render_demos, rendering
 from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
+from surgicai_vision.dataset.thinning import thinned
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.store import list_demos, read_demo
 from surgicai_vision.errors import BadFile, InputError, OutputExists, UnknownName
@@ -74,6 +76,35 @@ def test_every_frame_is_the_picture_of_its_state(tmp_path, fake, demos):
             frame += 1
     assert frame == dataset.length == summary.frames
     assert summary.episodes == 3
+
+
+def test_every_fifth_frame_is_one_of_all(tmp_path, fake, demos, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    render(demos, tmp_path / "all")
+    summary = render(demos, tmp_path / "set", every=5)
+    whole, few = open_dataset(tmp_path / "all"), open_dataset(tmp_path / "set")
+    rows = np.concatenate([np.arange(start, stop, 5) for start, stop in whole.bounds()])
+    assert summary.frames == few.length == len(rows) < whole.length
+    assert (few.fps, whole.fps) == (10, 50)
+    np.testing.assert_array_equal(few.frames("back"), whole.frames("back")[rows])
+    np.testing.assert_array_equal(few.depth("front"), whole.depth("front")[rows])
+    for key in layout.COLUMNS:
+        if key != names.DONE:
+            np.testing.assert_array_equal(few.columns()[key], whole.columns()[key][rows])
+    np.testing.assert_allclose(few.columns()["timestamp"], whole.columns()["timestamp"][rows], atol=1e-6)
+    assert check_dataset(tmp_path / "set").problems == ()
+    lerobot = LeRobotDataset("local/set", root=tmp_path / "set")
+    assert lerobot.fps == 10 and len(lerobot) == few.length
+    assert thinned(few, 5) is few
+    np.testing.assert_array_equal(thinned(few, 10).columns()[names.SEED], thinned(whole, 10).columns()[names.SEED])
+    with pytest.raises(InputError, match="the dataset holds one every 5"):
+        thinned(few, 1)
+    with pytest.raises(InputError, match=r"every is 4; .* 1, 2, 5, 10, 25, 50"):
+        render(demos, tmp_path / "none", every=4)
+    with pytest.raises(InputError, match="a replay needs each step's"):
+        replay_subject(few)
 
 
 def test_frames_across_episodes_equal_single_frames(tmp_path, fake, demos):

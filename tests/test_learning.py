@@ -49,6 +49,8 @@ class Dataset:
             names.PRIVILEGED_STATE: noise[:, 21:42],
             names.ACTION: np.tanh(noise[:, 42:]),
             names.PHASE: phase,
+            "frame_index": np.tile(np.arange(10), 4),
+            "timestamp": np.tile(np.arange(10, dtype=np.float32) / names.FPS, 4),
         }
 
 

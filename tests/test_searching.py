@@ -49,7 +49,7 @@ class Stepped(FakeDataset):
         columns = super().columns()
         step = np.tile(np.arange(self.steps), self.episodes)
         clock = np.where(step >= self.steps // 2, 0.5, -0.5).astype(np.float32)
-        return {**columns, "frame_index": step, names.ACTION: np.repeat(clock[:, None], 7, axis=1)}
+        return {**columns, "timestamp": step / names.FPS, names.ACTION: np.repeat(clock[:, None], 7, axis=1)}
 
 
 class Still:

@@ -48,6 +48,9 @@ class Options:
     size: int = option(224, "height and width of pictures [px]", check=picture_size, metavar="PX")
     depth: bool = option(False, "render depth beside RGB")
     segmentation: bool = option(False, "render the parts beside RGB")
+    every: int = option(
+        1, "render every N-th frame alone: many episodes at the cost of few", check=positive, metavar="N"
+    )
     video: str | None = option(
         None,
         f"store RGB as video: {', '.join(CODECS)}; the error is measured",
@@ -84,6 +87,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
             size=options.size,
             depth=options.depth,
             segmentation=options.segmentation,
+            every=options.every,
             video=options.video,
             workers=options.workers,
             engine=engine,

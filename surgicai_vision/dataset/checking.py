@@ -129,7 +129,9 @@ def _check_order(dataset: Dataset, columns: Mapping[str, np.ndarray], problems: 
     if len(bounds) != dataset.meta.get("episodes"):
         problems.append(f"episodes: {len(bounds)} in the data, {dataset.meta.get('episodes')} in {names.META_FILE}.")
     for number, (start, stop) in enumerate(bounds):
-        problems.extend(episode_problems(number, {key: rows[start:stop] for key, rows in columns.items()}))
+        problems.extend(
+            episode_problems(number, {key: rows[start:stop] for key, rows in columns.items()}, dataset.fps)
+        )
 
 
 def _check_lerobot(dataset: Dataset, columns: Mapping[str, np.ndarray], keys: list[str], problems: list[str]) -> None:

@@ -89,7 +89,7 @@ def encode_views(
             shutil.copyfile(result / VIDEO_FILE, target)
             start = bounds[first][0]
             for index, row in zip(range(first, stop), read_json(result / LOOK_FILE), strict=True):
-                low, high = ((frame - start) / names.FPS for frame in bounds[index])
+                low, high = ((frame - start) / dataset.fps for frame in bounds[index])
                 episodes[index][key] = Encoded((number, low, high), row["digest"], row["error"])
     return episodes
 
@@ -114,10 +114,10 @@ def encode_block(folder: Path, dataset: str, video: str, view: str, first: int, 
     data, key, path = _dataset(dataset), names.image_key(view), folder / VIDEO_FILE
     bounds = data.bounds()[first:stop]
     begin, end = bounds[0][0], bounds[-1][1]
-    with VideoWriter(path, video, names.FPS, data.image_size) as writer:
+    with VideoWriter(path, video, data.fps, data.image_size) as writer:
         for picture in data.decoded(key, begin, end):
             writer.add(picture)
-    rows, decoded = [], read_frames(path, 0, end - begin, names.FPS)
+    rows, decoded = [], read_frames(path, 0, end - begin, data.fps)
     for low, high in bounds:
         digest, error = layout.PictureDigest(), 0.0
         for before, after in zip(data.decoded(key, low, high), decoded, strict=False):

@@ -11,19 +11,20 @@ MOVED = 0.001
 """An arm or a needle that went further than this between two frames [m] must be seen to have moved."""
 
 
-def episode_problems(number: int, columns: Mapping[str, np.ndarray]) -> Iterator[str]:
+def episode_problems(number: int, columns: Mapping[str, np.ndarray], fps: float) -> Iterator[str]:
     """Yield what is wrong with the order, the end and the seed of one episode.
 
     Args:
         number: its index in the dataset.
         columns: its rows of `layout.COLUMNS`, `frame_index` and `timestamp`.
+        fps: frames a second.
     """
     count = len(columns["frame_index"])
     steps = np.arange(count)
     if not np.array_equal(columns["frame_index"], steps):
         yield f"episode {number}: frame_index is not 0, 1, 2, …"
-    if not np.allclose(columns["timestamp"], steps / names.FPS, atol=1e-4):
-        yield f"episode {number}: timestamp is not frame_index / {names.FPS}."
+    if not np.allclose(columns["timestamp"], steps / fps, atol=1e-4):
+        yield f"episode {number}: timestamp is not frame_index / {fps:g}."
     if not np.array_equal(columns[names.DONE], steps == count - 1):
         yield f"episode {number}: {names.DONE} is not true at its last frame alone."
     if len(np.unique(columns[names.SEED])) != 1:

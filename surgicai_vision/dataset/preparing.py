@@ -20,6 +20,7 @@ def prepare_dataset(
     size: int,
     depth: bool,
     workers: int,
+    every: int = 1,
     engine: Engine = LOCAL,
     source: str = "expert",
     disturbance: Disturbance = CALM,
@@ -32,7 +33,7 @@ def prepare_dataset(
         )  # fmt: skip
     with stage(f"dataset: {', '.join(views)} at {size} px", "frames") as progress:
         render_demos(
-            folder / "demos", folder / "dataset", views=views, size=size, depth=depth, workers=workers,
-            engine=engine, progress=progress,
+            folder / "demos", folder / "dataset", views=views, size=size, depth=depth, every=every,
+            workers=workers, engine=engine, progress=progress,
         )  # fmt: skip
     return folder / "dataset"

@@ -51,6 +51,7 @@ class Dataset:
         views: cameras, in order.
         image_size: side of the pictures [px].
         length: number of frames N.
+        fps: frames a second of simulated time; below `names.FPS` where only every so-manieth frame was rendered.
         video: codec of the RGB views, None where they are lossless pictures.
     """
 
@@ -67,7 +68,7 @@ class Dataset:
             self.config = from_mapping(TaskConfig, self.meta["task_config"], str(self.path / names.META_FILE))
             self.views = tuple(str(view) for view in self.meta["views"])
             self.image_size = int(self.meta["image_size"])
-            self.length = int(self.meta["frames"])
+            self.length, self.fps = int(self.meta["frames"]), int(self.meta["fps"])
             self.video: str | None = self.meta.get("video")
             self.has_depth, self.has_segmentation = bool(self.meta["depth"]), bool(self.meta["segmentation"])
         except (KeyError, TypeError, ValueError, InputError) as error:
@@ -155,8 +156,8 @@ class Dataset:
             if low < high:
                 chunk, file = row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]
                 path = self.path / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
-                begin = round(row[f"videos/{key}/from_timestamp"] * names.FPS)
-                yield from read_frames(path, begin + low - first, high - low, names.FPS)
+                begin = round(row[f"videos/{key}/from_timestamp"] * self.fps)
+                yield from read_frames(path, begin + low - first, high - low, self.fps)
 
     @functools.cached_property
     def _rows(self) -> list[dict[str, Any]]:

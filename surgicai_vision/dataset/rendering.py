@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from surgicai_vision import names
-from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.config import TaskConfig, check_every, from_mapping, to_mapping
 from surgicai_vision.dataset import layout, pictures
 from surgicai_vision.dataset.reading import open_dataset
 from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
@@ -55,6 +55,7 @@ def render_demos(
     size: int = 224,
     depth: bool = False,
     segmentation: bool = False,
+    every: int = 1,
     video: str | None = None,
     workers: int = 1,
     engine: Engine = LOCAL,
@@ -69,6 +70,8 @@ def render_demos(
         size: side of the square pictures [px].
         depth: also render depth, float32 [m].
         segmentation: also render part indices (`names.PARTS`).
+        every: render every so-manieth frame of each episode alone, from its first; a divisor of `names.FPS`, so that
+            the dataset has `names.FPS / every` frames a second of simulated time. Actions stay those of one step.
         video: codec of the RGB views, a key of `video.CODECS`; lossless pictures by default.
         workers: number of processes.
         engine: what runs them.
@@ -81,16 +84,24 @@ def render_demos(
     """
     started = time.monotonic()
     _check_pictures(views, size, video)
+    check_every(every)
     check_output(out, may_resume=names.META_FILE)
     paths = list_demos(demos)
-    options = {"views": list(views), "size": size, "depth": depth, "segmentation": segmentation}
+    options: dict[str, Any] = {"views": list(views), "size": size, "depth": depth, "segmentation": segmentation}
+    options |= {"every": every} if every > 1 else {}
     request = {**options, "demos": demos_digest(paths), **({"video": video} if video else {})}
     if (out / names.META_FILE).exists():
         return finished(out, request, started)
     origins = [_Origin.of(read_demo(path)) for path in paths]
     config = _same_config(origins, demos)
     jobs = [
-        Job("render-episode", {"demo": str(path.resolve()), **options}, (sha256_file(path),), row.length, ("demo",))
+        Job(
+            "render-episode",
+            {"demo": str(path.resolve()), **options},
+            (sha256_file(path),),
+            -(-row.length // every),
+            ("demo",),
+        )
         for path, row in zip(paths, origins, strict=True)
     ]
     with building(out) as (store, result):
@@ -160,7 +171,7 @@ def _meta(
         "cameras": summaries[0]["cameras"],
         "units": {"length": "m", "angle": "rad", "depth": "m", "time": "s"},
         "parts": list(names.PARTS),
-        "fps": names.FPS,
+        "fps": names.FPS // request.get("every", 1),
         "renderers": sorted({summary["renderer"] for summary in summaries}),
         "scene_hash": origins[0].scene_hash,
         "sources": sorted({origin.source for origin in origins}),
@@ -191,7 +202,9 @@ def _env(config: str, views: tuple[str, ...], size: int, depth: bool, segmentati
     )
 
 
-def render_episode(folder: Path, demo: str, views: Sequence[str], size: int, depth: bool, segmentation: bool) -> None:
+def render_episode(
+    folder: Path, demo: str, views: Sequence[str], size: int, depth: bool, segmentation: bool, every: int = 1
+) -> None:
     """Job "render-episode": write one episode's columns and pictures into `folder`."""
     episode = read_demo(Path(demo))
     env = _env(json.dumps(to_mapping(episode.config)), tuple(views), size, depth, segmentation)
@@ -205,7 +218,7 @@ def render_episode(folder: Path, demo: str, views: Sequence[str], size: int, dep
     statistics = {key: PictureStatistics() for key, _, _ in keys}
     hashes = layout.EpisodeDigest(content)
     measured: dict[str, list[np.ndarray]] = {key: [] for key in MEASURED}
-    for state in episode.state[:-1]:
+    for state in episode.state[:-1:every]:
         env.set_state_vector(state)
         observation = env.observe()
         for key, view, modality in keys:
@@ -216,12 +229,12 @@ def render_episode(folder: Path, demo: str, views: Sequence[str], size: int, dep
             hashes.add(key, frame)
         for key, measure in MEASURED.items():
             measured[key].append(measure(env))
-    columns = _columns(episode, {key: np.stack(rows) for key, rows in measured.items()})
+    columns = _columns(episode, every, {key: np.stack(rows) for key, rows in measured.items()})
     _write_episode(folder, content, columns, [key for key, _, modality in keys if modality == names.DEPTH])
     write_json(
         folder / SUMMARY_FILE,
         {
-            "frames": len(episode),
+            "frames": len(columns[names.DONE]),
             "digest": hashes.hexdigest(columns),
             "statistics": {
                 **{key: statistics[key].result() for key in content},
@@ -233,17 +246,18 @@ def render_episode(folder: Path, demo: str, views: Sequence[str], size: int, dep
     )
 
 
-def _columns(demo: Demo, measured: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return every column of `layout.COLUMNS`, (T,) or (T, n)."""
+def _columns(demo: Demo, every: int, measured: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return every column of `layout.COLUMNS`, (T,) or (T, n), of the T frames that are rendered."""
+    frames = len(range(0, len(demo), every))
     return {
         **{key: rows.astype(np.float32) for key, rows in measured.items()},
-        names.ACTION: demo.action,
-        names.REWARD: demo.reward,
-        names.DONE: np.arange(len(demo)) == len(demo) - 1,
-        names.SUCCESS: demo.success,
-        names.CONTACT: demo.contact,
-        names.PHASE: demo.phase.astype(np.int64),
-        names.SEED: np.full(len(demo), demo.seed, np.int64),
+        names.ACTION: demo.action[::every],
+        names.REWARD: demo.reward[::every],
+        names.DONE: np.arange(frames) == frames - 1,
+        names.SUCCESS: demo.success[::every],
+        names.CONTACT: demo.contact[::every],
+        names.PHASE: demo.phase[::every].astype(np.int64),
+        names.SEED: np.full(frames, demo.seed, np.int64),
     }
 
 

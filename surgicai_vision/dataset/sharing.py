@@ -68,7 +68,7 @@ configs:
 {names.TASK_TEXTS[dataset.task]}
 
 {meta["episodes"]} simulated demonstrations of the task `{dataset.task}` in robotic suturing: {dataset.length} frames
-at {names.FPS} per second, by {", ".join(meta["sources"])}. LeRobot {CODEBASE_VERSION} format, made by surgicai-vision
+at {dataset.fps} per second, by {", ".join(meta["sources"])}. LeRobot {CODEBASE_VERSION} format, by surgicai-vision
 ({meta["code_version"]}). Pictures of {size} pixels, {stored}
 
 | column | content |

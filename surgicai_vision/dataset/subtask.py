@@ -68,8 +68,10 @@ class SubtaskPart:
         return self._whole.episode_index[self._rows]
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return every column that is no picture, as `Dataset.columns`."""
-        return {key: values[self._rows] for key, values in self._whole.columns().items()}
+        """Return every column that is no picture, as `Dataset.columns`; index and time count from its beginning."""
+        columns = {key: values[self._rows] for key, values in self._whole.columns().items()}
+        first = np.searchsorted(self.episode_index, self.episode_index, side="left")
+        return columns | {key: columns[key] - columns[key][first] for key in ("frame_index", "timestamp")}
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> Any:
         """Return the RGB pictures of a view, (stop - start, H, W, 3) uint8."""

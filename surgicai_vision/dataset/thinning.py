@@ -4,7 +4,7 @@
 
 Neighbouring frames of 50 a second say nearly the same, while every episode brings a needle that lies elsewhere: for
 the same time of encoding and training, few frames of many episodes teach more than all frames of few
-(docs/results/best.md). Columns keep their values: `frame_index` still counts control steps.
+(docs/results/best.md). Columns keep their values: `frame_index` still counts the whole's frames.
 """
 
 import functools
@@ -12,20 +12,30 @@ from typing import Any, final
 
 import numpy as np
 
+from surgicai_vision import names
 from surgicai_vision.config import TaskConfig, digest
 from surgicai_vision.errors import InputError
 
 
 def thinned(dataset: Any, every: int) -> Any:
-    """Return the frames 0, `every`, 2 · `every` … of each episode; the dataset itself where `every` is 1.
+    """Return the frames of the control steps 0, `every`, 2 · `every` … of each episode.
 
     Args:
-        dataset: an opened dataset, or a part of one.
-        every: at least 1.
+        dataset: an opened dataset, or a part of one; itself where it holds no others.
+        every: control steps from frame to frame, at least 1.
+
+    Raises:
+        InputError: the dataset was rendered with fewer frames.
     """
     if every < 1:
         raise InputError(f"every is {every}; it must be at least 1.")
-    return dataset if every == 1 else ThinnedPart(dataset, every)
+    held = names.FPS // getattr(dataset, "fps", names.FPS)
+    if every % held:
+        raise InputError(
+            f"The recipe takes a frame every {every} steps; the dataset holds one every {held} ('render-demos --every "
+            f"{held}'). Give a recipe with every: {held}, or render all frames."
+        )
+    return dataset if every == held else ThinnedPart(dataset, every // held)
 
 
 @final

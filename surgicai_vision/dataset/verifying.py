@@ -71,7 +71,7 @@ class Verifier:
         columns = {key: _array(table.column(key), self.files.features, key) for key in self._plain(table)}
         self._check_indices(number, start, columns)
         if self.ours:
-            for problem in (*episode_problems(number, columns), *number_problems(columns)):
+            for problem in (*episode_problems(number, columns, self.files.fps), *number_problems(columns)):
                 raise _Unfit(problem)
         known = row_statistics(self.files.rows[number]) if number < len(self.files.rows) else {}
         statistics = {

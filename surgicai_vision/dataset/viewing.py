@@ -171,7 +171,7 @@ def _features(files: LeRobotFiles, dataset: Dataset, keys: Sequence[str], video:
             "video.width": dataset.image_size,
             "video.codec": video,
             "video.pix_fmt": PIXELS,
-            "video.fps": names.FPS,
+            "video.fps": dataset.fps,
             "video.channels": 3,
             "has_audio": False,
             "is_depth_map": False,
@@ -187,7 +187,7 @@ def _write_data(
     files: LeRobotFiles, folder: Path, features: Mapping[str, Any], places: Sequence[Mapping[str, Place]]
 ) -> list[EpisodeRow]:
     """Write the data files; return the episodes' rows."""
-    data = DataFiles(folder, features)
+    data = DataFiles(folder, features, files.fps)
     rows = []
     for number, table in enumerate(files.episodes(folder)):
         statistics = row_statistics(files.rows[number])

@@ -40,16 +40,16 @@ def assemble(shards: Sequence[Path], out: Path, features: Features, text: str, m
         out: dataset folder; it does not exist yet.
         features: LeRobot feature table.
         text: the task's sentence.
-        meta: content of `meta/surgicai.json`.
+        meta: content of `meta/surgicai.json`; its `fps` is that of the frames.
     """
     with whole_folder(out) as folder:
-        data = DataFiles(folder, features)
+        data = DataFiles(folder, features, meta["fps"])
         rows = []
         for index, shard in enumerate(shards):
             statistics = read_json(shard / SUMMARY_FILE)["statistics"]
             rows.append(data.append(index, pq.read_table(shard / EPISODE_FILE), statistics))
         data.close()
-        write_metadata(folder, features, [text], rows)
+        write_metadata(folder, features, [text], rows, {"fps": meta["fps"]})
         write_json(folder / names.META_FILE, meta)
 
 

@@ -23,9 +23,11 @@ FRAMES: Mapping[str, int] = MappingProxyType(
 """Frames of a demonstration by the expert, about."""
 RECORD, RENDER = 0.0045, 0.008
 """Per frame recorded; per view and frame rendered and written [s]."""
-ENCODE: Mapping[str, float] = MappingProxyType({"imagenet-lite": 0.017, "random": 0.035})
+ENCODE: Mapping[str, float] = MappingProxyType(
+    {"imagenet-lite": 0.017, "imagenet-lite-early": 0.006, "random-conv": 0.006, "random": 0.035}
+)
 ENCODE_ELSE = 0.08
-"""Per frame encoded [s]: the two light encoders, and a ResNet-50 or a small transformer."""
+"""Per frame encoded [s]: the light encoders, and a ResNet-50 or a small transformer."""
 LIVE = 2.5
 """Encoding in an evaluation takes so many times as long a frame: eight at a time at most, and seldom as many."""
 TRAIN = 4e-5

@@ -8,7 +8,7 @@ from typing import Any
 from surgicai_vision import names, registry
 from surgicai_vision.cells import OWN, Cell
 from surgicai_vision.chain import TERMINATIONS
-from surgicai_vision.config import digest, to_mapping
+from surgicai_vision.config import check_every, digest, to_mapping
 from surgicai_vision.demos.record import CALM, SOURCES, TAUGHT, Disturbance
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES
@@ -36,6 +36,7 @@ class Grid:
         demonstrations: numbers of the expert's demonstrations of each task; the smaller set lies within the larger.
         source: who demonstrates: `expert`, or `search`, which does not know the goal of a grasp.
         noise: what they execute is disturbed by up to so much; each episode draws its deviation between 0 and this.
+        every: frames are rendered every so many steps; recipes must then take them so.
         chain: add, for the whole procedure, a high-level policy over a policy for each subtask, by how subtasks end:
             `privileged` or `learned`.
         swap: add each such chain with the expert in the place of each subtask's policy.
@@ -64,6 +65,7 @@ class Grid:
     demonstrations: tuple[int, ...] = (50,)
     source: str = "expert"
     noise: float = 0.0
+    every: int = 1
     chain: tuple[str, ...] = ()
     swap: bool = False
     accept_licence: bool = False
@@ -87,6 +89,7 @@ class Grid:
             check_name("policy", name, (*registry.POLICIES, *LEROBOT_POLICIES))
         check_name("source", self.source, TEACHERS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
+        check_every(self.every)
         for name in self.chain:
             check_name("termination", name, TERMINATIONS)
         numbers = [(name, getattr(self, name)) for name in ("episodes", "size", "steps", "batch")]
@@ -168,7 +171,7 @@ class Grid:
         lerobot = {"steps": self.steps, "batch": self.batch} if cell.policy in LEROBOT_POLICIES else {}
         shared = {name: getattr(self, name) for name in ("episodes", "size", "depth")}
         shared |= {"views": list(self.views), "demonstrations": self.recorded, **lerobot}
-        shared |= {"source": self.source, "noise": self.noise}
+        shared |= {"source": self.source, "noise": self.noise, **({"every": self.every} if self.every > 1 else {})}
         return digest({"cell": to_mapping(cell), **shared})[:16]
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from surgicai_vision import names, registry
 from surgicai_vision.cells import OWN, Cell
-from surgicai_vision.errors import SurgicaiError
+from surgicai_vision.errors import InputError, SurgicaiError
 
 LEROBOT_POLICIES = ("act", "diffusion")
 OPTIONS = {
@@ -46,6 +46,8 @@ def train_lerobot(cell: Cell, dataset: Any, out: Path, *, steps: int, batch: int
     Raises:
         SurgicaiError: LeRobot failed; the message ends with the last of what it said.
     """
+    if dataset.fps != names.FPS:
+        raise InputError(f"{dataset.path} holds {dataset.fps} frames a second; {cell.policy} needs {names.FPS}.")
     root = dataset.path
     if cell.encoder != OWN:
         root = out.with_name(SCRATCH)
