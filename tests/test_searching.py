@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from policies.bc import BC
 from surgicai_vision import envs, names
 from surgicai_vision.agents import PolicyAgent
 from surgicai_vision.config import SUBTASK_STEPS, TaskConfig
+from surgicai_vision.demos.record import roll
 from surgicai_vision.demos.searching import Searcher
 from surgicai_vision.errors import InputError
 from surgicai_vision.registry import load_policy
@@ -39,7 +41,24 @@ def test_it_meets_every_goal_and_reads_none() -> None:
         shortest = min(len(actions) for _, actions in tried)
         for _, actions in tried[1:]:
             np.testing.assert_array_equal(actions[:shortest], tried[0][1][:shortest])
-    assert len(grasp(env, 500_000, 5.0)[1]) < Searcher.AGAIN < len(grasp(env, 500_000, 20.0)[1]) < SUBTASK_STEPS
+    _, second, third, *_ = Searcher.ATTEMPTS
+    steps = [len(grasp(env, 500_000, goal)[1]) for goal in (12.5, 5.0, 20.0)]
+    assert steps[0] < second < steps[1] < third < steps[2] < SUBTASK_STEPS
+
+
+def test_its_demonstrations_show_every_attempt() -> None:
+    """They go on after the success, so that what a learner does after a failed attempt has been shown."""
+    env = envs.make(TaskConfig("grasp"))
+    rollout = roll(env, Searcher(env), 500_000, "search")
+    assert rollout.success and len(rollout.demo) == env.config.max_steps and rollout.demo.success.any()
+    closing = rollout.demo.action[:, 6] < -0.5
+    opening = rollout.demo.action[:, 6] > 0.5
+    edges = [*list(Searcher.ATTEMPTS)[1:], env.config.max_steps]
+    for start, stop in pairwise(edges):
+        assert opening[start:stop].any() and closing[start:stop].any()
+        assert opening[start:stop].argmax() < closing[start:stop].argmax()
+    other = envs.make(TaskConfig("pullout"))
+    assert len(roll(other, Searcher(other), 500_000, "search").demo) < other.config.max_steps
 
 
 class Stepped(FakeDataset):

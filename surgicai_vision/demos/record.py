@@ -103,7 +103,10 @@ CALM = Disturbance()
 
 
 class Actor(Protocol):
-    """What records: an expert that sees the environment itself; made anew for every episode."""
+    """What records: an expert that sees the environment itself; made anew for every episode.
+
+    One with a true attribute `persists` goes on after its success until the episode's limit.
+    """
 
     def action(self) -> np.ndarray:
         """Return the action (7,) float32 for the environment's present state."""
@@ -127,7 +130,7 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert", disturbance:
     deviation = disturbance.deviation(rng)
     states, rows = [env.get_state()], []
     info: dict[str, Any] = {}
-    ended = False
+    ended, persists = False, getattr(actor, "persists", False)
     while not ended:
         phase = env.phase
         action = np.asarray(actor.action(), dtype=np.float32)
@@ -135,7 +138,7 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert", disturbance:
         _, reward, terminated, truncated, info = env.step(executed)
         states.append(env.get_state())
         rows.append((action, executed, phase, reward, info["is_success"], info["contact"]))
-        ended = terminated or truncated
+        ended = (terminated and not persists) or truncated or info["physics_error"]
     actions, sent, phase, reward, success, contact = (list(column) for column in zip(*rows, strict=True))
     demo = Demo(
         config=env.config,
@@ -153,7 +156,8 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert", disturbance:
     )
     if info["physics_error"]:
         return Rollout(demo, False, "physics error")
-    return Rollout(demo, bool(success[-1]), "" if success[-1] else f"no success in {len(actions)} steps")
+    reached = any(success) if persists else bool(success[-1])
+    return Rollout(demo, reached, "" if reached else f"no success in {len(actions)} steps")
 
 
 @functools.lru_cache(maxsize=1)
