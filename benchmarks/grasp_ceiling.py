@@ -9,7 +9,6 @@ again elsewhere (`surgicai_vision.demos.searching`). Both bound what a policy ca
 import argparse
 from collections.abc import Callable
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 from common import chunks, emit, median, spread
@@ -23,7 +22,7 @@ from surgicai_vision.statistics import clopper_pearson
 class Once(Searcher):
     """Takes the needle once, in the middle of the range."""
 
-    ATTEMPTS = MappingProxyType({0: 12.5})
+    ATTEMPTS = (12.5,)
 
 
 WAYS: dict[str, Callable[[Any], Searcher]] = {"once": Once, "search": Searcher}

@@ -25,14 +25,14 @@ import torch
 from torch import nn
 
 from surgicai_vision import names
-from surgicai_vision.config import Deviations
+from surgicai_vision.config import CLOCK_SIZE, Deviations
 from surgicai_vision.errors import InputError, check_name
 
 ACTIONS = len(names.ACTION_NAMES)
 VECTORS: Mapping[str, int] = MappingProxyType(
     {
         names.STATE: len(names.STATE_NAMES),
-        names.CLOCKED_STATE: len(names.STATE_NAMES) + 1,
+        names.CLOCKED_STATE: len(names.STATE_NAMES) + CLOCK_SIZE,
         names.BOTH_ARMS: len(names.BOTH_ARMS_NAMES),
         names.PRIVILEGED_STATE: len(names.PRIVILEGED_NAMES),
     }

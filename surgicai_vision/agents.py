@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision import names
-from surgicai_vision.config import SUBTASK_STEPS
+from surgicai_vision.config import clock
 from surgicai_vision.errors import UnreachablePose
 
 
@@ -196,8 +196,7 @@ class PolicyAgent:
         with one_thread():
             vectors = np.stack([self._vector(env) for env in envs])
             if self._clocked and ticks is not None:
-                clock = np.array(ticks, np.float32)[:, None] / SUBTASK_STEPS
-                vectors = np.concatenate([vectors, clock], axis=1, dtype=np.float32)
+                vectors = np.concatenate([vectors, clock(np.array(ticks))], axis=1, dtype=np.float32)
             return np.asarray(self._policy.act(self._features(observations), vectors), np.float32)
 
     def _features(self, observations: Sequence[Any]) -> NDArray[np.float32] | None:

@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+import numpy as np
+
 from surgicai_vision import names
 from surgicai_vision.errors import InputError, UnknownName, check_name
 
@@ -26,6 +28,7 @@ STEPS: Mapping[str, tuple[float, float, float]] = types.MappingProxyType(
 evaluation, the RL training script, the trajectories shipped with the release)."""
 
 SUBTASK_STEPS = 200
+CLOCK_PERIOD, CLOCK_SIZE = 25, 3
 """Control steps a subtask may take (paper, image policies)."""
 
 
@@ -236,3 +239,13 @@ def check_every(every: int) -> None:
     if every < 1 or names.FPS % every:
         allowed = ", ".join(str(number) for number in range(1, names.FPS + 1) if names.FPS % number == 0)
         raise InputError(f"every is {every}; it must divide the {names.FPS} frames a second: {allowed}.")
+
+
+def clock(steps: np.ndarray) -> np.ndarray:
+    """Return what a policy with a clock is told of the control steps (N,) since its subtask began, (N, 3) float32.
+
+    The share of `SUBTASK_STEPS`, and sine and cosine of a hand that goes round once in `CLOCK_PERIOD` steps: the share
+    alone changes too little in a few steps to act by.
+    """
+    turn = 2.0 * np.pi * steps / CLOCK_PERIOD
+    return np.stack([steps / SUBTASK_STEPS, np.sin(turn), np.cos(turn)], axis=1).astype(np.float32)

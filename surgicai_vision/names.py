@@ -69,7 +69,7 @@ PRIVILEGED_STATE = "privileged_state"
 """The 21 values of obs_type "state", goal included. No LeRobot key, so that no policy is fed it by default."""
 
 CLOCKED_STATE = "clocked_state"
-"""STATE and, last, the control steps since the subtask began, as a share of its limit of `config.SUBTASK_STEPS`."""
+"""STATE and, last, the time since the subtask began as `config.clock` tells it."""
 
 META_FILE = "meta/surgicai.json"
 """Our own sidecar inside a LeRobot dataset: cameras, units, renderer, hashes, versions."""

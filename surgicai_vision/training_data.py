@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from surgicai_vision import names
-from surgicai_vision.config import SUBTASK_STEPS, TaskConfig
+from surgicai_vision.config import TaskConfig, clock
 
 
 class TrainingData(Protocol):
@@ -25,11 +25,11 @@ class TrainingData(Protocol):
 
 
 def with_clock(columns: dict[str, np.ndarray], vector: str | None) -> dict[str, np.ndarray]:
-    """Return the columns, and `names.CLOCKED_STATE` (N, 8) beside them where that is the `vector` asked for."""
+    """Return the columns, and `names.CLOCKED_STATE` (N, 10) beside them where that is the `vector` asked for."""
     if vector != names.CLOCKED_STATE:
         return columns
-    clock = np.asarray(columns["timestamp"], np.float32)[:, None] * names.FPS / SUBTASK_STEPS
-    return {**columns, vector: np.concatenate([columns[names.STATE], clock], axis=1, dtype=np.float32)}
+    steps = np.rint(np.asarray(columns["timestamp"]) * names.FPS)
+    return {**columns, vector: np.concatenate([columns[names.STATE], clock(steps)], axis=1, dtype=np.float32)}
 
 
 def split(episode_index: np.ndarray, recipe: Any, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:

@@ -13,7 +13,7 @@ from policies.base import Recipe
 from policies.bc import BC
 from surgicai_vision import envs, names
 from surgicai_vision.agents import PolicyAgent
-from surgicai_vision.config import SUBTASK_STEPS, TaskConfig
+from surgicai_vision.config import CLOCK_PERIOD, CLOCK_SIZE, SUBTASK_STEPS, TaskConfig, clock
 from surgicai_vision.demos.record import roll
 from surgicai_vision.demos.searching import Searcher
 from surgicai_vision.errors import InputError
@@ -41,7 +41,7 @@ def test_it_meets_every_goal_and_reads_none() -> None:
         shortest = min(len(actions) for _, actions in tried)
         for _, actions in tried[1:]:
             np.testing.assert_array_equal(actions[:shortest], tried[0][1][:shortest])
-    _, second, third, *_ = Searcher.ATTEMPTS
+    second, third = Searcher.AGAIN, Searcher.AGAIN + Searcher.PERIOD
     steps = [len(grasp(env, 500_000, goal)[1]) for goal in (12.5, 5.0, 20.0)]
     assert steps[0] < second < steps[1] < third < steps[2] < SUBTASK_STEPS
 
@@ -53,12 +53,20 @@ def test_its_demonstrations_show_every_attempt() -> None:
     assert rollout.success and len(rollout.demo) == env.config.max_steps and rollout.demo.success.any()
     closing = rollout.demo.action[:, 6] < -0.5
     opening = rollout.demo.action[:, 6] > 0.5
-    edges = [*list(Searcher.ATTEMPTS)[1:], env.config.max_steps]
+    edges = range(Searcher.AGAIN, env.config.max_steps + 1, Searcher.PERIOD)
+    assert len(edges) == len(Searcher.ATTEMPTS) and Searcher.PERIOD == CLOCK_PERIOD
     for start, stop in pairwise(edges):
         assert opening[start:stop].any() and closing[start:stop].any()
         assert opening[start:stop].argmax() < closing[start:stop].argmax()
     other = envs.make(TaskConfig("pullout"))
     assert len(roll(other, Searcher(other), 500_000, "search").demo) < other.config.max_steps
+
+
+def test_the_clock_tells_steps_apart_and_comes_round() -> None:
+    told = clock(np.arange(SUBTASK_STEPS))
+    assert told.shape == (SUBTASK_STEPS, CLOCK_SIZE) and told.dtype == np.float32
+    np.testing.assert_allclose(told[CLOCK_PERIOD:, 1:], told[:-CLOCK_PERIOD, 1:], atol=1e-5)
+    assert np.abs(np.diff(told[:, 1:], axis=0)).sum(1).min() > 0.2
 
 
 class Stepped(FakeDataset):

@@ -10,8 +10,6 @@ other subtask it is the expert.
 """
 
 import math
-from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +17,6 @@ from numpy.typing import NDArray
 from surgicai_vision.demos.expert import HOVER, OPEN_ABOVE, Expert, Sight, Wish, take, toward
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.geometry import grasp_in_needle
-
-BESIDE = 0.004
-"""How far back the jaws go before another attempt [m]."""
 
 
 class Searcher:
@@ -31,13 +26,20 @@ class Searcher:
         env: the env.
     """
 
-    ATTEMPTS: Mapping[int, float] = MappingProxyType({0: 12.5, 95: 6.5, 120: 18.5, 145: 2.5, 170: 22.5})
-    """Control step from which on the needle is taken at so many degrees: the expert's own grasp takes 70 to 85 steps,
-    another attempt about 20."""
+    ATTEMPTS = (12.5, 6.5, 18.5, 2.5, 22.5)
+    """Angles at which the needle is taken [deg], one attempt after the other."""
+    AGAIN, PERIOD = 100, 25
+    """Control step of the second attempt, for the expert's own grasp takes 70 to 85; steps of each after it, which is
+    the period of the clock that policies have (`config.CLOCK_PERIOD`)."""
+    LOOSEN, LOOSE = 8, 0.22
+    """Steps for which the jaws open before another attempt, and how far [rad]: to slide along the needle.
+
+    What is done depends on the step, not on what was done before: a policy without a memory could not tell jaws that
+    open from jaws that close.
+    """
 
     def __init__(self, env: SuturingEnv):
         self.env, self._expert = env, Expert(env)
-        self._attempt, self._opened = 0, True
 
     @property
     def persists(self) -> bool:
@@ -53,12 +55,9 @@ class Searcher:
 
     def _grasp(self, scene: Sight, step: int) -> Wish:
         """Take the needle as the present attempt does; open before a new one."""
-        attempt = max(begin for begin in self.ATTEMPTS if begin <= step)
-        if attempt != self._attempt:
-            self._attempt, self._opened = attempt, False
-        if not self._opened:
-            if scene.command_jaw < OPEN_ABOVE - scene.step.jaw:
-                return Wish(scene.command, OPEN_ABOVE)
-            self._opened = True
+        later, into = divmod(step - self.AGAIN, self.PERIOD)
+        attempt = min(max(0, later + 1), len(self.ATTEMPTS) - 1)
+        if attempt and into < self.LOOSEN:
+            return Wish(scene.command, self.LOOSE)
         goal = scene.needle @ grasp_in_needle(scene.arm, math.radians(self.ATTEMPTS[attempt]))
-        return take(scene, goal, BESIDE if attempt else HOVER, OPEN_ABOVE)
+        return take(scene, goal, 0.0, self.LOOSE) if attempt else take(scene, goal, HOVER, OPEN_ABOVE)
