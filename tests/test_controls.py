@@ -45,7 +45,7 @@ def test_replay_of_one_demonstration_repeats_it_where_it_was_recorded(
         ended = terminated or truncated
     dataset = SimpleNamespace(
         columns=lambda: {names.ACTION: np.stack(actions)}, episode_index=np.zeros(len(actions), np.int64),
-        config=config, fingerprint="one",
+        config=config, fingerprint="one", fps=names.FPS,
     )  # fmt: skip
     monkeypatch.chdir(str(tmp_path))
     monkeypatch.setattr(folders, "open_dataset", lambda *_: dataset)
