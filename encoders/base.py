@@ -47,6 +47,7 @@ __all__ = [
     "POOLS",
     "Encoder",
     "EncoderCard",
+    "MapNetwork",
     "Plugin",
     "freeze",
     "load_exactly",
@@ -61,6 +62,18 @@ CUDA_BATCH = 64
 SMALL = (4, 2, 1)  # smaller pieces that are tried; each costs as much a picture as a whole one
 PROBE_SEED = 0
 FINGERPRINT_VERSION = 1  # raise when the same weights and card begin to give other features
+
+
+class MapNetwork(nn.Sequential):
+    """Layers whose answer is a feature map (B, C, h, w); the global feature is its mean over places."""
+
+    def forward_features(self, pictures: torch.Tensor) -> torch.Tensor:
+        """Return the feature map (B, C, h, w)."""
+        return super().forward(pictures)
+
+    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+        """Return the mean feature (B, C)."""
+        return self.forward_features(pictures).mean((2, 3))
 
 
 def state_sha256(module: nn.Module) -> str:

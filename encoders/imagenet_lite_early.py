@@ -28,21 +28,9 @@ CARD = replace(
 
 def early_of(network: Any) -> "nn.Module":
     """Return the network (B, 3, 224, 224) → (B, 40), map (B, 40, 28, 28), of timm's EfficientNet-Lite0."""
-    import torch
-    from torch import nn
+    from encoders.base import MapNetwork
 
-    class Stages(nn.Sequential):
-        """Stem and stages; the global feature is the mean over places."""
-
-        def forward_features(self, pictures: torch.Tensor) -> torch.Tensor:
-            """Return the feature map (B, 40, 28, 28)."""
-            return super().forward(pictures)
-
-        def forward(self, pictures: torch.Tensor) -> torch.Tensor:
-            """Return the mean feature (B, 40)."""
-            return self.forward_features(pictures).mean((2, 3))
-
-    return Stages(network.conv_stem, network.bn1, *network.blocks[:STAGES])
+    return MapNetwork(network.conv_stem, network.bn1, *network.blocks[:STAGES])
 
 
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":

@@ -43,16 +43,7 @@ def network_from(seed: int) -> "nn.Module":
     import torch
     from torch import nn
 
-    class Convolutions(nn.Sequential):
-        """The convolutions; the global feature is the mean over places."""
-
-        def forward_features(self, pictures: torch.Tensor) -> torch.Tensor:
-            """Return the feature map (B, 48, 28, 28)."""
-            return super().forward(pictures)
-
-        def forward(self, pictures: torch.Tensor) -> torch.Tensor:
-            """Return the mean feature (B, 48)."""
-            return self.forward_features(pictures).mean((2, 3))
+    from encoders.base import MapNetwork
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -64,7 +55,7 @@ def network_from(seed: int) -> "nn.Module":
             torch.nn.init.constant_(layer.get_parameter("bias"), 0.0)
             layers += [layer, nn.ReLU()]
             channels = width
-    return Convolutions(*layers)
+    return MapNetwork(*layers)
 
 
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":

@@ -28,8 +28,9 @@ STEPS: Mapping[str, tuple[float, float, float]] = types.MappingProxyType(
 evaluation, the RL training script, the trajectories shipped with the release)."""
 
 SUBTASK_STEPS = 200
-CLOCK_PERIOD, CLOCK_SIZE = 25, 3
 """Control steps a subtask may take (paper, image policies)."""
+CLOCK_PERIOD, CLOCK_SIZE = 25, 3
+"""Control steps in which the hand of `clock` goes round, and how many numbers `clock` tells."""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ def test_it_meets_every_goal_and_reads_none() -> None:
         shortest = min(len(actions) for _, actions in tried)
         for _, actions in tried[1:]:
             np.testing.assert_array_equal(actions[:shortest], tried[0][1][:shortest])
-    second, third = Searcher.AGAIN, Searcher.AGAIN + Searcher.PERIOD
+    second, third = Searcher.AGAIN, Searcher.AGAIN + CLOCK_PERIOD
     steps = [len(grasp(env, 500_000, goal)[1]) for goal in (12.5, 5.0, 20.0)]
     assert steps[0] < second < steps[1] < third < steps[2] < SUBTASK_STEPS
 
@@ -53,8 +53,8 @@ def test_its_demonstrations_show_every_attempt() -> None:
     assert rollout.success and len(rollout.demo) == env.config.max_steps and rollout.demo.success.any()
     closing = rollout.demo.action[:, 6] < -0.5
     opening = rollout.demo.action[:, 6] > 0.5
-    edges = range(Searcher.AGAIN, env.config.max_steps + 1, Searcher.PERIOD)
-    assert len(edges) == len(Searcher.ATTEMPTS) and Searcher.PERIOD == CLOCK_PERIOD
+    edges = range(Searcher.AGAIN, env.config.max_steps + 1, CLOCK_PERIOD)
+    assert len(edges) == len(Searcher.ATTEMPTS)
     for start, stop in pairwise(edges):
         assert opening[start:stop].any() and closing[start:stop].any()
         assert opening[start:stop].argmax() < closing[start:stop].argmax()

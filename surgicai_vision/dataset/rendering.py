@@ -94,16 +94,8 @@ def render_demos(
         return finished(out, request, started)
     origins = [_Origin.of(read_demo(path)) for path in paths]
     config = _same_config(origins, demos)
-    jobs = [
-        Job(
-            "render-episode",
-            {"demo": str(path.resolve()), **options},
-            (sha256_file(path),),
-            -(-row.length // every),
-            ("demo",),
-        )
-        for path, row in zip(paths, origins, strict=True)
-    ]
+    frames = [len(range(0, row.length, every)) for row in origins]
+    jobs = [_job(path, options, count) for path, count in zip(paths, frames, strict=True)]
     with building(out) as (store, result):
         shards = run(jobs, store, workers=workers, progress=progress, unit="frames", engine=engine)
         meta = _meta(demos, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins)
@@ -115,6 +107,11 @@ def render_demos(
             more: dict[str, Any] = {"store": store, "workers": workers, "engine": engine}
             write_view(open_dataset(lossless), result, views, video, {}, progress, **more)
     return finished(out, request, started)
+
+
+def _job(path: Path, options: Mapping[str, Any], frames: int) -> Job:
+    """Return the job that renders one demonstration."""
+    return Job("render-episode", {"demo": str(path.resolve()), **options}, (sha256_file(path),), frames, ("demo",))
 
 
 def _check_pictures(views: Sequence[str], size: int, video: str | None) -> None:
@@ -248,7 +245,7 @@ def render_episode(
 
 def _columns(demo: Demo, every: int, measured: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return every column of `layout.COLUMNS`, (T,) or (T, n), of the T frames that are rendered."""
-    frames = len(range(0, len(demo), every))
+    frames = len(measured[names.STATE])
     return {
         **{key: rows.astype(np.float32) for key, rows in measured.items()},
         names.ACTION: demo.action[::every],

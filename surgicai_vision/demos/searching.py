@@ -14,6 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision.config import CLOCK_PERIOD
 from surgicai_vision.demos.expert import HOVER, OPEN_ABOVE, Expert, Sight, Wish, take, toward
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.geometry import grasp_in_needle
@@ -28,9 +29,9 @@ class Searcher:
 
     ATTEMPTS = (12.5, 6.5, 18.5, 2.5, 22.5)
     """Angles at which the needle is taken [deg], one attempt after the other."""
-    AGAIN, PERIOD = 100, 25
-    """Control step of the second attempt, for the expert's own grasp takes 70 to 85; steps of each after it, which is
-    the period of the clock that policies have (`config.CLOCK_PERIOD`)."""
+    AGAIN = 100
+    """Control step of the second attempt, for the expert's own grasp takes 70 to 85. Another follows every
+    `CLOCK_PERIOD`, in which the clock that policies have goes round once."""
     LOOSEN, LOOSE = 8, 0.22
     """Steps for which the jaws open before another attempt, and how far [rad]: to slide along the needle.
 
@@ -55,7 +56,7 @@ class Searcher:
 
     def _grasp(self, scene: Sight, step: int) -> Wish:
         """Take the needle as the present attempt does; open before a new one."""
-        later, into = divmod(step - self.AGAIN, self.PERIOD)
+        later, into = divmod(step - self.AGAIN, CLOCK_PERIOD)
         attempt = min(max(0, later + 1), len(self.ATTEMPTS) - 1)
         if attempt and into < self.LOOSEN:
             return Wish(scene.command, self.LOOSE)
