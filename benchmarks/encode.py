@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from common import emit
 
-from encoders.base import CPU_BATCH, CUDA_BATCH, best_device, best_dtype
+from encoders.base import CUDA_BATCH, best_device, best_dtype
 from surgicai_vision import registry
 from surgicai_vision.features import encode
 
@@ -76,7 +76,7 @@ def cached(source: Any, encoder: Any) -> int:
 def ways(name: str, weights: str | None, frames: np.ndarray, dataset: Any) -> dict[str, Callable[[], int]]:
     """Return what is timed, by name; each returns how many frames it encoded."""
     loop, encoder = bare(name, weights), registry.load_encoder(name, weights)
-    batch = CUDA_BATCH if torch.cuda.is_available() else CPU_BATCH
+    batch = CUDA_BATCH if torch.cuda.is_available() else 8
     error = np.abs(loop(frames[:batch], batch).astype(np.float32) - encoder(frames[:batch])).max()
     print(f"{name}: largest difference between the ways {error:.4f}", file=sys.stderr)
     made = {

@@ -16,11 +16,13 @@ cache holds. Measured on a Xeon with AMX (bf16, channels_last): convolutions giv
 batch and thread count; transformers and attention pools do not (up to 1 % between batch sizes, and between
 one and two threads), but do for a fixed batch on one thread, at any position and beside any neighbours. So:
 
-* every piece holds exactly `CPU_BATCH` (`CUDA_BATCH`) pictures. What is left over is padded, unless this network
-  on this machine is found to give the same bits in smaller pieces: then it is cut into those of `SMALL`;
+* every piece holds exactly as many pictures as the card says (`CUDA_BATCH`). What is left over is padded, unless
+  this network on this machine is found to give the same bits in smaller pieces: then it is cut into those of `SMALL`;
 * on a CPU each piece is computed by one thread, and pieces run side by side, one per core. That is also
   faster where others use the cores: 4 to 5 times at a load of 5 on 2 cores, ResNet-50 and EfficientNet;
 * features are rounded to the values float16 can hold.
+
+BatchNorms are folded into the convolutions before them (`encoders.folding`).
 """
 
 import functools
@@ -40,6 +42,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from encoders.card import EncoderCard, Plugin
+from encoders.folding import fold_batch_norms
 from surgicai_vision.config import digest
 from surgicai_vision.errors import BadFile, InputError, SurgicaiError, check_name
 
@@ -57,11 +60,10 @@ __all__ = [
 ]
 
 POOLS = ("global", "spatial", "tokens")
-CPU_BATCH = 8  # per thread; larger batches leave the cache and are slower
 CUDA_BATCH = 64
 SMALL = (4, 2, 1)  # smaller pieces that are tried; each costs as much a picture as a whole one
 PROBE_SEED = 0
-FINGERPRINT_VERSION = 1  # raise when the same weights and card begin to give other features
+FINGERPRINT_VERSION = 2  # raise when the same weights and card begin to give other features
 
 
 class MapNetwork(nn.Sequential):
@@ -144,7 +146,9 @@ class Encoder:
         self.weights_sha256 = state_sha256(network)
         self._device = device or best_device()
         self._dtype = dtype or best_dtype(self._device)
-        self._network = freeze(network).to(self._device, self._dtype).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._batch = CUDA_BATCH if self._device.type == "cuda" else card.batch
+        network = freeze(fold_batch_norms(network.eval(), card.input_size)).to(self._device, self._dtype)
+        self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         low, high = card.input_range
         mean, std = torch.tensor(card.mean), torch.tensor(card.std)
         self._scale = ((high - low) / 255 / std).to(self._device)
@@ -202,15 +206,19 @@ class Encoder:
 
     def _cut(self, frames: np.ndarray) -> list[np.ndarray]:
         """Cut frames into whole pieces and what is left over."""
-        step = CUDA_BATCH if self._device.type == "cuda" else CPU_BATCH
-        whole = len(frames) // step * step
-        pieces = [frames[at : at + step] for at in range(0, whole, step)]
+        whole = len(frames) // self._batch * self._batch
+        pieces = [frames[at : at + self._batch] for at in range(0, whole, self._batch)]
         rest = frames[whole:]
-        for size in SMALL if len(rest) and self._any_size else ():
+        for size in self._small if len(rest) and self._any_size else ():
             while len(rest) >= size:
                 pieces.append(rest[:size])
                 rest = rest[size:]
         return [*pieces, rest] if len(rest) else pieces
+
+    @property
+    def _small(self) -> tuple[int, ...]:
+        """Sizes of the pieces into which what is left over may be cut."""
+        return tuple(size for size in SMALL if size < self._batch)
 
     @functools.cached_property
     def _any_size(self) -> bool:
@@ -218,9 +226,9 @@ class Encoder:
         if self._device.type == "cuda":
             return False
         side = self.card.input_size
-        frames = np.random.default_rng(PROBE_SEED).integers(0, 256, (CPU_BATCH, side, side, 3), np.uint8)
+        frames = np.random.default_rng(PROBE_SEED).integers(0, 256, (self._batch, side, side, 3), np.uint8)
         (whole,) = self._map([frames])
-        small = self._map([frames[-size:] for size in SMALL], pad=False)
+        small = self._map([frames[-size:] for size in self._small], pad=False)
         return all(torch.equal(piece, whole[-len(piece) :]) for piece in small)
 
     def _map(self, pieces: list[np.ndarray], pad: bool | None = None) -> list[torch.Tensor]:
@@ -234,9 +242,8 @@ class Encoder:
     def _run(self, frames: np.ndarray, pad: bool | None = None) -> torch.Tensor:
         """Encode one piece of at most a batch, padded unless it need not be; (b, *shape) float32 on the device."""
         count = len(frames)
-        step = CUDA_BATCH if self._device.type == "cuda" else CPU_BATCH
-        if count < step and (not self._any_size if pad is None else pad):
-            frames = np.concatenate([frames, np.zeros((step - count, *frames.shape[1:]), np.uint8)])
+        if count < self._batch and (not self._any_size if pad is None else pad):
+            frames = np.concatenate([frames, np.zeros((self._batch - count, *frames.shape[1:]), np.uint8)])
         pictures = self.preprocess(frames).to(self._dtype).contiguous(memory_format=torch.channels_last)
         return self._pooled(pictures)[:count].float()
 
@@ -257,7 +264,7 @@ class Encoder:
     def _identity(self) -> dict[str, Any]:
         """Everything a feature depends on, as plain data."""
         card = asdict(self.card)
-        keys = ("architecture", "input_size", "input_range", "mean", "std", "interpolation", "channel_order")
+        keys = ("architecture", "input_size", "input_range", "mean", "std", "interpolation", "channel_order", "batch")
         return {
             "version": FINGERPRINT_VERSION,
             "weights": self.weights_sha256,

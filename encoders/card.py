@@ -33,6 +33,7 @@ class EncoderCard:
         note: what a user must know before comparing it with others.
         layers: where each pool's feature is taken.
         channel_order: order in which the channels are handed to the network, "RGB" or "BGR".
+        batch: pictures a CPU thread computes at once; few where maps are large, lest they leave its cache.
     """
 
     name: str
@@ -53,6 +54,7 @@ class EncoderCard:
     note: str = ""
     layers: str = ""
     channel_order: str = "RGB"
+    batch: int = 8
 
 
 @dataclass(frozen=True)

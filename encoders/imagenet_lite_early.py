@@ -21,6 +21,7 @@ CARD = replace(
     name="imagenet-lite-early",
     architecture="timm tf_efficientnet_lite0, stem and the first three stages",
     dim=CHANNELS,
+    batch=2,
     layers="the third stage (spatial, tokens), its mean over places (global)",
     note="Supervised on ImageNet-1k; not an encoder of the paper. Meant for pool 'spatial'.",
 )

@@ -245,10 +245,10 @@ class _Training:
 
     def _observed(self, rows: np.ndarray) -> torch.Tensor:
         """Return the raw inputs of some frames, (n, inputs) float32: the views' features, then the vector."""
-        parts = [entry.rows[rows].astype(np.float32) for entry in self.task.features]
+        parts = [torch.from_numpy(entry.rows[rows]).float() for entry in self.task.features]
         if self.vector is not None:
-            parts.append(self.vector[rows])
-        return torch.from_numpy(np.concatenate(parts, axis=1))
+            parts.append(torch.from_numpy(self.vector[rows]))
+        return torch.cat(parts, dim=1)
 
     def _measure(self) -> None:
         """Store mean and standard deviation of the inputs over the training frames."""

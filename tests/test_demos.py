@@ -75,6 +75,27 @@ def test_each_episode_draws_its_own_noise_within_the_range():
     assert np.mean(off) < np.mean([np.abs(demo.executed - demo.action)[:, 1:6].mean() for demo in even])
 
 
+def test_the_range_of_noise_reaches_the_recording(tmp_path):
+    """It did not: the jobs were given the largest noise alone."""
+    config = TaskConfig("grasp", max_steps=100)
+    calm = record(config, episodes=2, out=tmp_path / "a", disturbance=Disturbance(0.6, noise_from=0.0))
+    loud = record(config, episodes=2, out=tmp_path / "b", disturbance=Disturbance(0.6))
+    for one, other in zip(calm, loud, strict=True):
+        one, other = read_demo(one), read_demo(other)
+        assert one.seed == other.seed and not np.array_equal(one.executed, other.executed)
+
+
+def test_an_episode_lingers_after_its_success():
+    env = FakeEnv(CONFIG)
+    plain = roll(env, FakeExpert(env), 3).demo
+    longer = roll(env, FakeExpert(env), 3, linger=4).demo
+    assert len(longer.action) == len(plain.action) + 4
+    np.testing.assert_array_equal(longer.state[: len(plain.state)], plain.state)
+    assert not longer.success[: len(plain.action) - 1].any() and longer.success[len(plain.action) - 1]
+    short = FakeEnv(dataclasses.replace(CONFIG, max_steps=len(plain.action) + 1))
+    assert len(roll(short, FakeExpert(short), 3, linger=4).demo.action) == len(plain.action) + 1, "up to the limit"
+
+
 class Patient(FakeEnv):
     """Knows no success while a push lasts."""
 
@@ -210,5 +231,5 @@ def test_record_gives_up_on_an_expert_that_fails(tmp_path, fake, monkeypatch):
 
 @pytest.mark.parametrize(("episodes", "seed"), [(0, 0), (-3, 0), (1, -1)])
 def test_record_refuses_senseless_numbers(tmp_path, episodes, seed):
-    with pytest.raises(InputError, match=f"episodes is {episodes} and seed {seed}"):
+    with pytest.raises(InputError, match=f"episodes is {episodes}, seed {seed}, linger 0"):
         record(CONFIG, episodes=episodes, seed=seed, out=tmp_path / "demos")

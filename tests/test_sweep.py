@@ -200,17 +200,18 @@ def test_a_grid_is_read_with_single_values(tmp_path):
     ]
     assert grid.recorded == 10
     for line, error in (("policy: act2", UnknownName), ("chain: [sometimes]", UnknownName), ("steps: 0", InputError),
-                        ("source: dmp", UnknownName), ("noise: 2", InputError)):  # fmt: skip
+                        ("source: dmp", UnknownName), ("noise: 2", InputError),
+                        ("linger: -1", InputError)):  # fmt: skip
         path.write_text(f"task: grasp\nencoder: random\nview: [front]\n{line}\n")
         with pytest.raises(error):
             read_grid(path)
 
 
 def test_a_grid_says_who_demonstrates_and_how_much_disturbed(tmp_path):
-    grid = replace(BLIND, seed=(0,), demonstrations=(2,), source="search", noise=0.5)
+    grid = replace(BLIND, seed=(0,), demonstrations=(2,), source="search", noise=0.5, linger=3)
     assert sweep(grid, tmp_path)["done"] == 1
     made = json.loads((tmp_path / "data/grasp/demos/demos.json").read_text())["request"]
-    assert made["source"] == "search" and (made["noise"], made["noise_from"]) == (0.5, 0.0)
+    assert made["source"] == "search" and (made["noise"], made["linger"]) == (0.5, 3)
     assert {grid.key(cell) for cell in grid.cells}.isdisjoint(BLIND.key(cell) for cell in grid.cells)
 
 

@@ -52,6 +52,7 @@ class Options:
     recoveries: float = option(
         0.0, "share of episodes that start with a push that is not recorded", check=share, metavar="P"
     )
+    linger: int = option(0, "control steps that an episode goes on after its success", check=not_negative, metavar="N")
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     executor: str = executor_option()
     address: str | None = address_option()
@@ -81,6 +82,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
             source=options.source,
             seed=options.seed,
             disturbance=Disturbance(options.noise, options.recoveries, options.noise_from),
+            linger=options.linger,
             workers=options.workers,
             engine=engine,
             demos=taught,

@@ -24,12 +24,13 @@ def prepare_dataset(
     engine: Engine = LOCAL,
     source: str = "expert",
     disturbance: Disturbance = CALM,
+    linger: int = 0,
 ) -> Path:
     """Record demonstrations into `folder`/demos and render them into `folder`/dataset; return the latter."""
     with stage(f"demos: {demonstrations} of {config.task}", "episodes") as progress:
         record(
             config, episodes=demonstrations, out=folder / "demos", workers=workers, engine=engine, progress=progress,
-            source=source, disturbance=disturbance,
+            source=source, disturbance=disturbance, linger=linger,
         )  # fmt: skip
     with stage(f"dataset: {', '.join(views)} at {size} px", "frames") as progress:
         render_demos(

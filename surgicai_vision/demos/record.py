@@ -121,8 +121,18 @@ class Rollout:
     reason: str
 
 
-def roll(env: Any, actor: Actor, seed: int, source: str = "expert", disturbance: Disturbance = CALM) -> Rollout:
-    """Roll one episode of `env` from `seed` and return it with every state on the way."""
+def roll(
+    env: Any,
+    actor: Actor,
+    seed: int,
+    source: str = "expert",
+    disturbance: Disturbance = CALM,
+    linger: int = 0,
+) -> Rollout:
+    """Roll one episode of `env` from `seed` and return it with every state on the way.
+
+    It ends `linger` control steps after its success: what is shown there is that, and how, one stops.
+    """
     rng = np.random.default_rng([seed, DISTURBANCE_STREAM])
     env.reset(seed=seed)
     if not disturbance.push(env, rng):
@@ -130,15 +140,18 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert", disturbance:
     deviation = disturbance.deviation(rng)
     states, rows = [env.get_state()], []
     info: dict[str, Any] = {}
-    ended, persists = False, getattr(actor, "persists", False)
+    left = env.config.max_steps if getattr(actor, "persists", False) else linger
+    ended = reached = False
     while not ended:
         phase = env.phase
         action = np.asarray(actor.action(), dtype=np.float32)
         executed = disturbance.executed(action, deviation, rng) if deviation else action
-        _, reward, terminated, truncated, info = env.step(executed)
+        _, reward, _, truncated, info = env.step(executed)
         states.append(env.get_state())
         rows.append((action, executed, phase, reward, info["is_success"], info["contact"]))
-        ended = (terminated and not persists) or truncated or info["physics_error"]
+        left -= reached
+        reached = reached or bool(info["is_success"])
+        ended = (reached and left <= 0) or truncated or info["physics_error"]
     actions, sent, phase, reward, success, contact = (list(column) for column in zip(*rows, strict=True))
     demo = Demo(
         config=env.config,
@@ -156,7 +169,6 @@ def roll(env: Any, actor: Actor, seed: int, source: str = "expert", disturbance:
     )
     if info["physics_error"]:
         return Rollout(demo, False, "physics error")
-    reached = any(success) if persists else bool(success[-1])
     return Rollout(demo, reached, "" if reached else f"no success in {len(actions)} steps")
 
 
@@ -176,13 +188,14 @@ def record_episode(
     noise: float = 0.0,
     recoveries: float = 0.0,
     noise_from: float | None = None,
+    linger: int = 0,
     demos: Sequence[str] = (),
 ) -> None:
     """Job "record-episode": roll `seed` and write the episode, or why it failed, into `folder`."""
     module, _, name = SOURCES[source].partition(":")
     env = _env(from_mapping(TaskConfig, task))
     actor = getattr(importlib.import_module(module), name)(env, *([demos] if demos else []))
-    rollout = roll(env, actor, seed, source, Disturbance(noise, recoveries, noise_from))
+    rollout = roll(env, actor, seed, source, Disturbance(noise, recoveries, noise_from), linger)
     if rollout.success:
         write_demo(folder, 0, rollout.demo)
     write_json(folder / "result.json", {"seed": seed, "success": rollout.success, "reason": rollout.reason})
@@ -196,6 +209,7 @@ def record(
     source: str = "expert",
     seed: int = names.TRAIN_SEED,
     disturbance: Disturbance = CALM,
+    linger: int = 0,
     workers: int = 1,
     engine: Engine = LOCAL,
     demos: Sequence[Path] = (),
@@ -210,22 +224,25 @@ def record(
         source: a key of `SOURCES`.
         seed: first seed; the following ones are taken in order.
         disturbance: noise and pushes.
+        linger: control steps that an episode goes on after its success.
         workers: number of processes.
         engine: what runs them.
         demos: files of the demonstrations that a source in `TAUGHT` learns from; their seeds are left out.
         progress: called with (episodes kept, episodes wanted, "episodes").
 
     Raises:
-        InputError: fewer than one episode, a negative seed, an unknown source, demonstrations for a source that
-            learns from none, or none for one that does.
+        InputError: fewer than one episode, a negative seed or linger, an unknown source, demonstrations for a source
+            that learns from none, or none for one that does.
         OutputExists: `out` holds something else.
         SurgicaiError: the expert failed at too many seeds.
     """
     check_name("source", source, SOURCES)
-    if episodes < 1 or seed < 0:
-        raise InputError(f"episodes is {episodes} and seed {seed}; they must be at least 1 and 0.")
+    if episodes < 1 or min(seed, linger) < 0:
+        raise InputError(f"episodes is {episodes}, seed {seed}, linger {linger}; they must be at least 1, 0 and 0.")
     _check_taught(source, demos)
     request = {"task": to_mapping(config), "source": source, "seed": seed, "episodes": episodes, **_of(disturbance)}
+    if linger:
+        request["linger"] = linger
     if demos:
         request["demos"] = [sha256_file(path) for path in demos]
     check_output(out, may_resume=MARKER)
@@ -279,7 +296,7 @@ def _take(
     kept: list[Path] = []
     skipped: list[dict[str, Any]] = []
     wanted, inputs = request["episodes"], tuple(request.get("demos", ()))
-    same = {key: request[key] for key in ("task", "source", "noise", "recoveries") if key in request}
+    same = {key: value for key, value in request.items() if key not in ("seed", "episodes", "demos")}
     if demos:
         same["demos"] = [str(path.resolve()) for path in demos]
     known = {read_demo(path).seed for path in demos}

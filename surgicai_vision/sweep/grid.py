@@ -9,7 +9,7 @@ from surgicai_vision import names, registry
 from surgicai_vision.cells import OWN, Cell
 from surgicai_vision.chain import TERMINATIONS
 from surgicai_vision.config import check_every, digest, to_mapping
-from surgicai_vision.demos.record import CALM, SOURCES, TAUGHT, Disturbance
+from surgicai_vision.demos.record import SOURCES, TAUGHT, Disturbance
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES
 
@@ -35,7 +35,8 @@ class Grid:
         deviation: sets of `config.Deviations` switches to be on; none takes the recipe's.
         demonstrations: numbers of the expert's demonstrations of each task; the smaller set lies within the larger.
         source: who demonstrates: `expert`, or `search`, which does not know the goal of a grasp.
-        noise: what they execute is disturbed by up to so much; each episode draws its deviation between 0 and this.
+        noise: what they execute is disturbed by so much (`record-demos --noise`).
+        linger: control steps that demonstrations go on after their success.
         every: frames are rendered every so many steps; recipes must then take them so.
         chain: add, for the whole procedure, a high-level policy over a policy for each subtask, by how subtasks end:
             `privileged` or `learned`.
@@ -65,6 +66,7 @@ class Grid:
     demonstrations: tuple[int, ...] = (50,)
     source: str = "expert"
     noise: float = 0.0
+    linger: int = 0
     every: int = 1
     chain: tuple[str, ...] = ()
     swap: bool = False
@@ -90,6 +92,8 @@ class Grid:
         check_name("source", self.source, TEACHERS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
         check_every(self.every)
+        if self.linger < 0:
+            raise InputError(f"linger is {self.linger}; it must be at least 0.")
         for name in self.chain:
             check_name("termination", name, TERMINATIONS)
         numbers = [(name, getattr(self, name)) for name in ("episodes", "size", "steps", "batch")]
@@ -159,7 +163,7 @@ class Grid:
     @property
     def disturbance(self) -> Disturbance:
         """What disturbs the demonstrations."""
-        return Disturbance(self.noise, noise_from=0.0) if self.noise else CALM
+        return Disturbance(self.noise)
 
     @property
     def recorded(self) -> int:
@@ -172,6 +176,7 @@ class Grid:
         shared = {name: getattr(self, name) for name in ("episodes", "size", "depth")}
         shared |= {"views": list(self.views), "demonstrations": self.recorded, **lerobot}
         shared |= {"source": self.source, "noise": self.noise, **({"every": self.every} if self.every > 1 else {})}
+        shared |= {"linger": self.linger} if self.linger else {}
         return digest({"cell": to_mapping(cell), **shared})[:16]
 
 

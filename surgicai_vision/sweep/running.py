@@ -140,7 +140,7 @@ class _Sweep:
                     TaskConfig(task), self.jobs.data_folder(task), self.stage, engine=engine, workers=workers,
                     demonstrations=self.grid.recorded, views=self.grid.cameras or ("front",), size=self.grid.size,
                     depth=self.grid.has_depth, source=self.grid.source, disturbance=self.grid.disturbance,
-                    every=self.grid.every,
+                    every=self.grid.every, linger=self.grid.linger,
                 )  # fmt: skip
             except SurgicaiError as error:
                 for state in to_do:
@@ -301,7 +301,8 @@ def _store_run(grid: Grid, out: Path, problems: list[str], skipped: Sequence[Cel
     """Write what the report says of the run; only when something changed."""
     old = files.read_json(out / RUN_FILE) if (out / RUN_FILE).exists() else {}
     counts = ", ".join(map(str, grid.demonstrations))
-    noise = f", executed with noise up to {grid.noise:g}" if grid.noise else ""
+    noise = f", executed with noise {grid.noise:g}" if grid.noise else ""
+    noise += f", going on for {grid.linger} steps after their success" if grid.linger else ""
     thin = f", a frame every {grid.every} steps" if grid.every > 1 else ""
     data = (
         f"{counts} demonstrations of each task by the scripted {grid.source}{noise}{thin}; {', '.join(grid.views)} at "
