@@ -3,7 +3,7 @@
 HLP → LLP → termination → HLP: the high-level policy says which subtask is due, that subtask's policy moves its arm
 until the subtask ends, and the high-level policy is asked again. A subtask ends
 
-* `privileged`: when the env's measured success has held, as in the released code;
+* `privileged`: when the env's measured success has held (a grasp's for `grasp_hold` steps), as in the released code;
 * `learned`: when the high-level policy itself names another subtask, `PATIENCE` observations in a row;
 * in either case after `steps` control steps (paper: 200).
 
@@ -30,9 +30,11 @@ from surgicai_vision import lerobot_agent, names
 from surgicai_vision.agents import BASELINES, Shared, one_thread
 from surgicai_vision.cells import Subject, checkpoint_subject, policy_agent
 from surgicai_vision.config import TaskConfig, digest, to_mapping
+from surgicai_vision.envs.suture import DWELL
 from surgicai_vision.errors import InputError, check_name
 
 ORDER = "order"
+GRASP = names.SUBTASKS.index("grasp")
 PATIENCE = 5
 """Observations in a row that must name another subtask before a learned termination believes them (0.1 s)."""
 TERMINATIONS = ("privileged", "learned")
@@ -51,6 +53,8 @@ class Chain:
         steps: control steps a subtask may take.
         decisions: decisions an episode may take.
         max_steps: control steps an episode may take.
+        grasp_hold: control steps a grasp must hold before it ends as `privileged`, at most the env's own `DWELL`; a
+            policy that learned to search (`demos.searching`) lets go again sooner than that.
     """
 
     hlp: str
@@ -63,12 +67,15 @@ class Chain:
     steps: int = 200
     decisions: int = 50
     max_steps: int = MAX_STEPS
+    grasp_hold: int = DWELL
 
     def __post_init__(self) -> None:
         check_name("termination", self.termination, TERMINATIONS)
         for name in ("steps", "decisions", "max_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1.")
+        if not 1 <= self.grasp_hold <= DWELL:
+            raise InputError(f"grasp_hold is {self.grasp_hold}; allowed: 1 to {DWELL}.")
         if self.hlp == ORDER and self.termination == "learned":
             raise InputError("A learned termination needs a high-level policy; give hlp: a checkpoint folder.")
 
@@ -212,6 +219,9 @@ class ChainAgent:
         self, slots: Sequence[int], states: Sequence[_Progress], envs: Sequence[Any], observations: Sequence[Any]
     ) -> None:
         """Ask the high-level policy wherever it is due, and begin what it says."""
+        for state, env in zip(states, envs, strict=True):
+            if self._has_grasped(state, env):
+                env.begin(GRASP + 1)
         asked = [row for row, state in enumerate(states) if self._may_act(state) and self._is_asked(state, envs[row])]
         if not asked:
             return
@@ -230,6 +240,12 @@ class ChainAgent:
         if state.subtask < 0 or state.steps >= self.chain.steps:
             return True
         return self.chain.termination == "learned" or env.phase != state.subtask
+
+    def _has_grasped(self, state: _Progress, env: Any) -> bool:
+        """Say whether a grasp has held for as long as this chain asks, before the env itself goes on."""
+        if self.chain.termination != "privileged" or not state.subtask == env.phase == GRASP:
+            return False
+        return bool(env.dwell >= self.chain.grasp_hold)
 
     def _believes(self, state: _Progress, env: Any, choice: int) -> bool:
         """Say whether a choice is a decision: always but where a learned termination must wait for more."""

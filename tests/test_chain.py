@@ -40,6 +40,11 @@ class Env:
     def __init__(self, length: int = 3):
         self.length, self.phase, self.steps, self.begun = length, 0, 0, []
 
+    @property
+    def dwell(self) -> int:
+        """Steps for which the success has held: it comes after two."""
+        return max(0, self.steps - 2)
+
     def begin(self, phase: int) -> None:
         if phase != self.phase:
             self.begun.append(phase)
@@ -82,6 +87,18 @@ def test_privileged_termination_asks_when_the_subtask_has_ended() -> None:
     assert env.begun == []
 
 
+def test_a_grasp_may_end_sooner_than_the_env_ends_it_and_nothing_else_may() -> None:
+    env = Env(10)
+    acted = roll(agent([0, 1, 2], grasp_hold=3), env, 17)
+    assert acted == [0] * 5 + [1] * 10 + [2] * 2 and env.begun == [1]
+    learned = agent([0] * 9, grasp_hold=3)
+    object.__setattr__(learned.chain, "termination", "learned")
+    assert roll(learned, Env(10), 8) == [0] * 8, "a learned termination asks the high-level policy alone"
+    for wrong in (0, 16):
+        with pytest.raises(InputError, match="grasp_hold is"):
+            Chain("order", **EXPERTS, grasp_hold=wrong)
+
+
 def test_a_choice_moves_its_own_arm() -> None:
     env = Env(3)
     assert roll(agent([0, 3, 1]), env, 7) == [0, 0, 0, 3, 3, 3, 1]
@@ -109,7 +126,7 @@ def test_learned_termination_waits_for_the_high_level_policy() -> None:
 
 
 def test_experts_in_their_order_sew_and_count_their_stages() -> None:
-    made = chain.subject(Chain("order", **EXPERTS, max_steps=1000))
+    made = chain.subject(Chain("order", **EXPERTS, max_steps=1000, grasp_hold=5))
     assert made.config.task == "suture"
     row = evaluate(made.make_agent, made.config, [names.TEST_SEED], workers=1)[0].row
     assert row.success and row.stages == 5, row

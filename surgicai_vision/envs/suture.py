@@ -37,6 +37,11 @@ class Suture(SuturingEnv):
         """Say so of the last subtask alone: it is the one whose success is the whole's."""
         return int(self.simulation.memory.phase) == len(self._subtasks) - 1 and super()._meets_demands()
 
+    @property
+    def dwell(self) -> int:
+        """Control steps for which the present subtask's success has held."""
+        return int(self.simulation.memory.dwell)
+
     def begin(self, phase: int) -> None:
         """Begin a subtask by choice, as a high-level policy does: its arm moves from now on.
 
