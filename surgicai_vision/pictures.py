@@ -100,6 +100,15 @@ def png(picture: Picture) -> bytes:
     return _encoded(picture, ".png", [])
 
 
+def decoded(content: bytes) -> Picture:
+    """Return a JPEG or PNG as RGB (H, W, 3)."""
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return np.asarray(picture[..., ::-1], np.uint8)
+
+
 def _encoded(picture: Picture, suffix: str, options: list[int]) -> bytes:
     import cv2
 

@@ -8,14 +8,16 @@ import re
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from matplotlib.figure import Figure
 from sweep_results import COMMAND, TASKS, add_curves, cell, evaluation, store_cell, write_sweep
 from test_report import assert_stands_alone, painted_stage
 
-from surgicai_vision import pictures, report, statistics
+from surgicai_vision import names, pictures, report, statistics
 from surgicai_vision.cli import main
 from surgicai_vision.commands.report import Options
 from surgicai_vision.report import beside, charts, films, formats, paper, tables
-from surgicai_vision.report.groups import group
+from surgicai_vision.report.failures import failure_sheet
+from surgicai_vision.report.groups import best_trained, group, of_task
 from surgicai_vision.report.pairs import compare, factor
 from surgicai_vision.report.reading import Condition, collect
 
@@ -229,6 +231,9 @@ def test_conditions_that_differ_in_two_things_are_no_pair():
     assert factor(one, Condition("grasp", "state")) == ""
     assert factor(one, Condition("grasp", "proprioception")) == "pictures"
     assert factor(one, Condition("grasp", "imagenet", ("front",), "act")) == "variant"
+    best = Condition("grasp", "imagenet-lite-early", ("front_psm2",), "spatial · best", 350, recipe="best")
+    assert factor(one, best) == "recipe", "a recipe is compared as a whole"
+    assert factor(Condition("grasp", "proprioception"), best) == ""
 
 
 def test_curves_chain_and_probes_are_drawn_with_their_numbers(text, groups):
@@ -315,6 +320,23 @@ def test_details_tell_every_episode(text, groups):
             assert len(told["outcomes"]) == len(told["steps"]) == len(told["mm"]) == len(result.rows)
             assert told["starts"] == result.rows[0]["seed"]
             assert told["commands"][-1] == COMMAND
+
+
+def test_failures_are_those_of_the_best_policy_of_each_task_once_a_kind(written, groups, monkeypatch):
+    monkeypatch.setattr(pictures, "stage", painted_stage)
+    reel, drawn = films.make_reel(groups), []
+    monkeypatch.setattr(pictures, "sheet", lambda rows, columns, title: drawn.append(rows) or Figure())
+    assert failure_sheet(groups, reel)
+    titles = [title.split() for title, _ in drawn[0]]
+    best = {task: best_trained(of_task(groups, task)) for task in names.SUBTASKS}
+    for task, start, *_ in titles:
+        lost = [row for r in best[task].results for row in r.rows if row["seed"] == int(start) and not row["success"]]
+        assert lost, "a failure of the best"
+    kinds = [(task, *outcome) for task, _, *outcome in titles]
+    assert len({kind[:2] for kind in kinds}) == len(kinds), "each kind once"
+    assert len({len(frames) for _, frames in drawn[0]}) == 1
+    assert failure_sheet(groups, films.Reel()) is None
+    assert pictures.decoded((written / "tables/failures.jpg").read_bytes()).shape[2] == 3
 
 
 def test_page_and_tables_are_the_same_each_time(written, text, monkeypatch):

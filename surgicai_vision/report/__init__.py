@@ -14,6 +14,7 @@ from typing import Any
 
 from surgicai_vision import files
 from surgicai_vision.report import films, page, show
+from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.origin import commands, origin
 from surgicai_vision.report.pairs import compare
@@ -22,7 +23,7 @@ from surgicai_vision.report.tables import write_tables
 
 __all__ = ["GRID_FILE", "REFERENCES", "RUN_FILE", "Result", "collect", "read_results", "write_report"]
 
-PAGE_FILE = "report.html"
+PAGE_FILE, FAILURES_FILE = "report.html", "failures.jpg"
 Progress = Callable[..., None]
 
 
@@ -63,7 +64,10 @@ def write_report(
     }
     path = out or folder / PAGE_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_tables(path.parent, groups, pairs, title)
+    tables = write_tables(path.parent, groups, pairs, title)
+    sheet = failure_sheet(groups, reel)
+    if sheet:
+        files.write_bytes(tables / FAILURES_FILE, sheet)
     report(len(reel.strips) + 2, len(reel.strips) + 3)
     files.write_bytes(path, page.render(filled).encode())
     report(len(reel.strips) + 3, len(reel.strips) + 3)

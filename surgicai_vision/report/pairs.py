@@ -1,7 +1,8 @@
 """Pairs: do two conditions differ? Exact McNemar on the same starts, Holm's correction within a task.
 
 Compared are trained conditions of a task that differ in one thing: encoder, views, variant or number of
-demonstrations; and each with pictures against proprioception alone. Episodes are paired by training seed and start.
+demonstrations; recipes as wholes, with the encoder, views and demonstrations of each; and each with pictures against
+proprioception alone. Episodes are paired by training seed and start.
 The test speaks of the policies that were trained, not of all that the same recipe might give.
 """
 
@@ -52,6 +53,8 @@ def factor(first: Condition, second: Condition) -> str:
     """Name the one thing two conditions differ in, or ""."""
     if "state" in (first.encoder, second.encoder):
         return ""
+    if first.recipe != second.recipe and bool(first.views) == bool(second.views):
+        return "recipe"
     fields = ("encoder", "views", "variant", "demonstrations")
     differ = [name for name in fields if getattr(first, name) != getattr(second, name)]
     if not first.views or not second.views:

@@ -46,6 +46,7 @@ class Condition:
         strength: how much.
         swap: subtask in which the expert acts (chain), or "".
         trained: whether a policy was trained.
+        recipe: its recipe's name, without what is changed in it.
     """
 
     task: str
@@ -57,6 +58,7 @@ class Condition:
     strength: float = 0.0
     swap: str = ""
     trained: bool = True
+    recipe: str = "paper"
 
     @property
     def policy(self) -> str:
@@ -141,6 +143,7 @@ class Result:
             views=tuple(self.about.get("views") or ()),
             variant=_variant(checkpoint.get("policy", "bc"), pool, recipe),
             demonstrations=checkpoint.get("demonstrations"),
+            recipe=recipe.split("+")[0],
         )
 
 
@@ -235,6 +238,7 @@ def condition_of(cell: Mapping[str, Any]) -> Condition:
         variant=" · ".join(part for part in (chain, variant) if part),
         demonstrations=cell.get("demonstrations"),
         swap=str(cell.get("swap") or ""),
+        recipe=recipe,
     )
 
 

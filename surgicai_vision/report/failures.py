@@ -1,0 +1,51 @@
+"""Failures: one picture of how the best policies fail, for a paper or a README: a film strip each."""
+
+import base64
+import io
+from collections.abc import Iterator, Sequence
+
+from surgicai_vision import names, pictures
+from surgicai_vision.report.films import Reel, Strip
+from surgicai_vision.report.groups import Group, best_trained, of_task
+
+MOST = 8
+"""Strips of the picture at most."""
+DOTS, QUALITY = 60, 80
+"""Dots per inch, of 2.1 inches a frame, and JPEG quality: eight strips stay below 300 kB."""
+
+
+def failure_sheet(groups: Sequence[Group], reel: Reel) -> bytes | None:
+    """Return a JPEG with failures of the best trained policy of each task, or None where no strip shows one.
+
+    Each kind of failure stands once, as its policy's first view saw it; frames are evenly spaced over the episode.
+    """
+    strips = list(_failures(groups, reel))[:MOST]
+    if not strips:
+        return None
+    widest = max(len(strip.frames) for strip in strips)
+    rows = [(_title(strip), _frames(strip, widest)) for strip in strips]
+    figure = pictures.sheet(rows, [""] * widest, "how the best policies fail: start to end")
+    content = io.BytesIO()
+    figure.savefig(content, format="jpeg", dpi=DOTS, pil_kwargs={"quality": QUALITY})
+    return content.getvalue()
+
+
+def _failures(groups: Sequence[Group], reel: Reel) -> Iterator[Strip]:
+    """Yield the strips of failures that were rendered, task by task."""
+    for task in names.TASKS:
+        best, seen = best_trained(of_task(groups, task)), set()
+        for strip in reel.strips.values():
+            row = strip.choice.row
+            if strip.choice.group is best and not row["success"] and row["failure"] not in seen:
+                seen.add(row["failure"])
+                yield strip
+
+
+def _title(strip: Strip) -> str:
+    return f"{strip.choice.row['task']} {strip.choice.row['seed']}\n{strip.outcome}"
+
+
+def _frames(strip: Strip, count: int) -> list[pictures.Picture]:
+    """Return the strip's frames, the last again where it has fewer than `count`."""
+    frames = [pictures.decoded(base64.b64decode(frame)) for frame in strip.frames]
+    return [*frames, *[frames[-1]] * (count - len(frames))]
