@@ -328,7 +328,7 @@ def test_failures_are_those_of_the_best_policy_of_each_task_once_a_kind(written,
     monkeypatch.setattr(pictures, "sheet", lambda rows, columns, title: drawn.append(rows) or Figure())
     assert failure_sheet(groups, reel)
     titles = [title.split() for title, _ in drawn[0]]
-    best = {task: best_trained(of_task(groups, task)) for task in names.SUBTASKS}
+    best = {task: best_trained(of_task(groups, task)) for task in names.TASKS}
     for task, start, *_ in titles:
         lost = [row for r in best[task].results for row in r.rows if row["seed"] == int(start) and not row["success"]]
         assert lost, "a failure of the best"
