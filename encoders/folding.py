@@ -42,9 +42,8 @@ def _fold(parent: nn.Module) -> int:
     """Fold what is in `parent`; return how many BatchNorms that were."""
     count, before = 0, None
     for name, part in list(parent.named_children()):
-        if isinstance(before, nn.Conv2d) and isinstance(part, nn.BatchNorm2d):
-            mean, variance = part.running_mean, part.running_var
-            assert mean is not None and variance is not None, "a frozen BatchNorm has statistics"
+        mean, variance = getattr(part, "running_mean", None), getattr(part, "running_var", None)
+        if isinstance(before, nn.Conv2d) and isinstance(part, nn.BatchNorm2d) and mean is not None:
             before.weight, before.bias = fuse_conv_bn_weights(
                 before.weight, before.bias, mean, variance, part.eps, part.weight, part.bias
             )
