@@ -9,7 +9,7 @@ are published.
 """
 
 import copy
-from typing import Any
+from typing import cast
 
 import torch
 from torch import nn
@@ -44,9 +44,9 @@ def _fold(parent: nn.Module) -> int:
     count, before = 0, None
     for name, part in list(parent.named_children()):
         if isinstance(before, nn.Conv2d) and isinstance(part, nn.BatchNorm2d) and part.track_running_stats:
-            statistics: Any = (part.running_mean, part.running_var)
+            mean, variance = cast(torch.Tensor, part.running_mean), cast(torch.Tensor, part.running_var)
             before.weight, before.bias = fuse_conv_bn_weights(
-                before.weight, before.bias, *statistics, part.eps, part.weight, part.bias
+                before.weight, before.bias, mean, variance, part.eps, part.weight, part.bias
             )
             parent.register_module(name, getattr(part, "act", nn.Identity()))  # timm's BatchNorm holds what follows it
             count += 1
