@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from surgicai_vision import lerobot_agent, names
 from surgicai_vision.agents import BASELINES, Shared, one_thread
 from surgicai_vision.cells import Subject, checkpoint_subject, policy_agent
-from surgicai_vision.config import TaskConfig, digest, to_mapping
-from surgicai_vision.envs.suture import DWELL
+from surgicai_vision.config import DWELL, TaskConfig, digest, to_mapping
 from surgicai_vision.errors import InputError, check_name
 
 ORDER = "order"

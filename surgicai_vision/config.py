@@ -29,6 +29,8 @@ evaluation, the RL training script, the trajectories shipped with the release)."
 
 SUBTASK_STEPS = 200
 """Control steps a subtask may take (paper, image policies)."""
+DWELL = 15
+"""Control steps a subtask's success must hold, in a whole procedure, before the next one begins."""
 CLOCK_PERIOD, CLOCK_SIZE = 25, 3
 """Control steps in which the hand of `clock` goes round, and how many numbers `clock` tells."""
 

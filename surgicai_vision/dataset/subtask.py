@@ -3,7 +3,7 @@
     part = subtask_of(open_dataset(Path("outputs/datasets/suture")), "insert")
 
 A low-level policy of a chain is better trained on these than on demonstrations of the subtask alone, which end at the
-first success: in a whole procedure the subtask goes on until it is finished (`envs.suture.DWELL`), and it begins where
+first success: in a whole procedure the subtask goes on until it is finished (`config.DWELL`), and it begins where
 the one before it left off.
 """
 

@@ -6,12 +6,11 @@ it finished. When the pull-out begins PSM2 lets go by itself, as in the released
 another subtask by `begin`.
 """
 
+from surgicai_vision.config import DWELL
 from surgicai_vision.envs.base import Info, SuturingEnv
 from surgicai_vision.envs.simulation import RELEASE_STEPS
 from surgicai_vision.errors import InputError
 
-DWELL = 15
-"""Control steps a success must hold before the next subtask begins."""
 PULLOUT_PHASE = 4
 
 
