@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from surgicai_vision import names
 from surgicai_vision.config import TaskConfig, digest
 from surgicai_vision.errors import InputError
 
@@ -14,6 +15,7 @@ class ChosenFrames:
 
     Attributes:
         config, task, views, image_size: as the whole's.
+        fps: frames a second, as the whole's.
         rows: which frames of the whole it holds, (N,) int64, rising.
         length: N.
     """
@@ -23,6 +25,7 @@ class ChosenFrames:
         self._whole, self._chosen, self.rows = whole, chosen, rows
         self.config: TaskConfig = whole.config
         self.task: str = whole.task
+        self.fps: int = getattr(whole, "fps", names.FPS)
         self.views, self.image_size, self.length = whole.views, whole.image_size, len(rows)
 
     @functools.cached_property

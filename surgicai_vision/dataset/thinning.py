@@ -46,6 +46,7 @@ class ThinnedPart(ChosenFrames):
         first = np.searchsorted(index, index, side="left")
         super().__init__(dataset, np.flatnonzero((np.arange(len(index)) - first) % every == 0), {"every": every})
         self.path = getattr(dataset, "path", None)
+        self.fps //= every
 
     def bounds(self) -> list[tuple[int, int]]:
         """Return (first frame, frame after the last) of every episode."""
