@@ -18,6 +18,7 @@ from surgicai_vision.cli import main
 from surgicai_vision.commands import folders, logs
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.dataset.subtask import subtask_of
+from surgicai_vision.dataset.thinning import thinned
 from surgicai_vision.envs import suture
 from surgicai_vision.errors import InputError, UnknownName, check_name
 
@@ -186,6 +187,10 @@ def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(capsys: pytest.Ca
         np.testing.assert_array_equal(part.frames("back", start, stop), frames[start:stop])
     with pytest.raises(InputError, match="has 0 to 8"):
         part.frames("back", 0, 9)
+    assert thinned(part, 2).length == 4
+    whole.fps = 25  # rendered with every other frame: a part of it is not thinned once more
+    sparse = subtask_of(whole, "insert")  # type: ignore[arg-type]
+    assert thinned(sparse, 2) is sparse and thinned(sparse, 4).length == 4 and thinned(sparse, 4).fps == 12
     with pytest.raises(InputError, match="shows 'grasp'"):
         subtask_of(Dataset(task="grasp"), "insert")  # type: ignore[arg-type]
     arguments = ("train", "--subtask", "insert", "--encoder", "tiny", "--view", "back", "--epochs", "1")
