@@ -231,9 +231,13 @@ def test_conditions_that_differ_in_two_things_are_no_pair():
     assert factor(one, Condition("grasp", "state")) == ""
     assert factor(one, Condition("grasp", "proprioception")) == "pictures"
     assert factor(one, Condition("grasp", "imagenet", ("front",), "act")) == "variant"
-    best = Condition("grasp", "imagenet-lite-early", ("front_psm2",), "spatial · best", 350, recipe="best")
+    best = Condition(
+        "grasp", "imagenet-lite-early", ("front_psm2",), "spatial · best", 350, recipe="best", pool="spatial"
+    )
     assert factor(one, best) == "recipe", "a recipe is compared as a whole"
     assert factor(Condition("grasp", "proprioception"), best) == ""
+    blind = Condition("grasp", "proprioception", (), "best", 350, recipe="best")
+    assert factor(blind, best) == "pictures", "without an encoder nothing is taken from it"
 
 
 def test_curves_chain_and_probes_are_drawn_with_their_numbers(text, groups):

@@ -58,8 +58,14 @@ def factor(first: Condition, second: Condition) -> str:
     fields = ("encoder", "views", "variant", "demonstrations")
     differ = [name for name in fields if getattr(first, name) != getattr(second, name)]
     if not first.views or not second.views:
+        if _without_pool(first) == _without_pool(second):  # what is taken from an encoder is no matter without one
+            differ = [name for name in differ if name != "variant"]
         differ = ["pictures" if name == "encoder" else name for name in differ if name != "views"]
     return differ[0] if len(differ) == 1 else ""
+
+
+def _without_pool(condition: Condition) -> list[str]:
+    return [part for part in condition.variant.split(" · ") if part and part != condition.pool]
 
 
 def _pair(first: Group, second: Group) -> Pair | None:

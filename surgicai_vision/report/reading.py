@@ -47,6 +47,7 @@ class Condition:
         swap: subtask in which the expert acts (chain), or "".
         trained: whether a policy was trained.
         recipe: its recipe's name, without what is changed in it.
+        pool: what is taken from the encoder.
     """
 
     task: str
@@ -59,6 +60,7 @@ class Condition:
     swap: str = ""
     trained: bool = True
     recipe: str = "paper"
+    pool: str = "global"
 
     @property
     def policy(self) -> str:
@@ -144,6 +146,7 @@ class Result:
             variant=_variant(checkpoint.get("policy", "bc"), pool, recipe),
             demonstrations=checkpoint.get("demonstrations"),
             recipe=recipe.split("+")[0],
+            pool=pool,
         )
 
 
@@ -239,6 +242,7 @@ def condition_of(cell: Mapping[str, Any]) -> Condition:
         demonstrations=cell.get("demonstrations"),
         swap=str(cell.get("swap") or ""),
         recipe=recipe,
+        pool=cell.get("pool", "global"),
     )
 
 
