@@ -19,7 +19,7 @@ from surgicai_vision.report.groups import group
 from surgicai_vision.report.origin import commands, origin
 from surgicai_vision.report.pairs import compare
 from surgicai_vision.report.reading import GRID_FILE, REFERENCES, RUN_FILE, Result, collect, read_results
-from surgicai_vision.report.tables import write_tables
+from surgicai_vision.report.tables import write_changed, write_tables
 
 __all__ = ["GRID_FILE", "REFERENCES", "RUN_FILE", "Result", "collect", "read_results", "write_report"]
 
@@ -67,7 +67,9 @@ def write_report(
     tables = write_tables(path.parent, groups, pairs, title)
     sheet = failure_sheet(groups, reel)
     if sheet:
-        files.write_bytes(tables / FAILURES_FILE, sheet)
+        write_changed(tables / FAILURES_FILE, sheet)
+    else:
+        (tables / FAILURES_FILE).unlink(missing_ok=True)
     report(len(reel.strips) + 2, len(reel.strips) + 3)
     files.write_bytes(path, page.render(filled).encode())
     report(len(reel.strips) + 3, len(reel.strips) + 3)

@@ -34,10 +34,14 @@ def write_tables(folder: Path, groups: Sequence[Group], pairs: Sequence[Pair], t
         "pairs.csv": _csv([_pair_record(pair) for pair in pairs]),
     }
     for name, content in contents.items():
-        path = out / name
-        if not path.exists() or path.read_bytes() != content:  # a second run changes nothing
-            files.write_bytes(path, content)
+        write_changed(out / name, content)
     return out
+
+
+def write_changed(path: Path, content: bytes) -> None:
+    """Write a file unless it holds that already: a second run changes nothing."""
+    if not path.exists() or path.read_bytes() != content:
+        files.write_bytes(path, content)
 
 
 def condition_record(item: Group) -> dict[str, Any]:
