@@ -24,24 +24,25 @@ def fold_batch_norms(network: nn.Module, side: int) -> nn.Module:
     """Return the network with each BatchNorm in the convolution that stands before it among its parent's parts.
 
     What stands in order need not run in order, so both networks are shown the same noise; where they do not agree, or
-    nothing was there to be folded, the network that was given is returned, untouched.
+    no BatchNorm is there, the network that was given is returned, untouched.
 
     Args:
         network: in eval mode, float32.
         side: height and width of the pictures (B, 3, side, side) it takes.
     """
+    if not any(isinstance(part, nn.BatchNorm2d) for part in network.modules()):
+        return network  # a transformer: neither copied nor asked
     folded = copy.deepcopy(network)
-    if not _fold(folded):
-        return network
+    _fold(folded)
     pictures = torch.randn(1, 3, side, side, generator=torch.Generator().manual_seed(SEED))
     with torch.inference_mode():
         before, after = network(pictures), folded(pictures)
     return folded if float((after - before).abs().max()) <= TOLERANCE * float(before.abs().max()) else network
 
 
-def _fold(parent: nn.Module) -> int:
-    """Fold what is in `parent`; return how many BatchNorms that were."""
-    count, before = 0, None
+def _fold(parent: nn.Module) -> None:
+    """Fold what is in `parent`."""
+    before = None
     for name, part in list(parent.named_children()):
         if isinstance(before, nn.Conv2d) and isinstance(part, nn.BatchNorm2d) and part.track_running_stats:
             mean, variance = cast(torch.Tensor, part.running_mean), cast(torch.Tensor, part.running_var)
@@ -49,8 +50,6 @@ def _fold(parent: nn.Module) -> int:
                 before.weight, before.bias, mean, variance, part.eps, part.weight, part.bias
             )
             parent.register_module(name, getattr(part, "act", nn.Identity()))  # timm's BatchNorm holds what follows it
-            count += 1
         else:
-            count += _fold(part)
+            _fold(part)
         before = part
-    return count
