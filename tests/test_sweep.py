@@ -24,7 +24,7 @@ from surgicai_vision.dataset.pictures import DEPTH_FAR, DEPTH_NEAR, grey
 from surgicai_vision.dataset.thinning import thinned
 from surgicai_vision.errors import InputError, UnknownName
 from surgicai_vision.executor import JOBS
-from surgicai_vision.sweep import Grid, estimate, plan, run_sweep
+from surgicai_vision.sweep import Grid, estimate, plan, read_choice, run_sweep
 from surgicai_vision.sweep.grid import chain_parts
 from surgicai_vision.sweep.lerobot import _arguments
 from surgicai_vision.sweep.planning import Jobs
@@ -36,12 +36,12 @@ BLIND = Grid(
 """Four cells that see nothing: half a second each."""
 
 
-def sweep(grid, out, workers=0, stage=QUIET):
-    return run_sweep(grid, out, stage, workers)
+def sweep(grid, out, workers=0, stage=QUIET, only=()):
+    return run_sweep(grid, out, stage, workers, choice=read_choice(only, grid.cells))
 
 
 def counts(result):
-    return tuple(result[name] for name in ("cells", "done", "cached", "failed", "not_run"))
+    return tuple(result[name] for name in ("cells", "done", "cached", "failed", "not_run", "left"))
 
 
 @contextmanager
@@ -82,9 +82,34 @@ def test_a_finished_sweep_does_nothing(quiet):
     out, first = quiet
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     again = sweep(BLIND, out)
-    assert (counts(again), again["digest"]) == ((4, 0, 4, 0, 0), first["digest"])
+    assert (counts(again), again["digest"]) == ((4, 0, 4, 0, 0, 0), first["digest"])
     after = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     assert {path.name for path in after if after[path] != before.get(path)} == {"episodes.parquet"}
+
+
+def test_chosen_cells_are_done_and_the_others_left_for_later(quiet, tmp_path):
+    out = tmp_path / "out"
+    grid = replace(BLIND, task=("grasp", "place"))
+    chosen = sweep(grid, out, only=("task=grasp", "seed=1", "demonstrations=1", "2"))
+    assert counts(chosen) == (8, 2, 0, 0, 0, 6)
+    assert [path.name for path in (out / "data").iterdir()] == ["grasp"], "nothing is made for cells that are left"
+    assert [path.name for path in (out / "references").iterdir()] == ["expert-grasp"]
+    again = sweep(grid, out, only=("task=grasp",))
+    assert counts(again) == (8, 2, 2, 0, 0, 4) and again["digest"] == quiet[1]["digest"]
+
+
+@pytest.mark.parametrize(
+    ("only", "told"),
+    [
+        (("grasp",), "give AXIS=VALUE,VALUE; axes: task, encoder"),
+        (("tsak=grasp",), "Did you mean 'task'"),
+        (("seed=0", "2"), "allowed|Allowed|0, 1"),
+        (("encoder=nune",), "Did you mean 'none'"),
+    ],
+)
+def test_a_wrong_choice_names_the_right_ones(only, told):
+    with pytest.raises(InputError, match=told):
+        read_choice(only, BLIND.cells)
 
 
 def test_a_cell_made_by_something_else_is_done_again_in_its_place(quiet, tmp_path):
@@ -97,7 +122,7 @@ def test_a_cell_made_by_something_else_is_done_again_in_its_place(quiet, tmp_pat
         ("cached", ""),
     ]
     again = sweep(BLIND, out)
-    assert (counts(again), again["digest"]) == ((4, 1, 3, 0, 0), first["digest"])
+    assert (counts(again), again["digest"]) == ((4, 1, 3, 0, 0, 0), first["digest"])
 
 
 def test_smaller_sets_of_demonstrations_lie_within_larger(quiet):
@@ -142,14 +167,14 @@ def test_a_failing_cell_is_recorded_the_rest_goes_on_and_it_is_tried_again(tmp_p
     grid = replace(BLIND, seed=(0,), demonstrations=(2,), recipe=("paper", str(recipe)), epochs=None)
     grid = replace(grid, expert=False)
     result = sweep(grid, tmp_path / "out", workers=1)
-    assert counts(result) == (2, 1, 0, 1, 0)
+    assert counts(result) == (2, 1, 0, 1, 0, 0)
     (failure,) = (tmp_path / "out").glob("cells/*/failed.json")
     error = json.loads(failure.read_text())["error"]
     assert "without overflow" in error and "Traceback" in error
     assert "failed: grasp, proprioception-wild" in result["problems"][0]
     assert pq.read_table(tmp_path / "out/episodes.parquet").num_rows == 1
     recipe.write_text("epochs: 1\n")
-    assert counts(sweep(grid, tmp_path / "out")) == (2, 1, 1, 0, 0)
+    assert counts(sweep(grid, tmp_path / "out")) == (2, 1, 1, 0, 0, 0)
     assert not failure.exists()
 
 

@@ -11,7 +11,7 @@ from surgicai_vision.commands.options import address_option, executor_option, op
 from surgicai_vision.config import from_mapping
 from surgicai_vision.errors import BadFile, UnknownName
 from surgicai_vision.files import configs_folder
-from surgicai_vision.sweep import AXES, Grid
+from surgicai_vision.sweep import AXES, Choice, Grid
 
 EXAMPLE = "surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/smoke --json"
 
@@ -23,6 +23,13 @@ class Options:
     grid: str = option(dataclasses.MISSING, "the grid; shipped ones also by their name (smoke)", metavar="GRID.yaml")
     out: str | None = option(
         None, "folder to make or to continue", metavar="DIR", default_text="outputs/sweeps/<name of the grid>"
+    )
+    only: tuple[str, ...] | None = option(
+        None,
+        "work on these cells alone, by an axis of the grid; repeat it for another axis; views are joined by +",
+        metavar="AXIS=VALUE,...",
+        repeat=True,
+        default_text="all",
     )
     dry_run: bool = option(False, "list the cells, what is there already and about how long the rest takes; no work")
     workers: int = option(
@@ -36,27 +43,28 @@ class Options:
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Run the sweep, or list its cells."""
     from surgicai_vision.executor import Engine
-    from surgicai_vision.sweep import run_sweep
+    from surgicai_vision.sweep import read_choice, run_sweep
 
     path = grid_file(options.grid)
     grid = read_grid(path)
+    choice = read_choice(options.only or (), grid.cells)
     out = Path(options.out) if options.out else folders.OUTPUTS / "sweeps" / path.stem
     engine = Engine(options.executor, options.address)
     if options.dry_run:
-        return _list(grid, out, options.workers, console)
-    result = run_sweep(grid, out, console.stage, options.workers, engine, options.attempts)
+        return _list(grid, out, choice, options.workers, console)
+    result = run_sweep(grid, out, console.stage, options.workers, engine, options.attempts, choice)
     for line in result.pop("problems"):
         console.say(line)
-    told = ", ".join(f"{result[name]} {name.replace('_', ' ')}" for name in ("done", "cached", "failed", "not_run"))
+    told = ", ".join(f"{result[name]} {name.replace('_', ' ')}" for name in COUNTS)
     console.say(f"{result['cells']} cells: {told}; {out}")
     return {**result, "exit_code": 1 if result["failed"] else 0}
 
 
-def _list(grid: Grid, out: Path, workers: int, console: Console) -> dict[str, Any]:
+def _list(grid: Grid, out: Path, choice: Choice, workers: int, console: Console) -> dict[str, Any]:
     """Say what each cell is, and how long the rest takes."""
-    from surgicai_vision.sweep import estimate, plan
+    from surgicai_vision.sweep import STATES, estimate, plan
 
-    states = plan(grid, out)
+    states = plan(grid, out, choice)
     for state in states:
         line = f"{state.state:<8} {state.key}  {state.where}"
         console.say(f"{line}: {state.reason}" if state.reason else line)
@@ -69,7 +77,7 @@ def _list(grid: Grid, out: Path, workers: int, console: Console) -> dict[str, An
     return {"cells": len(states), **counts, "seconds": time["seconds"], "dry_run": True}
 
 
-STATES = ("to do", "cached", "not run")
+COUNTS = ("done", "cached", "failed", "not_run", "left")
 
 
 def _duration(seconds: float) -> str:

@@ -9,9 +9,10 @@ is reported as not run, with the reason. Finished jobs wait in `work/` until the
 go on after a kill.
 """
 
+from surgicai_vision.sweep.choosing import Choice, read_choice
 from surgicai_vision.sweep.estimating import estimate
 from surgicai_vision.sweep.grid import AXES, Grid
-from surgicai_vision.sweep.planning import CELL_FILE, FAILED_FILE, GRID_FILE, CellState, plan
+from surgicai_vision.sweep.planning import CELL_FILE, FAILED_FILE, GRID_FILE, STATES, CellState, plan
 from surgicai_vision.sweep.running import EPISODES, run_sweep
 
 __all__ = [
@@ -20,9 +21,12 @@ __all__ = [
     "EPISODES",
     "FAILED_FILE",
     "GRID_FILE",
+    "STATES",
     "CellState",
+    "Choice",
     "Grid",
     "estimate",
     "plan",
+    "read_choice",
     "run_sweep",
 ]

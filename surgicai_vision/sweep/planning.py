@@ -13,12 +13,14 @@ from surgicai_vision.config import TaskConfig, digest, to_mapping
 from surgicai_vision.errors import BadFile, MissingWeights
 from surgicai_vision.executor import Job
 from surgicai_vision.files import read_json
+from surgicai_vision.sweep.choosing import EVERYTHING, Choice, is_chosen
 from surgicai_vision.sweep.grid import Grid, chain_parts
 from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES
 
 GRID_FILE, CELL_FILE, FAILED_FILE, REFERENCE_FILE = "sweep.json", "cell.json", "failed.json", "reference.json"
 PROBE_FILE = "probe.json"
-CACHED, TO_DO, NOT_RUN = "cached", "to do", "not run"
+CACHED, TO_DO, NOT_RUN, LEFT = "cached", "to do", "not run", "left"
+STATES = (TO_DO, CACHED, NOT_RUN, LEFT)
 FEATURE_SWITCHES = ("preprocessing", "batch_norm_drift", "bgr")
 """Deviations that change features."""
 
@@ -30,7 +32,7 @@ class CellState:
     Attributes:
         cell: the cell.
         key: its folder's name.
-        state: "cached", "to do" or "not run".
+        state: one of `STATES`; "left" is a cell that this call was not asked for.
         reason: why it is not run, or why it is done again.
     """
 
@@ -45,11 +47,11 @@ class CellState:
         return f"{self.cell.task}, {self.cell.name}, seed {self.cell.seed}"
 
 
-def plan(grid: Grid, out: Path) -> list[CellState]:
+def plan(grid: Grid, out: Path, choice: Choice = EVERYTHING) -> list[CellState]:
     """Return every cell of `grid` with its state in the folder `out`; does no work."""
     jobs = Jobs(grid, out)
     missing = functools.lru_cache(functools.partial(_missing, accept_licence=grid.accept_licence))
-    return [_state(grid.key(cell), cell, jobs, missing) for cell in grid.cells]
+    return [_state(grid.key(cell), cell, jobs, missing, choice) for cell in grid.cells]
 
 
 def _missing(encoder: str, accept_licence: bool) -> str:
@@ -61,7 +63,7 @@ def _missing(encoder: str, accept_licence: bool) -> str:
     return ""
 
 
-def _state(key: str, cell: Cell, jobs: "Jobs", missing: Any) -> CellState:
+def _state(key: str, cell: Cell, jobs: "Jobs", missing: Any, choice: Choice) -> CellState:
     path = jobs.cell_folder(key) / CELL_FILE
     made = path.exists()
     if made and read_json(path).get("job") == jobs.cell_key(cell):
@@ -69,6 +71,8 @@ def _state(key: str, cell: Cell, jobs: "Jobs", missing: Any) -> CellState:
     lack = missing(cell.encoder) if cell.encoder and cell.encoder != OWN else ""
     if lack:
         return CellState(cell, key, NOT_RUN, lack)
+    if not is_chosen(cell, choice):
+        return CellState(cell, key, LEFT)
     return CellState(cell, key, TO_DO, "made by other code or other data" if made else "")
 
 

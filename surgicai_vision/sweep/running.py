@@ -19,15 +19,18 @@ from surgicai_vision.executor import LOCAL, Engine, Job, claim, run
 from surgicai_vision.provenance import command_line, provenance
 from surgicai_vision.report import RUN_FILE
 from surgicai_vision.results import parquet_bytes, read_rows
+from surgicai_vision.sweep.choosing import EVERYTHING, Choice
 from surgicai_vision.sweep.grid import Grid, chain_parts
 from surgicai_vision.sweep.planning import (
     CACHED,
     CELL_FILE,
     FAILED_FILE,
     GRID_FILE,
+    LEFT,
     NOT_RUN,
     PROBE_FILE,
     REFERENCE_FILE,
+    TO_DO,
     CellState,
     Jobs,
     plan,
@@ -40,7 +43,13 @@ ATTEMPTS = 3
 
 
 def run_sweep(
-    grid: Grid, out: Path, stage: Stage, workers: int, engine: Engine = LOCAL, attempts: int = ATTEMPTS
+    grid: Grid,
+    out: Path,
+    stage: Stage,
+    workers: int,
+    engine: Engine = LOCAL,
+    attempts: int = ATTEMPTS,
+    choice: Choice = EVERYTHING,
 ) -> dict[str, Any]:
     """Run every cell that is not done and can be run.
 
@@ -51,9 +60,10 @@ def run_sweep(
         workers: processes; the result does not depend on it.
         engine: what runs them.
         attempts: how often a cell is started whose worker dies.
+        choice: the cells to work on; others that are not there yet are left for another call.
 
     Returns:
-        {"cells", "done" (by this call), "cached", "failed", "not_run", "digest" (of all rows there are),
+        {"cells", "done" (by this call), "cached", "failed", "not_run", "left", "digest" (of all rows there are),
         "problems": one line for each cell that failed or was not run}.
 
     Raises:
@@ -62,12 +72,15 @@ def run_sweep(
     """
     _open(grid, out)
     with claim(out / WORK):
-        sweep = _Sweep(grid, out, stage, functools.partial(run, workers=workers, engine=engine, attempts=attempts))
-        states = plan(grid, out)
-        to_do = [state for state in states if state.state not in (CACHED, NOT_RUN)]
+        states = plan(grid, out, choice)
+        tasks = [task for task in grid.task if any(s.cell.task == task and s.state != LEFT for s in states)]
+        do = functools.partial(run, workers=workers, engine=engine, attempts=attempts)
+        sweep = _Sweep(grid, out, stage, do, tuple(tasks))
+        to_do = [state for state in states if state.state == TO_DO]
         sweep.prepare(to_do, workers, engine)
         sweep.do(to_do)
-        sweep.probe([state.cell for state in states if state.state != NOT_RUN and state.key not in sweep.errors])
+        here = [state for state in states if state.state in (CACHED, TO_DO) and state.key not in sweep.errors]
+        sweep.probe([state.cell for state in here])
         shutil.rmtree(out / WORK)
     skipped = [state for state in states if state.state == NOT_RUN]
     problems = [f"not run: {state.where}: {state.reason}" for state in skipped]
@@ -79,9 +92,10 @@ def run_sweep(
     counts = {
         "cells": len(states),
         "done": len(to_do) - len(sweep.errors),
-        "cached": len(states) - len(to_do) - len(skipped),
+        "cached": sum(state.state == CACHED for state in states),
         "failed": len(sweep.errors),
         "not_run": len(skipped),
+        "left": sum(state.state == LEFT for state in states),
     }
     return {**counts, "digest": digest(table), "problems": problems, "out": str(out)}
 
@@ -108,6 +122,7 @@ class _Sweep:
     Attributes:
         grid, out, stage: as `run_sweep`'s.
         run: `executor.run` with workers and engine.
+        tasks: those whose references are wanted.
         errors: cell's key → what went wrong, in one line.
         problems: what went wrong beside the cells.
     """
@@ -116,6 +131,7 @@ class _Sweep:
     out: Path
     stage: Stage
     run: Any
+    tasks: tuple[str, ...]
     errors: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     jobs: Jobs = field(init=False)
@@ -133,7 +149,7 @@ class _Sweep:
         from surgicai_vision.dataset.preparing import prepare_dataset  # a sweep that is done renders nothing
 
         needed = {state.cell.task: None for state in to_do}
-        replayed = [task for task in self.grid.task if self.grid.replay and not self._filed_reference("replay", task)]
+        replayed = [task for task in self.tasks if self.grid.replay and not self._filed_reference("replay", task)]
         for task in [*needed, *(task for task in replayed if task not in needed)]:
             try:
                 prepare_dataset(
@@ -231,7 +247,7 @@ class _Sweep:
     def _references(self) -> list[tuple[str, str]]:
         """Return (name, task) of the references that are not there."""
         wanted = [(name, on) for name, on in (("expert", self.grid.expert), ("replay", self.grid.replay)) if on]
-        pairs = [(name, task) for task in self.grid.task for name, _ in wanted]
+        pairs = [(name, task) for task in self.tasks for name, _ in wanted]
         return [(name, task) for name, task in pairs if not self._filed_reference(name, task)]
 
     def _filed_reference(self, name: str, task: str) -> bool:
