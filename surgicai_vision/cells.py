@@ -13,7 +13,7 @@ from typing import Any
 
 from surgicai_vision import files, names
 from surgicai_vision.agents import BASELINES, NoisyAgent, PolicyAgent, ReplayAgent, mean_demonstration
-from surgicai_vision.config import DEVIATIONS, Deviations, TaskConfig, from_mapping, to_mapping
+from surgicai_vision.config import DEVIATIONS, Deviations, TaskConfig, from_mapping, read_changes, to_mapping
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.evaluation import Agent, MakeAgent, evaluate
 from surgicai_vision.provenance import command_line, provenance
@@ -43,6 +43,7 @@ class Cell:
         privileged: see the goal in place of all else: the ceiling.
         epochs: passes over the training frames; None takes the recipe's.
         deviations: switches of `config.Deviations` that are on; None takes the recipe's.
+        change: keys of the recipe and their values, `config.read_changes`'s texts.
         demonstrations: train on the first so many demonstrations; None takes all.
         chain: how subtasks end, where this is a high-level policy over a policy a subtask (`chain.TERMINATIONS`).
         swap: the subtask of such a chain that the expert does.
@@ -58,6 +59,7 @@ class Cell:
     privileged: bool = False
     epochs: int | None = None
     deviations: tuple[str, ...] | None = None
+    change: tuple[str, ...] = ()
     demonstrations: int | None = None
     chain: str | None = None
     swap: str | None = None
@@ -85,7 +87,7 @@ class Cell:
     @property
     def changes(self) -> dict[str, Any]:
         """Keys that replace the recipe's."""
-        changes: dict[str, Any] = {"privileged": True} if self.privileged else {}
+        changes: dict[str, Any] = read_changes(self.change) | ({"privileged": True} if self.privileged else {})
         if self.epochs is not None:
             changes["epochs"] = self.epochs
         if self.deviations is not None:
@@ -98,7 +100,7 @@ class Cell:
         counts = ((self.epochs, "epochs"), (self.demonstrations, "demos"))
         changed = tuple(f"{count}{unit}" for count, unit in counts if count is not None)
         switches = ("none",) if self.deviations == () else self.deviations or ()
-        return "+".join((Path(self.recipe).stem, *switches, *changed))
+        return "+".join((Path(self.recipe).stem, *switches, *self.change, *changed))
 
 
 @dataclass(frozen=True)

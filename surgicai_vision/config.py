@@ -10,11 +10,12 @@ import hashlib
 import json
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
+import yaml
 
 from surgicai_vision import names
 from surgicai_vision.errors import InputError, UnknownName, check_name
@@ -229,6 +230,24 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
 def to_mapping(config: Any) -> dict[str, Any]:
     """Return a frozen dataclass as plain JSON data."""
     return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def read_changes(texts: Iterable[str]) -> dict[str, Any]:
+    """Read `clock=false`, `epochs=10` as keys and their YAML values.
+
+    Raises:
+        InputError: a text of another form, or a key given twice.
+    """
+    changes: dict[str, Any] = {}
+    for text in texts:
+        key, sign, value = text.partition("=")
+        if not sign or not key or key in changes:
+            raise InputError(f"change '{text}' is not understood; give KEY=VALUE, each key once, such as clock=false.")
+        try:
+            changes[key] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise InputError(f"change '{text}': {value!r} is no YAML value.") from None
+    return changes
 
 
 def digest(value: Any) -> str:

@@ -4,6 +4,7 @@ import csv
 import itertools
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -230,13 +231,14 @@ def test_conditions_that_differ_in_two_things_are_no_pair():
     assert factor(one, Condition("grasp", "random", ("back",))) == ""
     assert factor(one, Condition("grasp", "state")) == ""
     assert factor(one, Condition("grasp", "proprioception")) == "pictures"
-    assert factor(one, Condition("grasp", "imagenet", ("front",), "act")) == "variant"
-    best = Condition(
-        "grasp", "imagenet-lite-early", ("front_psm2",), "spatial · best", 350, recipe="best", pool="spatial"
-    )
+    assert factor(one, replace(one, trained_by="act")) == "policy"
+    assert factor(one, replace(one, trained_by="act", recipe="released")) == ""
+    early = {"encoder": "imagenet-lite-early", "views": ("front_psm2",), "pool": "spatial"}
+    best = Condition("grasp", **early, recipe="best", demonstrations=350)
     assert factor(one, best) == "recipe", "a recipe is compared as a whole"
+    assert factor(replace(best, changes=("clock=false",)), best) == "change"
     assert factor(Condition("grasp", "proprioception"), best) == ""
-    blind = Condition("grasp", "proprioception", (), "best", 350, recipe="best")
+    blind = Condition("grasp", "proprioception", recipe="best", demonstrations=350)
     assert factor(blind, best) == "pictures", "without an encoder nothing is taken from it"
 
 

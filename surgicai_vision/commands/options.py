@@ -35,7 +35,7 @@ def option(
         check: called with the option's name and value; raises `InputError`.
         metavar: how `--help` names its value.
         default_text: what `--help` says of a default that depends on other options.
-        repeat: it may be given again: the texts are joined by commas.
+        repeat: it may be given again: texts are joined by commas, lists one behind the other.
     """
     metadata = {"text": text, "check": check, "metavar": metavar, "default_text": default_text, "repeat": repeat}
     if default is dataclasses.MISSING:
@@ -215,9 +215,10 @@ class _Joined(argparse.Action):
     """An option that may be given again."""
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
-        """Join the texts by commas."""
+        """Join texts by commas, lists one behind the other."""
         before = getattr(namespace, self.dest, None)
-        setattr(namespace, self.dest, values if before is None else f"{before},{values}")
+        joined = f"{before},{values}" if isinstance(values, str) else (*(before or ()), *values)
+        setattr(namespace, self.dest, values if before is None else joined)
 
 
 def _help(field: "dataclasses.Field[Any]") -> str:

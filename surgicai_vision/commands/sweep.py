@@ -102,13 +102,27 @@ def grid_file(given: str) -> Path:
 
 
 def read_grid(path: Path) -> Grid:
-    """Read a grid; a view set may be written as a list or as "front,back", an axis of one value without brackets."""
+    """Read a grid; a list of views may be written as "front,back", an axis of one value without brackets."""
     table = read_yaml(path)
     if isinstance(table.get("view"), list):
-        table["view"] = [view.split(",") if isinstance(view, str) else view for view in table["view"]]
+        table["view"] = [_listed(view) for view in table["view"]]
+    if isinstance(table.get("lever"), list):
+        table["lever"] = [_lever(lever) for lever in table["lever"]]
     for name in AXES:
         if name in table and isinstance(table[name], (str, int)):
             table[name] = [table[name]]
     for name in ("task", "encoder", "view"):
         table.setdefault(name, [])
     return from_mapping(Grid, table, str(path))
+
+
+def _listed(value: Any) -> Any:
+    """Return "front,back" as a list."""
+    return value.split(",") if isinstance(value, str) else value
+
+
+def _lever(table: Any) -> Any:
+    """Return a lever whose lists may be written as texts."""
+    if not isinstance(table, dict):
+        return table
+    return {key: _listed(value) if key in ("view", "change") else value for key, value in table.items()}

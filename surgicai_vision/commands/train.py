@@ -58,6 +58,13 @@ class Options:
         metavar="NAME[,NAME]",
         default_text="the recipe's",
     )
+    change: tuple[str, ...] | None = option(
+        None,
+        "replace values of the recipe, a comma list: clock=false,map_head=softmax",
+        metavar="KEY=VALUE[,KEY=VALUE]",
+        repeat=True,
+        default_text="none",
+    )
     epochs: int | None = option(
         None, "passes over the frames", check=positive, metavar="N", default_text="the recipe's"
     )
@@ -94,6 +101,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         privileged=options.encoder == STATE,
         epochs=options.epochs,
         deviations=options.deviation,
+        change=options.change or (),
     )
     registry.load_recipe(cell.policy, cell.recipe, cell.changes)
     label = f"{options.subtask}-of-{task}" if options.subtask else task

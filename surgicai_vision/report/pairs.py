@@ -1,18 +1,33 @@
 """Pairs: do two conditions differ? Exact McNemar on the same starts, Holm's correction within a task.
 
-Compared are trained conditions of a task that differ in one thing: encoder, views, variant or number of
-demonstrations; recipes as wholes, with the encoder, views and demonstrations of each; and each with pictures against
-proprioception alone. Episodes are paired by training seed and start.
-The test speaks of the policies that were trained, not of all that the same recipe might give.
+Compared are trained conditions of a task that differ in one thing (`FACTORS`); recipes as wholes, with the encoder,
+views and demonstrations of each; and each with pictures against proprioception alone. Episodes are paired by training
+seed and start. The test speaks of the policies that were trained, not of all that the same recipe might give.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 from surgicai_vision import names, statistics
 from surgicai_vision.report.groups import Group, of_task
 from surgicai_vision.report.reading import Condition
+
+FACTORS: Mapping[str, str] = MappingProxyType(
+    {
+        "encoder": "encoder",
+        "views": "views",
+        "chain": "chain",
+        "trained_by": "policy",
+        "pool": "pool",
+        "recipe": "recipe",
+        "changes": "change",
+        "demonstrations": "demonstrations",
+        "place": "place",
+    }
+)
+"""Field of a condition → how a difference in it is called."""
 
 
 @dataclass(frozen=True)
@@ -53,19 +68,15 @@ def factor(first: Condition, second: Condition) -> str:
     """Name the one thing two conditions differ in, or ""."""
     if "state" in (first.encoder, second.encoder):
         return ""
-    if first.recipe != second.recipe and bool(first.views) == bool(second.views):
-        return "recipe"
-    fields = ("encoder", "views", "variant", "demonstrations")
+    blind = not first.views or not second.views
+    fields = [name for name in FACTORS if not (blind and name == "pool")]  # no encoder, nothing taken from it
     differ = [name for name in fields if getattr(first, name) != getattr(second, name)]
-    if not first.views or not second.views:
-        if _without_pool(first) == _without_pool(second):  # what is taken from an encoder is no matter without one
-            differ = [name for name in differ if name != "variant"]
+    if "recipe" in differ and bool(first.views) == bool(second.views):
+        whole = ("encoder", "views", "pool", "recipe", "changes", "demonstrations")
+        differ = [name for name in differ if name == "recipe" or name not in whole]
+    if blind:
         differ = ["pictures" if name == "encoder" else name for name in differ if name != "views"]
-    return differ[0] if len(differ) == 1 else ""
-
-
-def _without_pool(condition: Condition) -> list[str]:
-    return [part for part in condition.variant.split(" · ") if part and part != condition.pool]
+    return FACTORS.get(differ[0], differ[0]) if len(differ) == 1 else ""
 
 
 def _pair(first: Group, second: Group) -> Pair | None:

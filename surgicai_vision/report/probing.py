@@ -67,8 +67,7 @@ def _matches(probe: dict[str, Any], item: Group) -> bool:
         return False
     if probe.get("task") and probe["task"] != condition.task:
         return False
-    pool = probe.get("pool") or "global"
-    pooled = pool == "global" or pool in condition.variant.split(" · ")
+    pooled = condition.pool == (probe.get("pool") or "global")
     return pooled and probe.get("encoder") == condition.encoder and _view(probe) == condition.view
 
 

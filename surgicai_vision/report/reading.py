@@ -40,27 +40,41 @@ class Condition:
         task: one of `names.TASKS`.
         encoder: the encoder; without one "proprioception" or "state", or the name of the chain or reference.
         views: its views.
-        variant: policy, pool and recipe where they are not bc, global and paper.
+        chain: how subtasks end in a chain, or "".
+        trained_by: the policy's kind.
+        pool: what is taken from the encoder.
+        recipe: its recipe's name.
+        changes: what is changed in the recipe.
         demonstrations: demonstrations asked for, where known.
         axis: what is shifted in a robustness evaluation, or "".
         strength: how much.
         swap: subtask in which the expert acts (chain), or "".
         trained: whether a policy was trained.
-        recipe: its recipe's name, without what is changed in it.
-        pool: what is taken from the encoder.
+        place: where it stands, if another evaluation of the same condition and training seed stands elsewhere.
     """
 
     task: str
     encoder: str
     views: tuple[str, ...] = ()
-    variant: str = ""
+    chain: str = ""
+    trained_by: str = "bc"
+    pool: str = "global"
+    recipe: str = "paper"
+    changes: tuple[str, ...] = ()
     demonstrations: int | None = None
     axis: str = ""
     strength: float = 0.0
     swap: str = ""
     trained: bool = True
-    recipe: str = "paper"
-    pool: str = "global"
+    place: str = ""
+
+    @property
+    def variant(self) -> str:
+        """Everything but inputs and demonstrations that is not as usual: not bc, global, paper."""
+        usual = ((self.trained_by, "bc"), (self.pool, "global"), (self.recipe, "paper"))
+        chain = f"chain, {self.chain} end" if self.chain else ""
+        parts = [chain, *(part for part, common in usual if part != common), " + ".join(self.changes), self.place]
+        return " · ".join(part for part in parts if part)
 
     @property
     def policy(self) -> str:
@@ -126,7 +140,7 @@ class Result:
         base = condition_of(self.cell) if self.cell else self._condition()
         return replace(
             base,
-            variant=" · ".join(part for part in (base.variant, self.place) if part),
+            place=self.place,
             axis=str(shift.get("axis") or ""),
             strength=float(shift.get("strength") or 0.0),
             swap=str(self.about.get("swap") or base.swap),
@@ -138,15 +152,16 @@ class Result:
         encoder = self.about.get("encoder") or self.summary["policy"]
         if checkpoint and not self.about.get("views"):
             encoder = "state" if "state" in encoder.split("-") else "proprioception"
-        recipe, pool = checkpoint.get("recipe", "paper"), checkpoint.get("pool", "global")
+        recipe, *changes = checkpoint.get("recipe", "paper").split("+")
         return Condition(
             task=self.summary["task"],
             encoder=encoder,
             views=tuple(self.about.get("views") or ()),
-            variant=_variant(checkpoint.get("policy", "bc"), pool, recipe),
+            trained_by=checkpoint.get("policy", "bc"),
+            pool=checkpoint.get("pool", "global"),
+            recipe=recipe,
+            changes=_told(changes),
             demonstrations=checkpoint.get("demonstrations"),
-            recipe=recipe.split("+")[0],
-            pool=pool,
         )
 
 
@@ -228,21 +243,20 @@ def _told_apart(results: Sequence[Result], folder: Path) -> list[Result]:
 
 def condition_of(cell: Mapping[str, Any]) -> Condition:
     """Return the condition of a cell that was not evaluated, from its own fields."""
-    recipe = Path(str(cell.get("recipe", "paper"))).stem
     deviations = cell.get("deviations")
     switches = [] if deviations is None else list(deviations) or ["none"]
     epochs = [f"{cell['epochs']}epochs"] if cell.get("epochs") else []
-    chain = f"chain, {cell['chain']} end" if cell.get("chain") else ""
-    variant = _variant(cell.get("policy", "bc"), cell.get("pool", "global"), "+".join([recipe, *switches, *epochs]))
     return Condition(
         task=str(cell["task"]),
         encoder=str(cell.get("encoder") or ("state" if cell.get("privileged") else "proprioception")),
         views=tuple(cell.get("view") or ()),
-        variant=" · ".join(part for part in (chain, variant) if part),
+        chain=str(cell.get("chain") or ""),
+        trained_by=cell.get("policy", "bc"),
+        pool=cell.get("pool", "global"),
+        recipe=Path(str(cell.get("recipe", "paper"))).stem,
+        changes=_told([*switches, *cell.get("change", ()), *epochs]),
         demonstrations=cell.get("demonstrations"),
         swap=str(cell.get("swap") or ""),
-        recipe=recipe,
-        pool=cell.get("pool", "global"),
     )
 
 
@@ -312,12 +326,9 @@ def _filled(cell: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in cell.items() if value is not None}
 
 
-def _variant(policy: str, pool: str, recipe: str) -> str:
-    """Name what is not as usual; demonstrations are told elsewhere."""
-    name, *changes = recipe.split("+")
-    changes = [COUNT.sub(r"\1 \2", change) for change in changes if not change.endswith("demos")]
-    parts = ((policy, "bc"), (pool, "global"), (name, "paper"), (" + ".join(changes), ""))
-    return " · ".join(part for part, usual in parts if part != usual)
+def _told(changes: Sequence[str]) -> tuple[str, ...]:
+    """Write what is changed in a recipe as people read it; demonstrations are told elsewhere."""
+    return tuple(COUNT.sub(r"\1 \2", change) for change in changes if not change.endswith("demos"))
 
 
 def order(condition: Condition) -> tuple[Any, ...]:

@@ -1,14 +1,15 @@
 """Grid: what a sweep's YAML file says, and the cells it stands for."""
 
 import itertools
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 from surgicai_vision import names, registry
 from surgicai_vision.cells import OWN, Cell
 from surgicai_vision.chain import TERMINATIONS
-from surgicai_vision.config import check_every, digest, to_mapping
+from surgicai_vision.config import RandomisationConfig, TaskConfig, check_every, digest, to_mapping
 from surgicai_vision.demos.record import SOURCES, TAUGHT, Disturbance
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES
@@ -18,6 +19,38 @@ AXES = ("task", "encoder", "view", "recipe", "policy", "deviation", "demonstrati
 
 TEACHERS = tuple(name for name in SOURCES if name not in TAUGHT)
 """Sources of demonstrations that need none themselves."""
+
+
+BANKS: Mapping[str, int] = MappingProxyType({"test": names.TEST_SEED, "validation": names.VALIDATION_SEED})
+"""Bank of start states → its first seed: what is chosen is chosen on validation, and told of test."""
+
+
+@dataclass(frozen=True)
+class Lever:
+    """What is replaced in each cell that sees, alone and all else kept; what is None stays.
+
+    Attributes:
+        encoder, view, pool, recipe, change: a cell's.
+        demonstrations: train on the first so many.
+    """
+
+    encoder: str | None = None
+    view: tuple[str, ...] | None = None
+    pool: str | None = None
+    recipe: str | None = None
+    change: tuple[str, ...] | None = None
+    demonstrations: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.encoder is not None:
+            registry.check_encoder_name(self.encoder)
+        if not self.replaced:
+            raise InputError("A lever replaces nothing; give one of encoder, view, pool, recipe, change.")
+
+    @property
+    def replaced(self) -> dict[str, Any]:
+        """Fields of a cell and their new values."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -33,10 +66,12 @@ class Grid:
         recipe: recipes of the former.
         pool: what is taken from the encoders.
         deviation: sets of `config.Deviations` switches to be on; none takes the recipe's.
+        lever: what is replaced one at a time in each cell that sees: ablations beside the whole.
         demonstrations: numbers of the expert's demonstrations of each task; the smaller set lies within the larger.
         source: who demonstrates: `expert`, or `search`, which does not know the goal of a grasp.
         noise: what they execute is disturbed by so much (`record-demos --noise`).
         linger: control steps that demonstrations go on after their success.
+        randomisation: what differs from episode to episode besides the start, in demonstrations and evaluations.
         every: frames are rendered every so many steps; recipes must then take them so.
         chain: add, for the whole procedure, a high-level policy over a policy for each subtask, by how subtasks end:
             `privileged` or `learned`.
@@ -50,7 +85,8 @@ class Grid:
         epochs: passes over the frames; none takes the recipe's.
         steps: updates of LeRobot's policies.
         batch: their batch size.
-        episodes: held-out starts of each evaluation.
+        starts: the bank of the evaluation's starts, one of `BANKS`.
+        episodes: starts of each evaluation.
         size: height and width of pictures [px].
         depth: render depth beside RGB; done by itself where a view is a depth view.
     """
@@ -63,10 +99,12 @@ class Grid:
     recipe: tuple[str, ...] = ("paper",)
     pool: str = "global"
     deviation: tuple[tuple[str, ...], ...] = ()
+    lever: tuple[Lever, ...] = ()
     demonstrations: tuple[int, ...] = (50,)
     source: str = "expert"
     noise: float = 0.0
     linger: int = 0
+    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
     every: int = 1
     chain: tuple[str, ...] = ()
     swap: bool = False
@@ -79,6 +117,7 @@ class Grid:
     epochs: int | None = None
     steps: int = 2000
     batch: int = 8
+    starts: str = "test"
     episodes: int = 20
     size: int = 224
     depth: bool = False
@@ -90,6 +129,7 @@ class Grid:
         for name in self.policy:
             check_name("policy", name, (*registry.POLICIES, *LEROBOT_POLICIES))
         check_name("source", self.source, TEACHERS)
+        check_name("bank of starts", self.starts, BANKS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
         check_every(self.every)
         if self.linger < 0:
@@ -102,6 +142,9 @@ class Grid:
                 raise InputError(f"{name} is {number}; it must be at least 1.")
         if not self.demonstrations:
             raise InputError("demonstrations is empty; give at least one number.")
+        for lever in self.lever:
+            if lever.demonstrations is not None and not 1 <= lever.demonstrations <= self.recorded:
+                raise InputError(f"lever: demonstrations is {lever.demonstrations}; allowed: 1 to {self.recorded}.")
         if not self.cells or len(set(self.cells)) != len(self.cells):
             raise InputError(f"The grid has {len(self.cells)} cells, {len(set(self.cells))} of them different.")
 
@@ -117,7 +160,8 @@ class Grid:
                 cells += self._of_policy(policy, task, common)
             if task == names.SUTURE:
                 cells += self._chains(common)
-        return cells
+        seeing = [cell for cell in cells if cell.encoder not in (None, OWN)]
+        return cells + [replace(cell, **lever.replaced) for cell in seeing for lever in self.lever]
 
     def _of_policy(self, policy: str, task: str, common: dict[str, Any]) -> Iterator[Cell]:
         """Yield the cells of a policy on a task."""
@@ -147,7 +191,8 @@ class Grid:
     @property
     def views(self) -> tuple[str, ...]:
         """Every view some cell needs."""
-        return tuple(view for view in names.VIEWS if any(view in view_set for view_set in self.view))
+        seen = {view for cell in self.cells for view in cell.view}
+        return tuple(view for view in names.VIEWS if view in seen)
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -166,6 +211,15 @@ class Grid:
         return Disturbance(self.noise)
 
     @property
+    def first_seed(self) -> int:
+        """Seed of the first start of an evaluation."""
+        return BANKS[self.starts]
+
+    def config(self, task: str) -> TaskConfig:
+        """Return the task as it is demonstrated and evaluated."""
+        return TaskConfig(task, randomisation=self.randomisation)
+
+    @property
     def recorded(self) -> int:
         """Demonstrations recorded of each task: the largest number; cells with fewer train on the first of them."""
         return max(self.demonstrations)
@@ -176,7 +230,7 @@ class Grid:
         shared = {name: getattr(self, name) for name in ("episodes", "size", "depth")}
         shared |= {"views": list(self.views), "demonstrations": self.recorded, **lerobot}
         shared |= {"source": self.source, "noise": self.noise, **({"every": self.every} if self.every > 1 else {})}
-        shared |= {"linger": self.linger} if self.linger else {}
+        shared |= {"linger": self.linger, "starts": self.starts, "randomisation": to_mapping(self.randomisation)}
         return digest({"cell": to_mapping(cell), **shared})[:16]
 
 

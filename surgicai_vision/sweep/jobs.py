@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ def train_policy(
 def run_cell(
     folder: Path,
     cell: Table,
-    episodes: int,
+    seeds: Sequence[int],
     final: str,
     policies: Mapping[str, str],
     dataset: str,
@@ -70,20 +70,20 @@ def run_cell(
         subject = _subject(what, policies, _dataset(dataset), policy, measured, accept_licence, options)
         about = {**subject.about, "command": command, "folder": str(Path(final) / "policy"), "swap": what.swap}
         with measured("evaluation", "steps"):
-            summary = _evaluate(folder / "evaluation", dataclasses.replace(subject, about=about), episodes)
+            summary = _evaluate(folder / "evaluation", dataclasses.replace(subject, about=about), seeds)
     shutil.rmtree(folder / SCRATCH, ignore_errors=True)
     write_json(folder / CELL_FILE, {"cell": cell, "summary": summary, "seconds": seconds})
 
 
 def run_reference(
-    folder: Path, name: str, task: str, episodes: int, dataset: str, command: str, environment: Table
+    folder: Path, name: str, config: Table, seeds: Sequence[int], dataset: str, command: str, environment: Table
 ) -> None:
     """Job "sweep-reference": evaluate who was not trained."""
     os.environ.update(environment)
     replay = name == "replay"
-    subject = replay_subject(_dataset(dataset)) if replay else baseline_subject(name, TaskConfig(task))
+    subject = replay_subject(_dataset(dataset)) if replay else baseline_subject(name, from_mapping(TaskConfig, config))
     about = {**subject.about, "command": command}
-    summary = _evaluate(folder, dataclasses.replace(subject, about=about), episodes)
+    summary = _evaluate(folder, dataclasses.replace(subject, about=about), seeds)
     write_json(folder / REFERENCE_FILE, {"summary": summary})
 
 
@@ -142,9 +142,9 @@ def _chain(cell: Cell, policies: Mapping[str, str], accept_licence: bool) -> Sub
     return dataclasses.replace(subject, name=cell.name, make_agent=make, about=about)
 
 
-def _evaluate(folder: Path, subject: Subject, episodes: int) -> dict[str, Any]:
-    seeds = range(names.TEST_SEED, names.TEST_SEED + episodes)
-    return evaluate_into(folder, subject, seeds, workers=1)
+def _evaluate(folder: Path, subject: Subject, seeds: Sequence[int]) -> dict[str, Any]:
+    """Evaluate on the starts from the first of `seeds` to the one before the second."""
+    return evaluate_into(folder, subject, range(*seeds), workers=1)
 
 
 def _cell(table: Table) -> Cell:

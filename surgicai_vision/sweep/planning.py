@@ -9,7 +9,7 @@ from typing import Any
 
 from surgicai_vision import names, registry
 from surgicai_vision.cells import OWN, Cell
-from surgicai_vision.config import TaskConfig, digest, to_mapping
+from surgicai_vision.config import digest, to_mapping
 from surgicai_vision.errors import BadFile, MissingWeights
 from surgicai_vision.executor import Job
 from surgicai_vision.files import read_json
@@ -123,7 +123,7 @@ class Jobs:
         inputs = [self.policy(part).key() for part in parts.values()] if parts else self._inputs(cell)
         arguments = {
             "cell": to_mapping(cell),
-            "episodes": self.grid.episodes,
+            "seeds": self._seeds,
             "final": str(final.absolute()),
             "policies": {name: str(self.policy_folder(part).absolute()) for name, part in parts.items()},
             **self._common(cell),
@@ -161,9 +161,15 @@ class Jobs:
     def reference(self, name: str, task: str) -> Job:
         """Return the job that evaluates the expert, or blind replay, on a task."""
         dataset = str((self.data_folder(task) / "dataset").absolute())
-        arguments = {"name": name, "task": task, "episodes": self.grid.episodes, "dataset": dataset, **self._where}
-        inputs = (self.dataset_digest(task) or "",) if name == "replay" else (digest(TaskConfig(task)),)
+        config = to_mapping(self.grid.config(task))
+        arguments = {"name": name, "config": config, "seeds": self._seeds, "dataset": dataset, **self._where}
+        inputs = (self.dataset_digest(task) or "",) if name == "replay" else ()
         return Job("sweep-reference", arguments, inputs, label=LABELS)
+
+    @property
+    def _seeds(self) -> list[int]:
+        """First seed of an evaluation's starts, and the one after its last."""
+        return [self.grid.first_seed, self.grid.first_seed + self.grid.episodes]
 
     def _common(self, cell: Cell) -> dict[str, Any]:
         lerobot = {"steps": self.grid.steps, "batch": self.grid.batch} if cell.policy in LEROBOT_POLICIES else {}
@@ -197,7 +203,7 @@ def _seen(cell: Cell) -> list[Cell]:
         on = tuple(switch for switch in FEATURE_SWITCHES if getattr(recipe.deviations, switch))
         common["deviations"] = on
         if recipe.every > 1:
-            common["recipe"] = cell.recipe
+            common["change"] = (f"every={recipe.every}",)
     if "batch_norm_drift" in on:  # the statistics are of these views and this seed
         return [Cell(cell.task, cell.encoder, cell.view, cell.seed, **common)]
     return [Cell(cell.task, cell.encoder, (view,), **common) for view in cell.view]

@@ -13,7 +13,7 @@ from typing import Any, final
 
 from surgicai_vision import files
 from surgicai_vision.cells import Cell, Stage
-from surgicai_vision.config import TaskConfig, digest, to_mapping
+from surgicai_vision.config import digest, to_mapping
 from surgicai_vision.errors import InputError, OutputExists, SurgicaiError
 from surgicai_vision.executor import LOCAL, Engine, Job, claim, run
 from surgicai_vision.provenance import command_line, provenance
@@ -153,7 +153,7 @@ class _Sweep:
         for task in [*needed, *(task for task in replayed if task not in needed)]:
             try:
                 prepare_dataset(
-                    TaskConfig(task), self.jobs.data_folder(task), self.stage, engine=engine, workers=workers,
+                    self.grid.config(task), self.jobs.data_folder(task), self.stage, engine=engine, workers=workers,
                     demonstrations=self.grid.recorded, views=self.grid.cameras or ("front",), size=self.grid.size,
                     depth=self.grid.has_depth, source=self.grid.source, disturbance=self.grid.disturbance,
                     every=self.grid.every, linger=self.grid.linger,
