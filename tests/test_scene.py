@@ -14,7 +14,7 @@ from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.errors import InputError, SurgicaiError, UnknownName
 from surgicai_vision.names import ARMS, LAYOUTS, SUBTASKS
-from surgicai_vision.scene import build_scene, holes, kinematics, needle
+from surgicai_vision.scene import build_scene, holes, kinematics, needle, phantom
 from surgicai_vision.scene.kinematics import DVRK_JOINTS, INSTRUMENTS
 
 GRAVITY = 9.81
@@ -160,6 +160,18 @@ def test_the_needle_falls_at_g(simulation):
     assert math.isclose(-data.qvel[dof + 2], GRAVITY * time, rel_tol=0.005)
     assert np.allclose(data.qpos[start : start + 2], 0.3, atol=1e-4)
     assert math.isclose(np.linalg.norm(data.qpos[start + 3 : start + 7]), 1.0, abs_tol=1e-12)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0.043, 0.0), (0.0, 0.105), (0.12, 0.0), (-0.3, 0.5)])
+def test_a_needle_that_falls_from_the_phantom_comes_to_rest_below_it(simulation, x, y):
+    """On the tray's rim, which is narrower than the needle, or flat on the table."""
+    data, model = simulation.data, simulation.model
+    data.qpos[simulation.scene.needle_qpos] = [x, y, phantom.TABLE + 0.08, 1.0, 0.0, 0.0, 0.0]
+    mujoco.mj_step(model, data, 1500)
+    above = data.geom_xpos[simulation.scene.needle_geoms, 2] - phantom.TABLE
+    assert above.min() > 0.0 and above.max() < phantom.TRAY_HEIGHT + 0.01
+    assert np.abs(data.joint("needle").qvel).max() < 0.05
+    assert not warnings_of(data)
 
 
 # -- the holes --------------------------------------------------------------------------------------------------------

@@ -113,12 +113,9 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     _set_options(spec, config.thread)
     look.add_materials(spec)
     look.add_surroundings(spec)
-    phantom.add_phantom(
-        spec,
-        config.layout,
-        needle={"contype": 0, "conaffinity": SURFACES | THREAD},
-        arm={"contype": 0, "conaffinity": FIRM},
-    )
+    soft = {"contype": 0, "conaffinity": SURFACES | THREAD}
+    phantom.add_table(spec, soft)
+    phantom.add_phantom(spec, config.layout, needle=soft, arm={"contype": 0, "conaffinity": FIRM})
     body = needle.add_needle(spec, {"contype": SURFACES | GRIP, "conaffinity": 0})
     thread.add_thread(spec, body, needle.point(0.0).tolist(), config.thread, {"contype": THREAD, "conaffinity": 0})
     for name in names.ARMS:

@@ -12,20 +12,17 @@ import numpy as np
 
 from surgicai_vision.names import ARMS, PSM1, PSM2
 from surgicai_vision.scene import needle, shapes, textures, tissue, tool
-from surgicai_vision.scene.holes import SURFACE
 from surgicai_vision.scene.kinematics import INSTRUMENTS
-from surgicai_vision.scene.phantom import ORIGIN, SIZE
+from surgicai_vision.scene.phantom import ORIGIN, SIZE, TABLE
 from surgicai_vision.scene.shapes import hide, show
 
-CLEARANCE = 0.002
-"""Between the phantom's underside and the drape [m]."""
 DRAPE_X = (0.04, 0.08, 0.13, 0.19, 0.27, 0.40, 0.60, 0.90)
 """Columns of the drape's points on each side of the phantom's middle [m], closer where the cameras look; between the
 first two, below the phantom, it has a hole, for every hidden pixel costs as much as a visible one."""
 DRAPE_WAVE = 0.006
 """Height of its folds [m]."""
 
-Box, Shape = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH
+Shape = mujoco.mjtGeom.mjGEOM_MESH
 
 MATERIALS: dict[str, dict[str, Any]] = {
     "tissue": {"rgba": [1.0, 1.0, 1.0, 1.0], "specular": 0.35, "shininess": 0.35},
@@ -55,7 +52,7 @@ def add_materials(spec: mujoco.MjSpec) -> None:
 
 
 def add_surroundings(spec: mujoco.MjSpec) -> None:
-    """Add the lights, the sky, the drape, and the tray on which the phantom lies."""
+    """Add the lights, the sky and the drape."""
     head = spec.visual.headlight
     head.ambient, head.diffuse, head.specular = [0.26, 0.25, 0.25], [0.26, 0.26, 0.26], [0.25, 0.25, 0.25]
     world = spec.worldbody
@@ -84,9 +81,6 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
     )
     _drape().add_to(spec, "drape")
     show(world, Shape, "drape", meshname="drape")
-    floor = SURFACE - SIZE[2] - CLEARANCE
-    half = [SIZE[0] / 2 + 0.007, SIZE[1] / 2 + 0.007, 0.006]
-    show(world, Box, "tray", pos=[*ORIGIN, floor + half[2]], size=half)
 
 
 def dress(spec: mujoco.MjSpec, layout: str = "simple", instrument: str = "400006") -> None:
@@ -134,7 +128,7 @@ def _drape() -> shapes.Mesh:
     y, x = np.meshgrid(rows, columns, indexing="ij")
     folds = np.sin(10.0 * x + 2.0 * y) + np.sin(8.0 * y - 3.0 * x) - 2.0
     away = np.clip(np.maximum(np.abs(x) / 0.08, np.abs(y) / 0.13) - 1.0, 0.0, 1.0)
-    z = SURFACE - SIZE[2] - CLEARANCE + DRAPE_WAVE * folds * away
+    z = TABLE + DRAPE_WAVE * folds * away
     keep = np.ones((len(rows) - 1, len(columns) - 1), bool)
     keep[len(rows) // 2 - 1, len(columns) // 2 - 1] = False
     mesh = shapes.Mesh()

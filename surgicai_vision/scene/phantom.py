@@ -31,6 +31,13 @@ BEYOND = 0.006
 """How far the ridge goes on beyond the first and the last hole pair [m]: short, because the tools come along the
 wound and their wrists stand there."""
 
+TRAY_RIM, TRAY_HEIGHT = 0.007, 0.012
+"""How far the tray on which the phantom lies reaches beyond it, and its height [m]."""
+CLEARANCE = 0.002
+"""Between the phantom's underside and the table [m]; the phantom stands sunk into the tray."""
+TABLE = SURFACE - SIZE[2] - CLEARANCE
+"""Height of the table's top [m]."""
+
 CONTACT = {"condim": 3, "friction": [0.4, 0.002, 0.0001], "solref": [0.004, 1.0]}
 
 
@@ -63,6 +70,22 @@ def add_phantom(spec: mujoco.MjSpec, layout: str, needle: dict[str, int], arm: d
         for side, hole in (("entry", pair.entry), ("exit", pair.exit)):
             _add_flank(body, f"phantom_{side}{index}", hole, start, end, flank_height(pair, hole), both)
         _add_crest(body, f"phantom_crest{index}", pair, start, end, both)
+
+
+def add_table(spec: mujoco.MjSpec, bits: dict[str, int]) -> None:
+    """Add the tray and the table below it, on which a needle comes to rest that falls from the phantom.
+
+    They are solid for the needle and the thread alone: no instrument is meant to come so low.
+
+    Args:
+        spec: the scene.
+        bits: collision bits of what the needle and the thread touch.
+    """
+    half = [SIZE[0] / 2 + TRAY_RIM, SIZE[1] / 2 + TRAY_RIM, TRAY_HEIGHT / 2]
+    place = {"pos": [*ORIGIN, TABLE + half[2]], "size": half, "material": "tray", "group": 0}
+    spec.worldbody.add_geom(name="tray", type=mujoco.mjtGeom.mjGEOM_BOX, **place, **CONTACT, **bits)
+    flat = {"pos": [*ORIGIN, TABLE], "size": [0.0, 0.0, 1.0], "group": 4}
+    spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, **flat, **CONTACT, **bits)
 
 
 def piece_edges(pairs: tuple[HolePair, ...]) -> list[float]:
