@@ -4,6 +4,7 @@ import csv
 import itertools
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -209,6 +210,16 @@ def test_a_cell_and_its_record_have_the_same_condition(tmp_path):
     assert (len(item.results), len(item.missing)) == (1, 1)
     assert item.condition.variant == "act · bgr"
     assert item.condition.demonstrations == 30
+
+
+def test_a_reference_that_several_sweeps_evaluated_stands_once(tmp_path):
+    for name, seed, episodes in (("right", 0, 20), ("left", 0, 12), ("other", 1, 20)):
+        rate = 0.6  # the same generator draws the same first episodes
+        evaluation(tmp_path / name, "grasp", "expert", rate, np.random.default_rng(seed), {}, episodes)
+    told = {(r.folder.name, r.condition.place) for r in collect(tmp_path).results}
+    assert told == {("right", "right"), ("other", "other")}, "what another saw goes in, what differs is told apart"
+    shutil.rmtree(tmp_path / "other")
+    assert [(r.folder.name, r.condition.place) for r in collect(tmp_path).results] == [("right", "")]
 
 
 def test_pairs_differ_in_one_thing_and_are_corrected_within_their_task(groups):

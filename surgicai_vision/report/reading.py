@@ -227,7 +227,21 @@ def read_results(folder: Path, grid: dict[str, Any] | None = None, empty: bool =
         results.append(Result(place, stored["summary"], stored["about"], read_rows(place), mapping))
     if not results and not empty:
         raise BadFile(f"{folder} holds no evaluation; run `surgicai-vision evaluate POLICY --out {folder}` first.")
-    return sorted(_told_apart(results, folder), key=lambda result: (*order(result.condition), result.seed))
+    return sorted(_told_apart(_once(results), folder), key=lambda result: (*order(result.condition), result.seed))
+
+
+def _once(results: Sequence[Result]) -> list[Result]:
+    """Leave out a reference whose episodes are among those of another: several sweeps evaluate the same expert."""
+    kept: list[Result] = []
+    for result in sorted(results, key=lambda result: -len(result.rows)):
+        same = [other for other in kept if other.condition == result.condition and other.config == result.config]
+        if result.trained or not any(_outcomes(result) <= _outcomes(other) for other in same):
+            kept.append(result)
+    return [result for result in results if result in kept]
+
+
+def _outcomes(result: Result) -> set[tuple[Any, ...]]:
+    return {(row["seed"], row["success"], row["steps"]) for row in result.rows}
 
 
 def _told_apart(results: Sequence[Result], folder: Path) -> list[Result]:
