@@ -25,6 +25,7 @@ from common import emit
 
 from encoders.base import CUDA_BATCH, best_device, best_dtype
 from surgicai_vision import registry
+from surgicai_vision.evaluation import BATCH
 from surgicai_vision.features import encode
 
 ENCODERS = ("imagenet-lite", "random", "imagenet")
@@ -76,7 +77,7 @@ def cached(source: Any, encoder: Any) -> int:
 def ways(name: str, weights: str | None, frames: np.ndarray, dataset: Any) -> dict[str, Callable[[], int]]:
     """Return what is timed, by name; each returns how many frames it encoded."""
     loop, encoder = bare(name, weights), registry.load_encoder(name, weights)
-    batch = CUDA_BATCH if torch.cuda.is_available() else 8
+    batch = CUDA_BATCH if torch.cuda.is_available() else BATCH
     error = np.abs(loop(frames[:batch], batch).astype(np.float32) - encoder(frames[:batch])).max()
     print(f"{name}: largest difference between the ways {error:.4f}", file=sys.stderr)
     made = {
