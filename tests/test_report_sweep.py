@@ -5,6 +5,7 @@ import itertools
 import json
 import re
 import shutil
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -385,6 +386,20 @@ def test_latex_has_the_structure_of_booktabs(written):
     assert not re.search(r"(?<!\\)[%#]", plain)
     assert not re.search(r"(?<!\\)_", re.sub(r"\\label\{[^}]*\}", "", plain))
     assert plain.count("{") - plain.count(r"\{") == plain.count("}") - plain.count(r"\}")
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no TeX here (texlive-latex-recommended)")
+def test_latex_compiles(written, tmp_path):
+    kind, packages = r"\documentclass{article}", r"\usepackage{booktabs}"
+    body = (written / "tables/table.tex").read_text()
+    strange = formats.escape_latex("".join(formats._LATEX))
+    (tmp_path / "paper.tex").write_text(
+        "\n".join([kind, packages, r"\begin{document}", strange, body, r"\end{document}"])
+    )
+    command = ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "paper.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert (tmp_path / "paper.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_latex_escapes_what_it_would_read_as_a_command():
