@@ -18,6 +18,7 @@ from surgicai_vision.commands.options import (
     share,
     task_config,
 )
+from surgicai_vision.config import TaskConfig
 from surgicai_vision.errors import InputError
 
 EXAMPLE = "surgicai-vision record-demos --task grasp --episodes 50"
@@ -52,6 +53,9 @@ class Options:
     recoveries: float = option(
         0.0, "share of episodes that start with a push that is not recorded", check=share, metavar="P"
     )
+    learner: str | None = option(
+        None, "a checkpoint that acts until a step drawn by chance; labels stay the expert's (DAgger)", metavar="DIR"
+    )
     linger: int = option(0, "control steps that an episode goes on after its success", check=not_negative, metavar="N")
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     executor: str = executor_option()
@@ -74,6 +78,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     out = Path(options.out) if options.out else folders.demos_folder(options.task)
     folders.check_folder(out, "demos.json")
     taught = _taught(Path(options.from_), options.demos_used) if options.from_ else []
+    learner = _learner(Path(options.learner), config) if options.learner else None
     with console.stage(f"recording {options.task}", "episodes") as progress:
         paths = record(
             config,
@@ -86,6 +91,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
             workers=options.workers,
             engine=engine,
             demos=taught,
+            learner=learner,
             progress=progress,
         )
     tried = len(paths) + len(read_marker(out)["skipped"])
@@ -103,6 +109,13 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         "interval": [low, high],
         "demos": str(out),
     }
+
+
+def _learner(folder: Path, config: TaskConfig) -> Any:
+    """Return the learner that drives."""
+    from surgicai_vision.dagger import learner_of
+
+    return learner_of(folder, config)
 
 
 def _taught(folder: Path, count: int) -> list[Path]:

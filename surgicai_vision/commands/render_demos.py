@@ -29,8 +29,11 @@ EXAMPLE = "surgicai-vision render-demos --task grasp --episodes 50 --view front,
 class Options:
     """Options of `render-demos`."""
 
-    demos: str | None = option(
-        None, "demonstrations to render", metavar="DIR", default_text="record the expert's into outputs/demos/<task>"
+    demos: tuple[str, ...] | None = option(
+        None,
+        "demonstrations to render, or several folders of them",
+        metavar="DIR[,DIR]",
+        default_text="record the expert's into outputs/demos/<task>",
     )
     task: str | None = option(
         None,
@@ -75,10 +78,11 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         raise InputError("--task, --episodes and env say what to record; with --demos DIR nothing is recorded.")
     if not options.view:
         raise InputError(f"--view is empty; give some of {', '.join(names.CAMERAS)}.")
-    task = folders.demos_task(Path(options.demos)) if options.demos else options.task or "grasp"
+    given = [Path(folder) for folder in options.demos or ()]
+    task = folders.demos_task(given[0]) if given else options.task or "grasp"
     out = Path(options.out) if options.out else folders.dataset_folder(task)
     folders.check_folder(out, names.META_FILE)
-    demos = Path(options.demos) if options.demos else _record(options, task, console)
+    demos = given or [_record(options, task, console)]
     with console.stage(f"rendering {', '.join(options.view)}", "frames") as progress:
         summary = render_demos(
             demos,

@@ -48,7 +48,7 @@ MEASURED: Mapping[str, Callable[[Any], np.ndarray]] = {
 
 
 def render_demos(
-    demos: Path,
+    demos: Path | Sequence[Path],
     out: Path,
     *,
     views: Sequence[str] = ("front", "back"),
@@ -61,10 +61,10 @@ def render_demos(
     engine: Engine = LOCAL,
     progress: Progress | None = None,
 ) -> DatasetSummary:
-    """Render a folder of demonstrations into a LeRobot dataset.
+    """Render demonstrations into a LeRobot dataset.
 
     Args:
-        demos: folder of demonstrations, of one task.
+        demos: folder of demonstrations, or several, one behind the other; all of one task and scene.
         out: dataset folder to make; the same request continues it or finds it finished.
         views: cameras, in the order of the dataset's columns.
         size: side of the square pictures [px].
@@ -86,19 +86,20 @@ def render_demos(
     _check_pictures(views, size, video)
     check_every(every)
     check_output(out, may_resume=names.META_FILE)
-    paths = list_demos(demos)
+    sources = [demos] if isinstance(demos, Path) else list(demos)
+    paths = [path for source in sources for path in list_demos(source)]
     options: dict[str, Any] = {"views": list(views), "size": size, "depth": depth, "segmentation": segmentation}
     options |= {"every": every} if every > 1 else {}
     request = {**options, "demos": demos_digest(paths), **({"video": video} if video else {})}
     if (out / names.META_FILE).exists():
         return finished(out, request, started)
     origins = [_Origin.of(read_demo(path)) for path in paths]
-    config = _same_config(origins, demos)
+    config = _same_config(origins, paths)
     frames = [len(range(0, row.length, every)) for row in origins]
     jobs = [_job(path, options, count) for path, count in zip(paths, frames, strict=True)]
     with building(out) as (store, result):
         shards = run(jobs, store, workers=workers, progress=progress, unit="frames", engine=engine)
-        meta = _meta(demos, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins)
+        meta = _meta(sources, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins)
         table = layout.features(views, size, depth, segmentation)
         lossless = store / "lossless" if video else result
         shutil.rmtree(lossless, ignore_errors=True)
@@ -140,17 +141,17 @@ class _Origin(NamedTuple):
         return cls(len(demo), demo.config, demo.scene_hash, demo.source, demo.code_version)
 
 
-def _same_config(origins: Sequence[_Origin], where: Path) -> TaskConfig:
+def _same_config(origins: Sequence[_Origin], paths: Sequence[Path]) -> TaskConfig:
     """Return the one configuration of all episodes."""
     first = origins[0]
-    for index, origin in enumerate(origins):
+    for path, origin in zip(paths, origins, strict=True):
         if origin.config != first.config or origin.scene_hash != first.scene_hash:
-            raise BadFile(f"{where}: episode {index} was made with another task or scene than episode 0.")
+            raise BadFile(f"{path} was made with another task or scene than {paths[0]}.")
     return first.config
 
 
 def _meta(
-    demos: Path,
+    sources: Sequence[Path],
     request: Mapping[str, Any],
     config: TaskConfig,
     summaries: Sequence[Mapping[str, Any]],
@@ -173,7 +174,7 @@ def _meta(
         "scene_hash": origins[0].scene_hash,
         "sources": sorted({origin.source for origin in origins}),
         "demos_digest": request["demos"],
-        "demos_request": read_marker(demos).get("request"),
+        "demos_requests": [read_marker(source).get("request") for source in sources],
         "demos_code_versions": sorted({origin.code_version for origin in origins}),
         "code_version": code_version(),
         "frames": sum(summary["frames"] for summary in summaries),

@@ -10,7 +10,8 @@ does nothing when it is complete.
     rollout = roll(env, expert, seed)      # one episode, kept or not
 
 With a `Disturbance` the expert is shown states off its own path: noise on what is executed, while the label stays the
-expert's own answer (DART, Laskey et al. 2017), and starts that were pushed away before the recording begins.
+expert's own answer (DART, Laskey et al. 2017), and starts that were pushed away before the recording begins. With a
+`Driver` these are states that a learner itself comes to (DAgger, Ross et al. 2011; `surgicai_vision.dagger`).
 """
 
 import dataclasses
@@ -46,8 +47,8 @@ TAUGHT = frozenset({"dmp"})
 
 MAX_FAILURES = 3
 """Seeds tried per episode wanted, at most; below one success in three the expert is not fit to teach."""
-
-
+LABELS = ("demos", "learner")
+"""Arguments of a job that say where a file lies, and not what it holds."""
 DISTURBANCE_STREAM = 0xDA27
 """Sets the disturbance's random numbers apart from the start's, which are of the same seed."""
 PUSH = (8, 25)
@@ -112,6 +113,24 @@ class Actor(Protocol):
         """Return the action (7,) float32 for the environment's present state."""
 
 
+class Driver(Protocol):
+    """What acts in the expert's place at first, while the labels stay the expert's."""
+
+    def begin(self, env: Any, seed: int, rng: np.random.Generator) -> None:
+        """Begin an episode: `env` has been reset."""
+
+    def action(self, env: Any, observation: Any) -> np.ndarray | None:
+        """Return the action (7,) that is executed; None once the expert acts itself."""
+
+
+@dataclass(frozen=True)
+class Learner:
+    """The checkpoint folder of a driver, and the hash of the policy in it."""
+
+    folder: Path
+    digest: str
+
+
 @dataclass(frozen=True)
 class Rollout:
     """One rolled episode, whether it succeeded, and why it is not kept if it did not."""
@@ -128,6 +147,7 @@ def roll(
     source: str = "expert",
     disturbance: Disturbance = CALM,
     linger: int = 0,
+    driver: Driver | None = None,
 ) -> Rollout:
     """Roll one episode of `env` from `seed` and return it with every state on the way.
 
@@ -138,6 +158,9 @@ def roll(
     if not disturbance.push(env, rng):
         env.reset(seed=seed)  # the push ended it; this start stays as it was
     deviation = disturbance.deviation(rng)
+    observation = env.observe() if driver else None
+    if driver:
+        driver.begin(env, seed, rng)
     states, rows = [env.get_state()], []
     info: dict[str, Any] = {}
     left = env.config.max_steps if getattr(actor, "persists", False) else linger
@@ -145,8 +168,10 @@ def roll(
     while not ended:
         phase = env.phase
         action = np.asarray(actor.action(), dtype=np.float32)
-        executed = disturbance.executed(action, deviation, rng) if deviation else action
-        _, reward, _, truncated, info = env.step(executed)
+        driven = driver.action(env, observation) if driver else None
+        executed = disturbance.executed(action, deviation, rng) if deviation and driven is None else action
+        executed = executed if driven is None else driven
+        observation, reward, _, truncated, info = env.step(executed)
         states.append(env.get_state())
         rows.append((action, executed, phase, reward, info["is_success"], info["contact"]))
         left -= reached
@@ -165,7 +190,7 @@ def roll(
         reward=np.asarray(reward, dtype=np.float32),
         success=np.asarray(success, dtype=bool),
         contact=np.asarray(contact, dtype=bool),
-        executed=np.stack(sent) if disturbance.noise else None,
+        executed=np.stack(sent) if disturbance.noise or driver else None,
     )
     if info["physics_error"]:
         return Rollout(demo, False, "physics error")
@@ -192,10 +217,24 @@ def record_episode(
     demos: Sequence[str] = (),
 ) -> None:
     """Job "record-episode": roll `seed` and write the episode, or why it failed, into `folder`."""
-    module, _, name = SOURCES[source].partition(":")
     env = _env(from_mapping(TaskConfig, task))
+    record_into(folder, env, source, seed, Disturbance(noise, recoveries, noise_from), linger, demos)
+
+
+def record_into(
+    folder: Path,
+    env: Any,
+    source: str,
+    seed: int,
+    disturbance: Disturbance,
+    linger: int,
+    demos: Sequence[str] = (),
+    driver: Driver | None = None,
+) -> None:
+    """Roll `seed` in `env` and write the episode, or why it failed, into `folder`."""
+    module, _, name = SOURCES[source].partition(":")
     actor = getattr(importlib.import_module(module), name)(env, *([demos] if demos else []))
-    rollout = roll(env, actor, seed, source, Disturbance(noise, recoveries, noise_from), linger)
+    rollout = roll(env, actor, seed, source, disturbance, linger, driver)
     if rollout.success:
         write_demo(folder, 0, rollout.demo)
     write_json(folder / "result.json", {"seed": seed, "success": rollout.success, "reason": rollout.reason})
@@ -213,6 +252,7 @@ def record(
     workers: int = 1,
     engine: Engine = LOCAL,
     demos: Sequence[Path] = (),
+    learner: Learner | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Record `episodes` successful demonstrations into the folder `out`; return their files.
@@ -228,6 +268,7 @@ def record(
         workers: number of processes.
         engine: what runs them.
         demos: files of the demonstrations that a source in `TAUGHT` learns from; their seeds are left out.
+        learner: what drives until a step drawn by chance, while the labels stay the expert's.
         progress: called with (episodes kept, episodes wanted, "episodes").
 
     Raises:
@@ -245,12 +286,14 @@ def record(
         request["linger"] = linger
     if demos:
         request["demos"] = [sha256_file(path) for path in demos]
+    if learner:
+        request["learner"] = learner.digest
     check_output(out, may_resume=MARKER)
     if finished(out, request):
         return list_demos(out)
     with building(out) as (store, result):
         rolling = functools.partial(run, store=store, workers=workers, engine=engine)
-        kept, skipped = _take(request, demos, rolling, progress or (lambda done, total, unit: None))
+        kept, skipped = _take(request, demos, learner, rolling, progress or (lambda done, total, unit: None))
         with whole_folder(result) as folder:
             for index, path in enumerate(kept):
                 shutil.copyfile(path, folder / f"episode_{index:06d}.safetensors")
@@ -290,15 +333,21 @@ def finished(out: Path, request: Mapping[str, Any]) -> bool:
 
 
 def _take(
-    request: Mapping[str, Any], demos: Sequence[Path], rolling: Callable[..., list[Path]], progress: Progress
+    request: Mapping[str, Any],
+    demos: Sequence[Path],
+    learner: Learner | None,
+    rolling: Callable[..., list[Path]],
+    progress: Progress,
 ) -> tuple[list[Path], list[dict[str, Any]]]:
     """Try seeds in order until enough succeeded; return the kept files and the skipped seeds."""
     kept: list[Path] = []
     skipped: list[dict[str, Any]] = []
     wanted, inputs = request["episodes"], tuple(request.get("demos", ()))
-    same = {key: value for key, value in request.items() if key not in ("seed", "episodes", "demos")}
+    same = {key: value for key, value in request.items() if key not in ("seed", "episodes", "demos", "learner")}
     if demos:
         same["demos"] = [str(path.resolve()) for path in demos]
+    if learner:
+        same["learner"], inputs = str(learner.folder.resolve()), (*inputs, learner.digest)
     known = {read_demo(path).seed for path in demos}
     seeds = (seed for seed in itertools.count(request["seed"]) if seed not in known)
     while len(kept) < wanted:
@@ -309,7 +358,7 @@ def _take(
                 f"{request['task']['task']}; {wanted} were wanted ({reasons}; …)."
             )
         jobs = [
-            Job("record-episode", {**same, "seed": seed}, inputs, label=("demos",))
+            Job("drive-episode" if learner else "record-episode", {**same, "seed": seed}, inputs, label=LABELS)
             for seed in itertools.islice(seeds, wanted - len(kept))
         ]
         report = functools.partial(_report, progress, len(kept), wanted)

@@ -41,6 +41,7 @@ _NUMERIC = ("mujoco", "numpy", "torch", "timm", "lerobot")
 JOBS: Mapping[str, JobKind] = MappingProxyType(
     {
         "record-episode": JobKind("surgicai_vision.demos.record:record_episode", ("scene", "envs", "demos")),
+        "drive-episode": JobKind("surgicai_vision.dagger:record_driven", (*_CELL, "dagger"), _NUMERIC),
         "render-episode": JobKind(
             "surgicai_vision.dataset.rendering:render_episode", ("scene", "envs", "demos", "dataset")
         ),
