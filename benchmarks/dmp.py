@@ -20,7 +20,7 @@ from surgicai_vision.config import TaskConfig
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.imitator import Imitator
 from surgicai_vision.demos.importing import import_demos
-from surgicai_vision.demos.record import roll
+from surgicai_vision.demos.rolling import roll
 from surgicai_vision.demos.store import write_demo
 from surgicai_vision.statistics import clopper_pearson
 

@@ -14,7 +14,7 @@ import surgicai_vision.envs as envs
 from surgicai_vision import names
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.demos.record import roll
+from surgicai_vision.demos.rolling import roll
 from surgicai_vision.envs import poses
 
 FORMATS = ("bag", "db3", "mcap")

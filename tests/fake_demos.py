@@ -4,7 +4,7 @@ import numpy as np
 from fake_env import FakeEnv, FakeExpert
 
 from surgicai_vision.dataset import rendering
-from surgicai_vision.demos.record import roll
+from surgicai_vision.demos.rolling import roll
 from surgicai_vision.demos.store import write_demo, write_marker
 
 

@@ -13,7 +13,8 @@ from surgicai_vision.config import TaskConfig
 from surgicai_vision.dagger import Wheel, learner_of
 from surgicai_vision.dataset import open_dataset, render_demos
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.demos.record import record, roll
+from surgicai_vision.demos.record import record
+from surgicai_vision.demos.rolling import roll
 from surgicai_vision.demos.store import read_demo, read_marker
 from surgicai_vision.errors import BadFile, InputError, OutputExists
 

@@ -9,7 +9,8 @@ from fake_env import FakeEnv, FakeExpert
 
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.demos import record as recording
-from surgicai_vision.demos.record import Disturbance, record, roll
+from surgicai_vision.demos.record import record
+from surgicai_vision.demos.rolling import Disturbance, roll
 from surgicai_vision.demos.store import (
     Demo,
     list_demos,

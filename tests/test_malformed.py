@@ -31,8 +31,8 @@ from surgicai_vision.config import SceneConfig, TaskConfig
 from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 from surgicai_vision.demos import bags, surgicai
 from surgicai_vision.demos.bag_config import BagConfig
-from surgicai_vision.demos.record import roll
 from surgicai_vision.demos.recording import recording_of
+from surgicai_vision.demos.rolling import roll
 from surgicai_vision.demos.segments import segments
 from surgicai_vision.demos.store import demo_bytes, list_demos, read_demo
 from surgicai_vision.errors import InputError

@@ -26,7 +26,8 @@ from surgicai_vision.demos.movement import (
     quaternion_of,
     turn_of,
 )
-from surgicai_vision.demos.record import record, roll
+from surgicai_vision.demos.record import record
+from surgicai_vision.demos.rolling import roll
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_demo
 from surgicai_vision.envs import poses
 from surgicai_vision.errors import InputError

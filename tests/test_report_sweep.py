@@ -19,10 +19,11 @@ from surgicai_vision import names, pictures, report, statistics
 from surgicai_vision.cli import main
 from surgicai_vision.commands.report import Options
 from surgicai_vision.report import beside, charts, films, formats, paper, tables
+from surgicai_vision.report.condition import Condition
 from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import best_trained, group, of_task
 from surgicai_vision.report.pairs import compare, factor
-from surgicai_vision.report.reading import Condition, collect
+from surgicai_vision.report.reading import collect
 
 LIMIT = 8_000_000
 

@@ -14,7 +14,7 @@ from policies.bc import BC
 from surgicai_vision import envs, names
 from surgicai_vision.agents import PolicyAgent
 from surgicai_vision.config import CLOCK_PERIOD, CLOCK_SIZE, SUBTASK_STEPS, TaskConfig, clock
-from surgicai_vision.demos.record import roll
+from surgicai_vision.demos.rolling import roll
 from surgicai_vision.demos.searching import Searcher
 from surgicai_vision.errors import InputError
 from surgicai_vision.registry import load_policy

@@ -66,7 +66,8 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Record and say where the demonstrations are."""
-    from surgicai_vision.demos.record import Disturbance, record
+    from surgicai_vision.demos.record import record
+    from surgicai_vision.demos.rolling import Disturbance
     from surgicai_vision.demos.store import MARKER, read_marker
     from surgicai_vision.executor import Engine
     from surgicai_vision.statistics import clopper_pearson

@@ -6,7 +6,8 @@ from typing import Any
 
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.dataset.rendering import render_demos
-from surgicai_vision.demos.record import CALM, Disturbance, record
+from surgicai_vision.demos.record import record
+from surgicai_vision.demos.rolling import CALM, Disturbance
 from surgicai_vision.executor import LOCAL, Engine
 
 

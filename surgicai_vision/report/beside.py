@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from surgicai_vision import names
 from surgicai_vision.report import paper, text
+from surgicai_vision.report.condition import Condition
 from surgicai_vision.report.groups import Group
-from surgicai_vision.report.reading import Condition
 
 _TELLING = tuple(name for name in paper.ENCODERS if name != "random")
 _DEMONSTRATIONS = 50

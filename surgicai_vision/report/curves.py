@@ -8,8 +8,8 @@ from markupsafe import Markup
 from surgicai_vision import names, statistics
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Point, Series
+from surgicai_vision.report.condition import Condition
 from surgicai_vision.report.groups import Group
-from surgicai_vision.report.reading import Condition
 
 MOST = len(charts.COLOURS)
 """Series in one drawing; what is beyond stands in the table alone."""

@@ -14,7 +14,8 @@ import numpy as np
 
 from surgicai_vision import statistics
 from surgicai_vision.report import text
-from surgicai_vision.report.reading import Collected, Condition, Missing, Result, order
+from surgicai_vision.report.condition import Condition, order
+from surgicai_vision.report.reading import Collected, Missing, Result
 
 KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
 """Kinds of failure in the order in which charts stack them."""

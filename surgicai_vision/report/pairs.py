@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from surgicai_vision import names, statistics
+from surgicai_vision.report.condition import Condition
 from surgicai_vision.report.groups import Group, of_task
-from surgicai_vision.report.reading import Condition
 
 FACTORS: Mapping[str, str] = MappingProxyType(
     {

@@ -15,6 +15,7 @@ from typing import Any
 from surgicai_vision import files, names
 from surgicai_vision.config import TaskConfig, from_mapping
 from surgicai_vision.errors import BadFile
+from surgicai_vision.report.condition import Condition, condition_of, condition_of_policy, order
 from surgicai_vision.results import MARKER, find_evaluations, read_rows
 
 RUN_FILE, GRID_FILE, CELL_FILE, FAILED_FILE = "run.json", "sweep.json", "cell.json", "failed.json"
@@ -27,77 +28,6 @@ PROBES = ("probes.parquet", "probe.json")
 FAILED, NOT_RUN, PENDING = "failed", "not run", "pending"
 PROBLEM = re.compile(r"(failed|not run): (\w+), (.+), seed (\d+): (.*)", re.DOTALL)
 """A line of `run.json`'s "not_run"."""
-
-COUNT = re.compile(r"^(\d+)([a-z]+)$")
-"""A change of a recipe that is a number: "2epochs"."""
-
-
-@dataclass(frozen=True)
-class Condition:
-    """What was evaluated, but for the training seed.
-
-    Attributes:
-        task: one of `names.TASKS`.
-        encoder: the encoder; without one "proprioception" or "state", or the name of the chain or reference.
-        views: its views.
-        chain: how subtasks end in a chain, or "".
-        trained_by: the policy's kind.
-        pool: what is taken from the encoder.
-        recipe: its recipe's name.
-        changes: what is changed in the recipe.
-        demonstrations: demonstrations asked for, where known.
-        axis: what is shifted in a robustness evaluation, or "".
-        strength: how much.
-        swap: subtask in which the expert acts (chain), or "".
-        trained: whether a policy was trained.
-        place: where it stands, if another evaluation of the same condition and training seed stands elsewhere.
-    """
-
-    task: str
-    encoder: str
-    views: tuple[str, ...] = ()
-    chain: str = ""
-    trained_by: str = "bc"
-    pool: str = "global"
-    recipe: str = "paper"
-    changes: tuple[str, ...] = ()
-    demonstrations: int | None = None
-    axis: str = ""
-    strength: float = 0.0
-    swap: str = ""
-    trained: bool = True
-    place: str = ""
-
-    @property
-    def variant(self) -> str:
-        """Everything but inputs and demonstrations that is not as usual: not bc, global, paper."""
-        usual = ((self.trained_by, "bc"), (self.pool, "global"), (self.recipe, "paper"))
-        chain = f"chain, {self.chain} end" if self.chain else ""
-        parts = [chain, *(part for part, common in usual if part != common), " + ".join(self.changes), self.place]
-        return " · ".join(part for part in parts if part)
-
-    @property
-    def policy(self) -> str:
-        """The policy without its views."""
-        return self.encoder + (f" · {self.variant}" if self.variant else "")
-
-    @property
-    def view(self) -> str:
-        """The view set."""
-        return " + ".join(self.views)
-
-    @property
-    def label(self) -> str:
-        """The policy with everything that tells it from its neighbours, but for the task."""
-        parts = [self.policy + (f" on {self.view}" if self.views else "")]
-        parts += [f"{self.axis} {self.strength:g}"] if self.axis else []
-        parts += [f"expert in {self.swap}"] if self.swap else []
-        return ", ".join(parts)
-
-    @property
-    def plain(self) -> bool:
-        """Whether neither the world was shifted nor the expert swapped in."""
-        return not self.axis and not self.swap
 
 
 @dataclass(frozen=True)
@@ -137,7 +67,7 @@ class Result:
     def condition(self) -> Condition:
         """What it is an evaluation of: by its cell where it is one of a sweep, else by what is known of the policy."""
         shift = self.about.get("shift") or {}
-        base = condition_of(self.cell) if self.cell else self._condition()
+        base = condition_of(self.cell) if self.cell else condition_of_policy(self.summary, self.about)
         return replace(
             base,
             place=self.place,
@@ -145,23 +75,6 @@ class Result:
             strength=float(shift.get("strength") or 0.0),
             swap=str(self.about.get("swap") or base.swap),
             trained=self.trained,
-        )
-
-    def _condition(self) -> Condition:
-        checkpoint = self.checkpoint
-        encoder = self.about.get("encoder") or self.summary["policy"]
-        if checkpoint and not self.about.get("views"):
-            encoder = "state" if "state" in encoder.split("-") else "proprioception"
-        recipe, *changes = checkpoint.get("recipe", "paper").split("+")
-        return Condition(
-            task=self.summary["task"],
-            encoder=encoder,
-            views=tuple(self.about.get("views") or ()),
-            trained_by=checkpoint.get("policy", "bc"),
-            pool=checkpoint.get("pool", "global"),
-            recipe=recipe,
-            changes=_told(changes),
-            demonstrations=checkpoint.get("demonstrations"),
         )
 
 
@@ -255,25 +168,6 @@ def _told_apart(results: Sequence[Result], folder: Path) -> list[Result]:
     ]
 
 
-def condition_of(cell: Mapping[str, Any]) -> Condition:
-    """Return the condition of a cell that was not evaluated, from its own fields."""
-    deviations = cell.get("deviations")
-    switches = [] if deviations is None else list(deviations) or ["none"]
-    epochs = [f"{cell['epochs']}epochs"] if cell.get("epochs") else []
-    return Condition(
-        task=str(cell["task"]),
-        encoder=str(cell.get("encoder") or ("state" if cell.get("privileged") else "proprioception")),
-        views=tuple(cell.get("view") or ()),
-        chain=str(cell.get("chain") or ""),
-        trained_by=cell.get("policy", "bc"),
-        pool=cell.get("pool", "global"),
-        recipe=Path(str(cell.get("recipe", "paper"))).stem,
-        changes=_told([*switches, *cell.get("change", ()), *epochs]),
-        demonstrations=cell.get("demonstrations"),
-        swap=str(cell.get("swap") or ""),
-    )
-
-
 def read_probes(folder: Path) -> list[dict[str, Any]]:
     """Return the rows of every probe below `folder`."""
     import pyarrow.parquet as pq
@@ -338,19 +232,6 @@ def _noted(line: str, shared: Mapping[str, Any]) -> Missing | None:
 
 def _filled(cell: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in cell.items() if value is not None}
-
-
-def _told(changes: Sequence[str]) -> tuple[str, ...]:
-    """Write what is changed in a recipe as people read it; demonstrations are told elsewhere."""
-    return tuple(COUNT.sub(r"\1 \2", change) for change in changes if not change.endswith("demos"))
-
-
-def order(condition: Condition) -> tuple[Any, ...]:
-    """By task; in it trained policies first, by encoder, views and what else they are, then the references."""
-    views = [names.VIEWS.index(view) if view in names.VIEWS else len(names.VIEWS) for view in condition.views]
-    task = names.TASKS.index(condition.task) if condition.task in names.TASKS else len(names.TASKS)
-    more = (condition.variant, condition.demonstrations or 0, condition.axis, condition.strength, condition.swap)
-    return (task, not condition.trained, not views, condition.encoder, len(views), views, *more)
 
 
 def _json(path: Path) -> dict[str, Any]:

@@ -13,10 +13,11 @@ from typing import Any
 from surgicai_vision import files, statistics
 from surgicai_vision.report import text
 from surgicai_vision.report.beside import paper_rate
+from surgicai_vision.report.condition import Condition
 from surgicai_vision.report.formats import latex, markdown
 from surgicai_vision.report.groups import KINDS, MEASURES, Group, measured
 from surgicai_vision.report.pairs import Pair
-from surgicai_vision.report.reading import REFERENCES, Condition, Result
+from surgicai_vision.report.reading import REFERENCES, Result
 from surgicai_vision.results import parquet_bytes
 
 FOLDER = "tables"

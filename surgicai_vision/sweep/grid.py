@@ -10,7 +10,8 @@ from surgicai_vision import names, registry
 from surgicai_vision.cells import OWN, Cell
 from surgicai_vision.chain import TERMINATIONS
 from surgicai_vision.config import RandomisationConfig, TaskConfig, check_every, digest, to_mapping
-from surgicai_vision.demos.record import SOURCES, TAUGHT, Disturbance
+from surgicai_vision.demos.record import SOURCES, TAUGHT
+from surgicai_vision.demos.rolling import Disturbance
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES
 
