@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from surgicai_vision import lerobot_agent, names
 from surgicai_vision.agents import BASELINES, Shared, one_thread
-from surgicai_vision.cells import Subject, checkpoint_subject, policy_agent
 from surgicai_vision.config import DWELL, TaskConfig, digest, to_mapping
 from surgicai_vision.errors import InputError, check_name
+from surgicai_vision.subjects import Subject, checkpoint_subject, policy_agent
 
 ORDER = "order"
 GRASP = names.SUBTASKS.index("grasp")

@@ -17,12 +17,12 @@ from typing import Any, final
 
 import numpy as np
 
-from surgicai_vision.cells import checkpoint_subject
 from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.demos.record import Learner, record_into
 from surgicai_vision.demos.rolling import Disturbance
 from surgicai_vision.errors import InputError
 from surgicai_vision.evaluation import Agent
+from surgicai_vision.subjects import checkpoint_subject
 
 
 @final

@@ -4,7 +4,7 @@ Interface:
 
 * `find(folder) -> Path | None`: the folder with config.json and model.safetensors, looked for in a training's
   output, in one of its checkpoints, or in `pretrained_model` itself.
-* `subject(folder, task, weights) -> cells.Subject`.
+* `subject(folder, task, weights) -> subjects.Subject`.
 
 The policy runs through LeRobot's own pipeline, as in `lerobot-eval`. So that a result depends neither on the
 batch nor on the processes, every slot has a policy of its own (sharing weights) with its own random numbers,
@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 
 from surgicai_vision import names
 from surgicai_vision.agents import one_thread
-from surgicai_vision.cells import Subject
 from surgicai_vision.config import TaskConfig, from_mapping
 from surgicai_vision.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.files import read_json, sha256_file
+from surgicai_vision.subjects import Subject
 
 CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
 PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")

@@ -10,19 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision import files, names, registry
-from surgicai_vision.cells import (
-    Cell,
-    Stage,
-    baseline_subject,
-    checkpoint_subject,
-    evaluate_once,
-    timed,
-    train_cell,
-)  # fmt: skip
+from surgicai_vision.cells import Cell, Stage, evaluate_once, timed, train_cell
 from surgicai_vision.config import TaskConfig, to_mapping
 from surgicai_vision.errors import InputError, OutputExists, check_name
 from surgicai_vision.provenance import command_line, provenance
 from surgicai_vision.report import RUN_FILE, write_report
+from surgicai_vision.subjects import baseline_subject, checkpoint_subject
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision import chain, files, names
-from surgicai_vision.cells import Stage, Subject, evaluate_into
+from surgicai_vision.cells import Stage, evaluate_into
 from surgicai_vision.config import to_mapping
 from surgicai_vision.errors import check_name
 from surgicai_vision.evaluation import Agent, MakeAgent
 from surgicai_vision.results import MARKER, parquet_bytes, read_rows
 from surgicai_vision.statistics import clopper_pearson, holm, mcnemar
+from surgicai_vision.subjects import Subject
 
 CURVES, MARK = "survival.parquet", "survival.json"
 EXPERT, ALL, AS_IT_IS = "expert", "all", "as-it-is"

@@ -13,7 +13,6 @@ from fake_demos import write_demos
 from fake_env import FakeEnv
 
 from surgicai_vision import names
-from surgicai_vision.cells import replay_subject
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.dataset import check_dataset, layout, metadata, open_dataset, pictures, render_demos, rendering
 from surgicai_vision.dataset.statistics import PictureStatistics, column_statistics
@@ -21,6 +20,7 @@ from surgicai_vision.dataset.thinning import thinned
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.store import list_demos, read_demo
 from surgicai_vision.errors import BadFile, InputError, OutputExists, UnknownName
+from surgicai_vision.subjects import replay_subject
 
 CONFIG = TaskConfig(max_steps=12)
 SIZE = 32

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from surgicai_vision import cells, envs, names, results
+from surgicai_vision import envs, names, results, subjects
 from surgicai_vision.agents import PolicyAgent, RandomAgent, ZeroAgent
 from surgicai_vision.config import TaskConfig
 from surgicai_vision.envs import gauge
@@ -246,7 +246,7 @@ def test_a_policy_with_pictures_gives_the_same_rows_for_any_batch():
 
 
 def test_expert_solves_held_out_starts():
-    subject = cells.baseline_subject("expert", TaskConfig("grasp"))
+    subject = subjects.baseline_subject("expert", TaskConfig("grasp"))
     rows = rows_of(
         evaluate(subject.make_agent, subject.config, range(names.TEST_SEED, names.TEST_SEED + 3), workers=1)
     )
@@ -254,6 +254,6 @@ def test_expert_solves_held_out_starts():
 
 
 def test_zero_fails():
-    make = functools.partial(cells.baseline, "zero")
+    make = functools.partial(subjects.baseline, "zero")
     row = evaluate(make, SHORT, [names.TEST_SEED], workers=1)[0].row
     assert (row.success, row.failure, row.steps) == (False, "missed", SHORT.max_steps)

@@ -14,8 +14,8 @@ from encoders.clip import CLIP
 from encoders.imagenet import IMAGENET
 from encoders.r3m import R3M, R3M_18
 from encoders.released import changed, drifted
-from surgicai_vision import cells, names, registry, released
-from surgicai_vision.agents import NoisyAgent, ZeroAgent
+from surgicai_vision import cells, names, registry, released, subjects
+from surgicai_vision.agents import NoisyAgent, PolicyAgent, ZeroAgent
 from surgicai_vision.checkpoint import ENCODER_STATISTICS, read_checkpoint
 from surgicai_vision.commands.console import QuietConsole
 from surgicai_vision.config import DEVIATIONS, Deviations, TaskConfig
@@ -131,7 +131,7 @@ def test_three_evaluations_are_three_rounds_of_new_starts(tmp_path: Path, monkey
 
     monkeypatch.setattr(cells, "evaluate", evaluate)
     monkeypatch.setattr(cells, "write_evaluation", lambda out, episodes, about: {"stored": about["rounds"]})
-    subject = cells.Subject("policy", TaskConfig(), ZeroAgent, rounds=3)
+    subject = subjects.Subject("policy", TaskConfig(), ZeroAgent, rounds=3)
     result = cells.evaluate_into(tmp_path, subject, range(10, 15))
     assert taken == list(range(10, 25))
     assert result == {"rounds": [3, 2, 3], "stored": [3, 2, 3]}
@@ -162,7 +162,7 @@ def test_a_drifted_encoder_comes_back_with_its_checkpoint(
     encoder = registry.load_encoder_of(checkpoint)
     assert encoder.weights_sha256 == checkpoint.encoder.weights_sha256
     assert encoder.card.channel_order == "BGR"
-    subject = cells.checkpoint_subject(tmp_path / "policy")
+    subject = subjects.checkpoint_subject(tmp_path / "policy")
     assert subject.rounds == 3 and isinstance(subject.make_agent(), NoisyAgent)
     (tmp_path / "policy" / ENCODER_STATISTICS).write_bytes(b"torn")
     with pytest.raises(BadFile, match="safetensors"):
@@ -172,6 +172,6 @@ def test_a_drifted_encoder_comes_back_with_its_checkpoint(
 def test_a_paper_policy_is_evaluated_as_ever(tmp_path: Path) -> None:
     cell = cells.Cell("grasp", None, (), epochs=1)
     cells.train_cell(cell, Pictures(), tmp_path / "policy", QUIET)
-    subject = cells.checkpoint_subject(tmp_path / "policy")
-    assert subject.rounds == 1 and type(subject.make_agent()) is cells.PolicyAgent
+    subject = subjects.checkpoint_subject(tmp_path / "policy")
+    assert subject.rounds == 1 and type(subject.make_agent()) is PolicyAgent
     assert not (tmp_path / "policy" / ENCODER_STATISTICS).exists()

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from surgicai_vision import cells, envs, names
+from surgicai_vision import envs, names, subjects
 from surgicai_vision.agents import PolicyAgent
 from surgicai_vision.cli import main
 from surgicai_vision.config import RandomisationConfig, TaskConfig
@@ -37,7 +37,7 @@ def seeing(image_size=48):
 
 
 def subject(config=SHORT):
-    return cells.Subject("seeing", config, seeing, {"views": ["front", "wrist_psm2"]})
+    return subjects.Subject("seeing", config, seeing, {"views": ["front", "wrist_psm2"]})
 
 
 def played(chosen, batch=8):
@@ -222,7 +222,7 @@ def test_running_again_does_only_what_is_missing(tmp_path, pretend):
 
 
 def test_without_pictures_only_the_arm_can_shift(tmp_path):
-    blind = cells.baseline_subject("expert", SHORT)
+    blind = subjects.baseline_subject("expert", SHORT)
     assert axes_of(blind) == ("latency", "kinematic_error")
     assert axes_of(subject()) == tuple(AXES)
     with pytest.raises(InputError, match="sees no pictures"):

@@ -94,28 +94,28 @@ def subject_of(options: Any) -> Any:
     Args:
         options: of this verb, or another's with the same fields (`swap` is this one's alone).
     """
-    from surgicai_vision import cells, lerobot_agent
+    from surgicai_vision import agents, lerobot_agent, subjects
 
     folder, swap = Path(options.policy), getattr(options, "swap", None)
     if swap and folder.suffix not in CHAIN_SUFFIXES:
         raise InputError(f"--swap {swap} is for a chain.yaml; leave it out.")
     if options.policy == REPLAY:
-        subject = cells.replay_subject(folders.open_dataset(options.dataset, options.task or "grasp", ()))
+        subject = subjects.replay_subject(folders.open_dataset(options.dataset, options.task or "grasp", ()))
         return _in_env(subject, options.env)
     if options.dataset:
         raise InputError("--dataset is for replay alone; leave it out.")
     if folder.suffix in CHAIN_SUFFIXES:
         return _chain(folder, options, swap)
-    if options.policy in cells.BASELINES:
+    if options.policy in agents.BASELINES:
         config = task_config(options.task or "grasp", options.env)
-        return cells.baseline_subject(options.policy, config)
+        return subjects.baseline_subject(options.policy, config)
     if not folder.exists() and folder.parent == Path():
-        raise UnknownName("policy or checkpoint folder", options.policy, (*cells.BASELINES, REPLAY))
+        raise UnknownName("policy or checkpoint folder", options.policy, (*agents.BASELINES, REPLAY))
     lerobot = lerobot_agent.find(folder)
     if lerobot:
         subject = lerobot_agent.subject(lerobot, options.task, options.weights)
     else:
-        subject = cells.checkpoint_subject(folder, options.weights, options.accept_licence)
+        subject = subjects.checkpoint_subject(folder, options.weights, options.accept_licence)
     trained_for = subject.config.task
     if options.task not in (None, trained_for):
         raise InputError(f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out.")

@@ -43,7 +43,7 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Roll the expert once and draw the start and the end as every camera sees them."""
-    from surgicai_vision import cells, pictures
+    from surgicai_vision import pictures, subjects
     from surgicai_vision.evaluation import evaluate
     from surgicai_vision.provenance import provenance
 
@@ -55,7 +55,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         raise InputError(f"--view is empty; give some of {', '.join(names.CAMERAS)}.")
     folders.check_file(path, "--sheet", (".png", ".jpg", ".pdf", ".svg"))
     with console.stage(f"rolling the expert of {options.task}", "steps") as progress:
-        episode = evaluate(cells.expert, config, [options.seed], workers=1, progress=progress)[0]
+        episode = evaluate(subjects.expert, config, [options.seed], workers=1, progress=progress)[0]
     moments = {"start": episode.film.states[0], f"end, step {episode.row.steps}": episode.film.states[-1]}
     shown = [(moment, modality) for moment in moments for modality in names.MODALITIES]
     rows, total = [], len(options.view)
@@ -81,7 +81,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
 def _film(options: Options, console: Console) -> dict[str, Any]:
     """Draw a row of moments for every subtask: the expert's episode from the seed, as the first view sees it."""
-    from surgicai_vision import cells, pictures
+    from surgicai_vision import pictures, subjects
     from surgicai_vision.evaluation import evaluate
 
     path, rows, outcomes = Path(options.film or ""), [], {}
@@ -89,7 +89,7 @@ def _film(options: Options, console: Console) -> dict[str, Any]:
     with console.stage("filming", "subtasks") as progress:
         for done, subtask in enumerate(names.SUBTASKS):
             config = task_config(subtask, options.env)
-            episode = evaluate(cells.expert, config, [options.seed], workers=1)[0]
+            episode = evaluate(subjects.expert, config, [options.seed], workers=1)[0]
             last = len(episode.film.states) - 1
             moments = [episode.film.states[round(last * share / (FILM_FRAMES - 1))] for share in range(FILM_FRAMES)]
             with pictures.stage(config, options.size, options.quality) as see:

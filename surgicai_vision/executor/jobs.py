@@ -32,7 +32,7 @@ class JobKind:
 
 _DATA = ("scene", "envs", "demos", "dataset")
 _LEARN = (
-    *_DATA, "features", "released", "training", "training_data", "checkpoint", "registry", "cells",
+    *_DATA, "features", "released", "training", "training_data", "checkpoint", "registry", "subjects", "cells",
     "encoders", "policies",
 )  # fmt: skip
 _CELL = (*_LEARN, "sweep", "agents", "evaluation", "rows", "statistics", "chain", "lerobot_agent")

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision import files
-from surgicai_vision.cells import Stage, Subject, evaluate_into
+from surgicai_vision.cells import Stage, evaluate_into
 from surgicai_vision.config import to_mapping
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.results import MARKER, parquet_bytes, read_rows
 from surgicai_vision.robustness.axes import AXES, axes_of, shifted
 from surgicai_vision.statistics import area_interval, area_under_curve, clopper_pearson, holm, mcnemar
+from surgicai_vision.subjects import Subject
 
 __all__ = ["AXES", "CURVES", "MARK", "STRENGTHS", "axes_of", "robustness", "shifted"]
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from surgicai_vision.cells import Subject
 from surgicai_vision.config import RANDOMISATION_LIMITS, TaskConfig
 from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.evaluation import Agent, MakeAgent
 from surgicai_vision.robustness.corruption import CORRUPTIONS, CorruptedAgent
+from surgicai_vision.subjects import Subject
 
 
 @dataclass(frozen=True)

@@ -13,20 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision import names
-from surgicai_vision.cells import (
-    Cell,
-    Stage,
-    Subject,
-    baseline_subject,
-    checkpoint_subject,
-    encode_cell,
-    evaluate_into,
-    replay_subject,
-    timed,
-    train_cell,
-)  # fmt: skip
+from surgicai_vision.cells import Cell, Stage, encode_cell, evaluate_into, timed, train_cell
 from surgicai_vision.config import TaskConfig, from_mapping
 from surgicai_vision.files import write_json
+from surgicai_vision.subjects import Subject, baseline_subject, checkpoint_subject, replay_subject
 from surgicai_vision.sweep.lerobot import LEROBOT_POLICIES, SCRATCH, train_lerobot
 from surgicai_vision.sweep.planning import CELL_FILE, PROBE_FILE, REFERENCE_FILE
 
