@@ -317,13 +317,14 @@ def _store_run(grid: Grid, out: Path, problems: list[str], skipped: Sequence[Cel
     """Write what the report says of the run; only when something changed."""
     old = files.read_json(out / RUN_FILE) if (out / RUN_FILE).exists() else {}
     counts = ", ".join(map(str, grid.demonstrations))
-    noise = f", executed with noise {grid.noise:g}" if grid.noise else ""
-    noise += f", going on for {grid.linger} steps after their success" if grid.linger else ""
-    thin = f", a frame every {grid.every} steps" if grid.every > 1 else ""
-    data = (
-        f"{counts} demonstrations of each task by the scripted {grid.source}{noise}{thin}; {', '.join(grid.views)} at "
-        f"{grid.size} × {grid.size}; {', '.join(grid.policy)}, recipe {', '.join(grid.recipe)}"
-    )
+    parts = [f"{counts} demonstrations of each task by the scripted {grid.source}"]
+    parts += [f"executed with noise {grid.noise:g}"] if grid.noise else []
+    parts += [f"going on for {grid.linger} steps after their success"] if grid.linger else []
+    parts += [f"{axis} up to {getattr(grid.randomisation, axis):g}" for axis in grid.randomisation.on]
+    parts += [f"a frame every {grid.every} steps"] if grid.every > 1 else []
+    seen = f"{', '.join(grid.views)} at {grid.size} × {grid.size}" if grid.views else "no pictures"
+    taught = f"{', '.join(grid.policy)}, recipe {', '.join(grid.recipe)}"
+    data = "; ".join([", ".join(parts), seen, taught, f"{grid.episodes} {grid.starts} starts from {grid.first_seed}"])
     run = {"title": "sweep", "command": old.get("command") or command_line(), "data": data, "not_run": problems}
     lacking = [{"key": state.key, "cell": to_mapping(state.cell), "reason": state.reason} for state in skipped]
     made = {**run, "skipped": lacking, "provenance": old.get("provenance") or provenance()}
