@@ -10,18 +10,16 @@ next one (`render-demos --demos A,B`).
 
 import atexit
 import functools
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.config import TaskConfig, from_mapping
 from surgicai_vision.demos.record import Learner, record_into
-from surgicai_vision.demos.rolling import Disturbance
 from surgicai_vision.errors import InputError
-from surgicai_vision.evaluation import Agent
+from surgicai_vision.evaluation import Agent, env_of
 from surgicai_vision.subjects import checkpoint_subject
 
 
@@ -61,37 +59,15 @@ def learner_of(folder: Path, config: TaskConfig) -> Learner:
     return Learner(folder, str(subject.about["checkpoint"]["policy_sha256"]))
 
 
-def record_driven(
-    folder: Path,
-    task: Mapping[str, Any],
-    learner: str,
-    source: str,
-    seed: int,
-    noise: float = 0.0,
-    recoveries: float = 0.0,
-    noise_from: float | None = None,
-    linger: int = 0,
-    demos: Sequence[str] = (),
-) -> None:
+def record_driven(folder: Path, task: Mapping[str, Any], learner: str, **how: Any) -> None:
     """Job "drive-episode": as "record-episode", with a learner that drives."""
-    env, wheel = _driven(json.dumps(to_mapping(from_mapping(TaskConfig, task))), learner)
-    disturbance = Disturbance(noise, recoveries, noise_from)
-    record_into(folder, env, source, seed, disturbance, linger, demos, wheel)
+    env, wheel = _driven(from_mapping(TaskConfig, task), learner)
+    record_into(folder, env, driver=wheel, **how)
 
 
 @functools.lru_cache(maxsize=1)
-def _driven(task: str, learner: str) -> tuple[Any, Wheel]:
+def _driven(config: TaskConfig, learner: str) -> tuple[Any, Wheel]:
     """Return this process's environment with what the learner sees, and the learner."""
-    from surgicai_vision import envs
-
     atexit.register(_driven.cache_clear)  # the GL context must go before the interpreter does
     agent = checkpoint_subject(Path(learner)).make_agent()
-    cameras = tuple(agent.cameras)
-    env = envs.make(
-        from_mapping(TaskConfig, json.loads(task)),
-        obs_type="pixels_agent_pos" if cameras else "state",
-        cameras=cameras,
-        image_size=agent.image_size,
-        depth=getattr(agent, "depth", False),
-    )
-    return env, Wheel(agent)
+    return env_of(agent, config), Wheel(agent)

@@ -72,6 +72,20 @@ class Episode:
     film: Film
 
 
+def env_of(agent: Agent, config: TaskConfig) -> Any:
+    """Make an env that shows what the agent sees."""
+    from surgicai_vision import envs
+
+    cameras = tuple(agent.cameras)
+    return envs.make(
+        config,
+        obs_type="pixels_agent_pos" if cameras else "state",
+        cameras=cameras,
+        image_size=agent.image_size,
+        depth=getattr(agent, "depth", False),
+    )
+
+
 def evaluate(
     make_agent: MakeAgent,
     task_config: TaskConfig,
@@ -160,17 +174,9 @@ class _Slot:
     states: list[NDArray[np.float64]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        from surgicai_vision import envs
         from surgicai_vision.envs.gauge import Gauge
 
-        cameras = tuple(self.agent.cameras)
-        self.env = envs.make(
-            self.task_config,
-            obs_type="pixels_agent_pos" if cameras else "state",
-            cameras=cameras,
-            image_size=self.agent.image_size,
-            depth=getattr(self.agent, "depth", False),
-        )
+        self.env = env_of(self.agent, self.task_config)
         self.gauge = Gauge(self.env)
 
     def begin(self, seed: int) -> None:

@@ -95,8 +95,7 @@ def render_demos(
         return finished(out, request, started)
     origins = [_Origin.of(read_demo(path)) for path in paths]
     config = _same_config(origins, paths)
-    frames = [len(range(0, row.length, every)) for row in origins]
-    jobs = [_job(path, options, count) for path, count in zip(paths, frames, strict=True)]
+    jobs = [_job(path, options, len(range(0, row.length, every))) for path, row in zip(paths, origins, strict=True)]
     with building(out) as (store, result):
         shards = run(jobs, store, workers=workers, progress=progress, unit="frames", engine=engine)
         meta = _meta(sources, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins)

@@ -60,20 +60,9 @@ def _env(config: TaskConfig) -> Any:
     return envs.make(config)
 
 
-def record_episode(
-    folder: Path,
-    task: Mapping[str, Any],
-    source: str,
-    seed: int,
-    noise: float = 0.0,
-    recoveries: float = 0.0,
-    noise_from: float | None = None,
-    linger: int = 0,
-    demos: Sequence[str] = (),
-) -> None:
-    """Job "record-episode": roll `seed` and write the episode, or why it failed, into `folder`."""
-    env = _env(from_mapping(TaskConfig, task))
-    record_into(folder, env, source, seed, Disturbance(noise, recoveries, noise_from), linger, demos)
+def record_episode(folder: Path, task: Mapping[str, Any], **how: Any) -> None:
+    """Job "record-episode": roll one seed; `how` is the rest of `record_into`'s arguments."""
+    record_into(folder, _env(from_mapping(TaskConfig, task)), **how)
 
 
 def record_into(
@@ -81,15 +70,17 @@ def record_into(
     env: Any,
     source: str,
     seed: int,
-    disturbance: Disturbance,
-    linger: int,
+    noise: float = 0.0,
+    recoveries: float = 0.0,
+    noise_from: float | None = None,
+    linger: int = 0,
     demos: Sequence[str] = (),
     driver: Driver | None = None,
 ) -> None:
     """Roll `seed` in `env` and write the episode, or why it failed, into `folder`."""
     module, _, name = SOURCES[source].partition(":")
     actor = getattr(importlib.import_module(module), name)(env, *([demos] if demos else []))
-    rollout = roll(env, actor, seed, source, disturbance, linger, driver)
+    rollout = roll(env, actor, seed, source, Disturbance(noise, recoveries, noise_from), linger, driver)
     if rollout.success:
         write_demo(folder, 0, rollout.demo)
     write_json(folder / "result.json", {"seed": seed, "success": rollout.success, "reason": rollout.reason})
