@@ -146,11 +146,12 @@ def read_results(folder: Path, grid: dict[str, Any] | None = None, empty: bool =
 def _once(results: Sequence[Result]) -> list[Result]:
     """Leave out a reference whose episodes are among those of another: several sweeps evaluate the same expert."""
     kept: list[Result] = []
-    for result in sorted(results, key=lambda result: -len(result.rows)):
+    references = [result for result in results if not result.trained]
+    for result in sorted(references, key=lambda result: -len(result.rows)):
         same = [other for other in kept if other.condition == result.condition and other.config == result.config]
-        if result.trained or not any(_outcomes(result) <= _outcomes(other) for other in same):
+        if not any(_outcomes(result) <= _outcomes(other) for other in same):
             kept.append(result)
-    return [result for result in results if result in kept]
+    return [result for result in results if result.trained or result in kept]
 
 
 def _outcomes(result: Result) -> set[tuple[Any, ...]]:
