@@ -2,7 +2,7 @@
 
     python benchmarks/cache.py --json
 
-An entry is written by `surgicai_vision.features.encode` itself, with an encoder that costs nothing. Each repetition
+An entry is written by `surgicai_vision.features.cache.encode` itself, with an encoder that costs nothing. Each repetition
 reads batches of 256 rows drawn at random from all of them: as they lie (`float16`), and cast to float32 as `training`
 does. The pages are in memory, as they are from the second epoch on. Every batch is checked to hold the rows asked
 for. Prints one JSON line.
@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from common import emit, median
 
-from surgicai_vision import registry
-from surgicai_vision.features import encode
+from surgicai_vision.features import encoders
+from surgicai_vision.features.cache import encode
 
 DIM = 2048
 
@@ -39,7 +39,7 @@ class Source:
 class Filler:
     """An encoder whose row says which frame it is of."""
 
-    card = registry.encoder_card("random")
+    card = encoders.encoder_card("random")
     pool, dim, shape, fingerprint, weights_sha256 = "global", DIM, (DIM,), "filler", ""
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
-from surgicai_vision.provenance import provenance
+from surgicai_vision.evaluation.provenance import provenance
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

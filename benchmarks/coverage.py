@@ -24,7 +24,12 @@ import numpy as np
 from common import emit
 from scipy.stats import binom
 
-from surgicai_vision.statistics import area_interval, area_under_curve, clopper_pearson, hierarchical_bootstrap
+from surgicai_vision.evaluation.statistics import (
+    area_interval,
+    area_under_curve,
+    clopper_pearson,
+    hierarchical_bootstrap,
+)
 
 LEVEL = 0.95
 RATES = (0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 0.9, 0.95, 0.98)

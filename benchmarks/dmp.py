@@ -5,7 +5,7 @@
 
 Every start counts, none is drawn again. Prints one JSON object: per task the successes, the starts, the share with its
 95 % Clopper-Pearson interval, the median steps, and what was learned from (`bent`: demonstrations that were put onto
-the path through the holes; see `surgicai_vision/demos/lesson.py`).
+the path through the holes; see `surgicai_vision/demos/dmp/fit.py`).
 """
 
 import argparse
@@ -15,14 +15,15 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import envs, names
-from surgicai_vision.config import TaskConfig
+from surgicai_vision import envs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.demos.dmp.controller import Imitator
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.demos.imitator import Imitator
-from surgicai_vision.demos.importing import import_demos
-from surgicai_vision.demos.rolling import roll
+from surgicai_vision.demos.imports.surgicai import import_demos
+from surgicai_vision.demos.rollout import roll
 from surgicai_vision.demos.store import write_demo
-from surgicai_vision.statistics import clopper_pearson
+from surgicai_vision.evaluation.statistics import clopper_pearson
 
 TAUGHT = 0
 """Seed of the expert's first demonstration; the starts begin at `--seed`."""

@@ -5,7 +5,7 @@
 
 The bare loop is what one would write by hand: eval mode, bfloat16 where the processor multiplies it, channels_last,
 all cores, `inference_mode`; for each batch uint8 pictures are normalised, passed on and collected as float16. It runs
-with our own batch and with 16, and the faster one counts. `cached` is `surgicai_vision.features.encode` into an empty
+with our own batch and with 16, and the faster one counts. `cached` is `surgicai_vision.features.cache.encode` into an empty
 cache; its frames come from memory, as the bare loop's do. `--dataset DIR` adds what decoding our pictures costs.
 The ways take turns within one process; the best of each counts. Prints one JSON line an encoder.
 """
@@ -24,9 +24,9 @@ import torch
 from common import emit
 
 from encoders.base import CUDA_BATCH, best_device, best_dtype
-from surgicai_vision import registry
-from surgicai_vision.evaluation import BATCH
-from surgicai_vision.features import encode
+from surgicai_vision.evaluation.rollout import BATCH
+from surgicai_vision.features import encoders
+from surgicai_vision.features.cache import encode
 
 ENCODERS = ("imagenet-lite", "random", "imagenet")
 """`random` is the ResNet-50 of `imagenet` without its weights, which make no difference to the speed."""
@@ -48,8 +48,8 @@ class Memory:
 
 def bare(name: str, weights: str | None) -> Callable[[np.ndarray, int], np.ndarray]:
     """Return the bare loop: (frames (N, H, W, 3) uint8, batch) → features (N, dim) float16."""
-    plugin = registry.encoder_plugin(name)
-    card, network = plugin.build(plugin.card, registry.find_weights(name, weights))
+    plugin = encoders.encoder_plugin(name)
+    card, network = plugin.build(plugin.card, encoders.find_weights(name, weights))
     device = best_device()
     kind = best_dtype(device)
     network = network.eval().requires_grad_(False).to(device, kind).to(memory_format=torch.channels_last)
@@ -76,7 +76,7 @@ def cached(source: Any, encoder: Any) -> int:
 
 def ways(name: str, weights: str | None, frames: np.ndarray, dataset: Any) -> dict[str, Callable[[], int]]:
     """Return what is timed, by name; each returns how many frames it encoded."""
-    loop, encoder = bare(name, weights), registry.load_encoder(name, weights)
+    loop, encoder = bare(name, weights), encoders.load_encoder(name, weights)
     batch = CUDA_BATCH if torch.cuda.is_available() else BATCH
     error = np.abs(loop(frames[:batch], batch).astype(np.float32) - encoder(frames[:batch])).max()
     print(f"{name}: largest difference between the ways {error:.4f}", file=sys.stderr)
@@ -126,7 +126,7 @@ def main() -> None:
     frames = np.random.default_rng(0).integers(0, 256, (arguments.frames, 224, 224, 3), np.uint8)
     dataset = None
     if arguments.dataset:
-        from surgicai_vision.dataset.reading import open_dataset
+        from surgicai_vision.dataset.reader import open_dataset
 
         dataset = open_dataset(Path(arguments.dataset))
     names = [arguments.encoder] if arguments.encoder else [name for name in ENCODERS if at_hand(name)]
@@ -136,10 +136,10 @@ def main() -> None:
 
 def at_hand(name: str) -> bool:
     """Say whether an encoder's weights are on this machine."""
-    from surgicai_vision.errors import SurgicaiError
+    from surgicai_vision.core.errors import SurgicaiError
 
     try:
-        registry.find_weights(name)
+        encoders.find_weights(name)
     except SurgicaiError:
         return False
     return True

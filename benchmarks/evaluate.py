@@ -23,10 +23,10 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import numpy as np
 from common import emit, median
 
-from surgicai_vision import names
-from surgicai_vision.agents import PolicyAgent
-from surgicai_vision.config import TaskConfig
-from surgicai_vision.evaluation import Agent, Episode, evaluate
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.evaluation.rollout import Agent, Episode, evaluate
 
 ENCODER, VIEW, SIZE = "imagenet-lite", "front", 224
 
@@ -45,7 +45,7 @@ class Head:
 
 def make_agent() -> Agent:
     """Make the agent (in a worker process)."""
-    from surgicai_vision.registry import load_encoder
+    from surgicai_vision.features.encoders import load_encoder
 
     encoder = load_encoder(ENCODER)
     return PolicyAgent("benchmark", Head(encoder.dim), encoder, (VIEW,), SIZE)

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 
 from common import chunks, emit, median, spread
 
-from surgicai_vision import envs, names
-from surgicai_vision.config import SceneConfig, TaskConfig, to_mapping
+from surgicai_vision import envs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import SceneConfig, TaskConfig, to_mapping
+from surgicai_vision.core.errors import SurgicaiError
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.errors import SurgicaiError
-from surgicai_vision.statistics import clopper_pearson
+from surgicai_vision.evaluation.statistics import clopper_pearson
 
 
 class Job(NamedTuple):

@@ -74,8 +74,8 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="accepted for symmetry; the last line is always JSON")
     arguments = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from surgicai_vision import names
-    from surgicai_vision.config import TaskConfig
+    from surgicai_vision.core import names
+    from surgicai_vision.core.config import TaskConfig
     from surgicai_vision.dataset import render_demos
     from surgicai_vision.demos.record import record
     from surgicai_vision.demos.store import list_demos, read_demo

@@ -3,7 +3,7 @@
     python benchmarks/grasp_ceiling.py --episodes 200
 
 `once`: the expert takes the needle in the middle of the range of goals, seeing everything else. `search`: it tries
-again elsewhere (`surgicai_vision.demos.searching`). Both bound what a policy can reach that sees pictures alone.
+again elsewhere (`surgicai_vision.demos.search_expert`). Both bound what a policy can reach that sees pictures alone.
 """
 
 import argparse
@@ -14,9 +14,9 @@ from typing import Any
 from common import chunks, emit, median, spread
 
 from surgicai_vision import envs
-from surgicai_vision.config import TaskConfig
-from surgicai_vision.demos.searching import Searcher
-from surgicai_vision.statistics import clopper_pearson
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.demos.search_expert import Searcher
+from surgicai_vision.evaluation.statistics import clopper_pearson
 
 
 class Once(Searcher):

@@ -13,14 +13,14 @@ import math
 
 import numpy as np
 
-from surgicai_vision.config import SceneConfig
+from surgicai_vision.core.config import SceneConfig
+from surgicai_vision.core.names import FPS, PSM2
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.place import draw_psm2_grasp
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import hold_needle
-from surgicai_vision.names import FPS, PSM2
 from surgicai_vision.scene import build_scene
 
 SECONDS, SPEED, TURN = 10.0, 0.030, math.radians(60.0)

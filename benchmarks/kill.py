@@ -25,7 +25,7 @@ RENDER = """
 import json, sys
 from pathlib import Path
 from surgicai_vision.dataset import open_dataset, render_demos
-from surgicai_vision.executor import Engine
+from surgicai_vision.core.executor import Engine
 if __name__ == "__main__":
     demos, out, workers, size, address = sys.argv[1:]
     engine = Engine("ray", address) if address else Engine()
@@ -39,7 +39,7 @@ SIZE = 64
 
 def make_demos(folder: Path, episodes: int) -> None:
     """Record short demonstrations of the expert."""
-    from surgicai_vision.config import TaskConfig
+    from surgicai_vision.core.config import TaskConfig
     from surgicai_vision.demos.record import record
 
     record(TaskConfig("grasp"), episodes=episodes, out=folder, workers=0)

@@ -16,8 +16,9 @@ import mujoco
 import numpy as np
 from common import chunks, emit, spread
 
-from surgicai_vision import envs, names
-from surgicai_vision.config import SceneConfig, TaskConfig
+from surgicai_vision import envs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import SceneConfig, TaskConfig
 
 STEPS = 200
 DIVERGED = tuple(

@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="accepted for symmetry; the last line is always JSON")
     arguments = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from surgicai_vision.config import TaskConfig
+    from surgicai_vision.core.config import TaskConfig
     from surgicai_vision.demos.record import record
 
     root = Path(tempfile.mkdtemp(prefix="surgicai-vision-render-"))

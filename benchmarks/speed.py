@@ -31,8 +31,9 @@ import mujoco
 import numpy as np
 from common import emit, median
 
-from surgicai_vision import envs, names
-from surgicai_vision.config import SceneConfig, TaskConfig
+from surgicai_vision import envs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import SceneConfig, TaskConfig
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.scene.rendering import QUALITIES, FrameRenderer
 

@@ -4,7 +4,7 @@
     python benchmarks/training.py --views 1 --dim 1280
 
 The features are noise in a cache entry of their own (their values make no difference to the time); data, split,
-policy, checkpoint and its training states are those of `surgicai_vision.training.train`. Prints one JSON line.
+policy, checkpoint and its training states are those of `surgicai_vision.training.train.train`. Prints one JSON line.
 """
 
 import argparse
@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 from common import emit
 
-from surgicai_vision import names, registry
-from surgicai_vision.config import TaskConfig
-from surgicai_vision.features import encode
-from surgicai_vision.training import train
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.features import encoders
+from surgicai_vision.features.cache import encode
+from surgicai_vision.training import policies
+from surgicai_vision.training.train import train
 
 EPISODE = 100  # transitions an episode: the paper's demonstrations of grasp have 94
 
@@ -51,7 +53,7 @@ def encoder(dim: int) -> Any:
         return generator.normal(size=(len(frames), dim)).astype(np.float32)
 
     about = {"pool": "global", "dim": dim, "shape": (dim,), "fingerprint": f"noise{dim}", "weights_sha256": ""}
-    vars(answer).update(about, card=registry.encoder_card("random"))
+    vars(answer).update(about, card=encoders.encoder_card("random"))
     return answer
 
 
@@ -66,14 +68,14 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="accepted for symmetry; the output is always JSON")
     arguments = parser.parse_args()
     dataset, network = Noise(arguments.transitions, arguments.views), encoder(arguments.dim)
-    recipe = registry.load_recipe("bc", "paper", {"epochs": arguments.epochs})
+    recipe = policies.load_recipe("bc", "paper", {"epochs": arguments.epochs})
     seconds = []
     with tempfile.TemporaryDirectory() as folder:
         features = [encode(dataset, view, network, Path(folder)) for view in dataset.views]
         for repeat in range(arguments.repeats):
             began = time.perf_counter()
             checkpoint = train(
-                dataset, features, registry.policy_plugin("bc"), recipe, seed=repeat, out=Path(folder) / str(repeat)
+                dataset, features, policies.policy_plugin("bc"), recipe, seed=repeat, out=Path(folder) / str(repeat)
             )
             seconds.append(round(time.perf_counter() - began, 2))
     row = {

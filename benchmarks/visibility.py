@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from common import chunks, emit, spread
 
-from surgicai_vision import envs, names
-from surgicai_vision.config import SceneConfig, TaskConfig
+from surgicai_vision import envs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import SceneConfig, TaskConfig
+from surgicai_vision.core.errors import SurgicaiError
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.errors import SurgicaiError
+from surgicai_vision.evaluation.statistics import clopper_pearson
 from surgicai_vision.scene.rendering import FrameRenderer
-from surgicai_vision.statistics import clopper_pearson
 
 TASKS = ("grasp", "place", "insert", "handoff")
 SIZE, PIXELS, GOAL = 224, 25, 0.95

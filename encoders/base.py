@@ -43,8 +43,8 @@ from torch import nn
 
 from encoders.card import EncoderCard, Plugin
 from encoders.folding import fold_batch_norms
-from surgicai_vision.config import digest
-from surgicai_vision.errors import BadFile, InputError, SurgicaiError, check_name
+from surgicai_vision.core.config import digest
+from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
 
 __all__ = [
     "POOLS",

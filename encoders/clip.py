@@ -11,8 +11,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard, Plugin, Released
-from surgicai_vision.errors import BadFile
-from surgicai_vision.files import sha256_file
+from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.files import sha256_file
 
 if TYPE_CHECKING:
     import torch

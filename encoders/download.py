@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from surgicai_vision.errors import BadFile, SurgicaiError
-from surgicai_vision.files import sha256_file
+from surgicai_vision.core.errors import BadFile, SurgicaiError
+from surgicai_vision.core.files import sha256_file
 
 TIMEOUT = 20.0  # without a byte [s]
 FULL_REVISION = re.compile(r"[0-9a-f]{40}")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard
-from surgicai_vision.errors import BadFile, MissingWeights
+from surgicai_vision.core.errors import BadFile, MissingWeights
 
 if TYPE_CHECKING:
     from torch import nn

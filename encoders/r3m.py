@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard, Plugin, Released
-from surgicai_vision.errors import BadFile
+from surgicai_vision.core.errors import BadFile
 
 if TYPE_CHECKING:
     from torch import nn

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard, Plugin
-from surgicai_vision.errors import InputError
+from surgicai_vision.core.errors import InputError
 
 if TYPE_CHECKING:
     from torch import nn

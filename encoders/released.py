@@ -22,8 +22,8 @@ from torch import nn
 
 from encoders.base import best_device, best_dtype
 from encoders.card import EncoderCard, Plugin
-from surgicai_vision.config import Deviations
-from surgicai_vision.errors import BadFile, InputError
+from surgicai_vision.core.config import Deviations
+from surgicai_vision.core.errors import BadFile, InputError
 
 STATISTICS = ("running_mean", "running_var")
 

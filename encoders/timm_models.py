@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard, Plugin
-from surgicai_vision.errors import BadFile, UnknownName
-from surgicai_vision.files import sha256_file
+from surgicai_vision.core.errors import BadFile, UnknownName
+from surgicai_vision.core.files import sha256_file
 
 if TYPE_CHECKING:
     from torch import nn

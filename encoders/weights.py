@@ -18,8 +18,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from encoders.card import EncoderCard
-from surgicai_vision.errors import BadFile, InputError, MissingWeights
-from surgicai_vision.files import cache_root, sha256_file
+from surgicai_vision.core.errors import BadFile, InputError, MissingWeights
+from surgicai_vision.core.files import cache_root, sha256_file
 
 FOLDER_VARIABLE = "SURGICAI_VISION_WEIGHTS"
 NON_COMMERCIAL = "-NC"

@@ -24,9 +24,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from surgicai_vision import names
-from surgicai_vision.config import CLOCK_SIZE, Deviations
-from surgicai_vision.errors import InputError, check_name
+from surgicai_vision.core import names
+from surgicai_vision.core.config import CLOCK_SIZE, Deviations
+from surgicai_vision.core.errors import InputError, check_name
 
 ACTIONS = len(names.ACTION_NAMES)
 VECTORS: Mapping[str, int] = MappingProxyType(

@@ -12,7 +12,7 @@ from torch import nn
 
 from policies.base import ACTIONS, Inputs, Plugin, Policy, Recipe
 from policies.layers import FeatureMLP
-from surgicai_vision import names
+from surgicai_vision.core import names
 
 
 @final

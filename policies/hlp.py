@@ -13,8 +13,8 @@ from torch import nn
 
 from policies.base import Inputs, Plugin, Policy, Recipe
 from policies.layers import FeatureMLP
-from surgicai_vision import names
-from surgicai_vision.errors import InputError
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
 
 AHEAD = 10
 """Frames by which labels are ahead. In our recordings a subtask goes on for 15 frames after its success, while

@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from policies.base import Inputs, Recipe
-from surgicai_vision.errors import InputError
+from surgicai_vision.core.errors import InputError
 
 POINTS = 32  # patterns of a spatial softmax (Levine et al., End-to-end visuomotor policies, JMLR 2016)
 

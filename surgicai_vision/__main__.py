@@ -2,7 +2,7 @@
 
 import sys
 
-from surgicai_vision.cli import main
+from surgicai_vision.commands.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

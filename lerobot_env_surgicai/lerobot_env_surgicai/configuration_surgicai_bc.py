@@ -8,8 +8,10 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.optim import AdamConfig
 from lerobot.utils.constants import OBS_STATE
 
-from surgicai_vision import names, registry
-from surgicai_vision.errors import InputError, check_name
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.features import encoders
+from surgicai_vision.training import policies
 
 
 @PreTrainedConfig.register_subclass("surgicai_bc")
@@ -55,7 +57,7 @@ class SurgicaiBcConfig(PreTrainedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.encoder:
-            registry.check_encoder_name(self.encoder)
+            encoders.check_encoder_name(self.encoder)
         for view in self.views:
             check_name("view", view, names.CAMERAS)
         self.recipe()
@@ -68,7 +70,7 @@ class SurgicaiBcConfig(PreTrainedConfig):
             "proprioception": self.proprioception,
             "learning_rate": self.learning_rate,
         }
-        return registry.load_recipe("bc", "paper", changes)
+        return policies.load_recipe("bc", "paper", changes)
 
     def validate_features(self) -> None:
         """Keep the inputs this policy takes and drop the rest (depth, segmentation, other views).

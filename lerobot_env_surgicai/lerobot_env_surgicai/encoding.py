@@ -9,7 +9,7 @@ from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_ENV_STATE
 
 from lerobot_env_surgicai.pictures import check_identity, encode, load_encoder
-from surgicai_vision import names
+from surgicai_vision.core import names
 
 
 @ProcessorStepRegistry.register("surgicai_encode_views")

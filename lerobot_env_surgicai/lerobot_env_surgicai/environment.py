@@ -23,10 +23,11 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 import surgicai_vision.envs  # noqa: F401  # registers the gymnasium ids
 from lerobot_env_surgicai.encoding import EncodeViews
-from surgicai_vision import names, registry
-from surgicai_vision.config import RandomisationConfig, SceneConfig, TaskConfig, to_mapping
+from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig, to_mapping
+from surgicai_vision.core.errors import check_name
 from surgicai_vision.dataset import open_dataset
-from surgicai_vision.errors import check_name
+from surgicai_vision.features import encoders
 
 AGENT_POS, FEATURES = "agent_pos", "environment_state"
 TASK_FIELDS = tuple(field.name for field in dataclasses.fields(TaskConfig))
@@ -79,7 +80,7 @@ class SurgicaiEnv(EnvConfig):
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(names.ACTION_NAMES),))}
         self.features[AGENT_POS] = PolicyFeature(FeatureType.STATE, (len(names.STATE_NAMES),))
         if self.encoder:
-            dim = len(self.views) * registry.encoder_card(self.encoder).dim
+            dim = len(self.views) * encoders.encoder_card(self.encoder).dim
             self.features[FEATURES] = PolicyFeature(FeatureType.ENV, (dim,))
         else:
             shape = (self.image_size, self.image_size, 3)

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from lerobot_env_surgicai.configuration_surgicai_bc import SurgicaiBcConfig
 from lerobot_env_surgicai.pictures import Remembered, check_identity, encode, identity, load_encoder
-from surgicai_vision import names, registry
-from surgicai_vision.errors import BadFile, InputError
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.training import policies
 
 
 class SurgicaiBcPolicy(PreTrainedPolicy):
@@ -44,7 +45,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
             config.encoder_sha256, config.encoder_identity = self._encoder.weights_sha256, identity(self._encoder)
             self._training_encoder = Remembered(self._encoder)
             visual = (self._encoder.shape,) * len(config.views)
-        self.network = registry.policy_plugin("bc").make(config.recipe(), visual)
+        self.network = policies.policy_plugin("bc").make(config.recipe(), visual)
         self._acting: Any = None
 
     @classmethod

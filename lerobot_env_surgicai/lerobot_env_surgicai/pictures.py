@@ -8,16 +8,17 @@ from typing import Any, final
 import numpy as np
 import torch
 
-from surgicai_vision import names, registry
-from surgicai_vision.checkpoint import SEEN
-from surgicai_vision.config import digest, to_mapping
-from surgicai_vision.errors import InputError
+from surgicai_vision.core import names
+from surgicai_vision.core.config import digest, to_mapping
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.features import encoders
+from surgicai_vision.training.checkpoint import SEEN
 
 
 @functools.lru_cache(maxsize=2)
 def load_encoder(name: str, weights: str | None, pool: str) -> Any:
     """Load a frozen encoder, once a process for each choice."""
-    return registry.load_encoder(name, weights, pool=pool)
+    return encoders.load_encoder(name, weights, pool=pool)
 
 
 def identity(encoder: Any) -> str:

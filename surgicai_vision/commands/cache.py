@@ -8,7 +8,7 @@ from typing import Any
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import one_of, option
-from surgicai_vision.errors import InputError
+from surgicai_vision.core.errors import InputError
 
 EXAMPLE = "surgicai-vision cache list"
 ACTIONS = ("list", "size", "prune")
@@ -29,7 +29,7 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Show the entries, or delete those of no dataset that is kept."""
-    from surgicai_vision.features import default_cache_root, list_cache, prune_cache
+    from surgicai_vision.features.cache import default_cache_root, list_cache, prune_cache
 
     prune = options.action == "prune"
     if not prune and (options.keep or options.all):

@@ -16,7 +16,7 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Print one line a check; the exit code is 1 when something must be mended."""
-    from surgicai_vision.doctor import check
+    from surgicai_vision.commands.doctor_checks import check
 
     checks = check()
     width = max(len(line.name) for line in checks)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
@@ -18,8 +17,9 @@ from surgicai_vision.commands.options import (
     task_config,
     weights_option,
 )
-from surgicai_vision.config import from_mapping
-from surgicai_vision.errors import InputError, UnknownName
+from surgicai_vision.core import names
+from surgicai_vision.core.config import from_mapping
+from surgicai_vision.core.errors import InputError, UnknownName
 
 EXAMPLE = "surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json"
 
@@ -70,8 +70,8 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Evaluate, keep the rows and print the summary."""
-    from surgicai_vision import cells
-    from surgicai_vision.results import MARKER
+    from surgicai_vision.evaluation import run
+    from surgicai_vision.evaluation.storage import MARKER
 
     if options.swap == ALL:
         return _run_swaps(options, console)
@@ -82,7 +82,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     folders.check_folder(out, MARKER)
     title = f"evaluating {subject.name} on {subject.config.task}"
     with console.stage(title, "steps") as progress:
-        result = cells.evaluate_into(out, subject, seeds, options.workers, progress)
+        result = run.evaluate_into(out, subject, seeds, options.workers, progress)
     console.say(summary_line(result))
     console.say(f"episodes: {out}")
     return {**result, "out": str(out)}
@@ -94,13 +94,13 @@ def subject_of(options: Any) -> Any:
     Args:
         options: of this verb, or another's with the same fields (`swap` is this one's alone).
     """
-    from surgicai_vision import agents, lerobot_agent, subjects
+    from surgicai_vision.evaluation import agents, lerobot_agent, policy_spec
 
     folder, swap = Path(options.policy), getattr(options, "swap", None)
     if swap and folder.suffix not in CHAIN_SUFFIXES:
         raise InputError(f"--swap {swap} is for a chain.yaml; leave it out.")
     if options.policy == REPLAY:
-        subject = subjects.replay_subject(folders.open_dataset(options.dataset, options.task or "grasp", ()))
+        subject = policy_spec.replay_subject(folders.open_dataset(options.dataset, options.task or "grasp", ()))
         return _in_env(subject, options.env)
     if options.dataset:
         raise InputError("--dataset is for replay alone; leave it out.")
@@ -108,14 +108,14 @@ def subject_of(options: Any) -> Any:
         return _chain(folder, options, swap)
     if options.policy in agents.BASELINES:
         config = task_config(options.task or "grasp", options.env)
-        return subjects.baseline_subject(options.policy, config)
+        return policy_spec.baseline_subject(options.policy, config)
     if not folder.exists() and folder.parent == Path():
         raise UnknownName("policy or checkpoint folder", options.policy, (*agents.BASELINES, REPLAY))
     lerobot = lerobot_agent.find(folder)
     if lerobot:
         subject = lerobot_agent.subject(lerobot, options.task, options.weights)
     else:
-        subject = subjects.checkpoint_subject(folder, options.weights, options.accept_licence)
+        subject = policy_spec.checkpoint_subject(folder, options.weights, options.accept_licence)
     trained_for = subject.config.task
     if options.task not in (None, trained_for):
         raise InputError(f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out.")
@@ -129,21 +129,21 @@ def _in_env(subject: Any, env: dict[str, Any] | None) -> Any:
 
 def _chain(path: Path, options: Any, swap: str | None = None) -> Any:
     """Say who acts in a chain, in the task suture."""
-    from surgicai_vision import chain, survival
+    from surgicai_vision.evaluation import expert_swap, hierarchical
 
-    config = from_mapping(chain.Chain, read_yaml(path), str(path))
+    config = from_mapping(hierarchical.Chain, read_yaml(path), str(path))
     if options.task not in (None, names.SUTURE):
         raise InputError(f"{path} is a chain of the whole procedure; leave --task {options.task} out.")
     env = {"max_steps": config.max_steps, **options.env} if options.env else None
     if swap != ALL:
-        return _in_env(survival.swapped(config, swap, options.weights, options.accept_licence), env)
-    variants = survival.variants_of(config, options.weights, options.accept_licence)
+        return _in_env(expert_swap.swapped(config, swap, options.weights, options.accept_licence), env)
+    variants = expert_swap.variants_of(config, options.weights, options.accept_licence)
     return {name: _in_env(subject, env) for name, subject in variants.items()}
 
 
 def _run_swaps(options: Options, console: Console) -> dict[str, Any]:
     """Evaluate a chain as it is and with each subtask swapped, and print how far each comes."""
-    from surgicai_vision.survival import AS_IT_IS, CURVES, MARK, survival_curves
+    from surgicai_vision.evaluation.expert_swap import AS_IT_IS, CURVES, MARK, survival_curves
 
     variants = subject_of(options)
     plain = variants[AS_IT_IS]

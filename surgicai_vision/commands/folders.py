@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import files
-from surgicai_vision.errors import BadFile, InputError, check_name
+from surgicai_vision.core import files
+from surgicai_vision.core.errors import BadFile, InputError, check_name
 
 OUTPUTS = Path("outputs")
 CORES = len(os.sched_getaffinity(0))
@@ -67,7 +67,7 @@ def open_dataset(folder: str | None, task: str, views: Sequence[str]) -> Any:
     if not path.exists():
         command = f"surgicai-vision render-demos --task {task} --episodes 50"
         raise BadFile(f"There is no dataset {path}; make it by `{command}`, or give one with --dataset DIR.")
-    from surgicai_vision.dataset.reading import open_dataset as open_folder
+    from surgicai_vision.dataset.reader import open_dataset as open_folder
 
     dataset = open_folder(path)
     for view in views:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import config_only, one_of, option
-from surgicai_vision.demos.bag_config import CONVENTIONS, SEGMENTATIONS, BagConfig, Topics, bags_in, is_bag
-from surgicai_vision.errors import BadFile, InputError, check_name
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import BadFile, InputError, check_name
+from surgicai_vision.demos.imports.rosbag.config import CONVENTIONS, SEGMENTATIONS, BagConfig, Topics, bags_in, is_bag
 
 EXAMPLE = "surgicai-vision import-demos regrasp_all_episodes_merged.pkl --task handoff --out outputs/demos/surgicai"
 ROLES = tuple(field.name for field in dataclasses.fields(Topics))
@@ -69,7 +69,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
 
 def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str, Any]:
-    from surgicai_vision.demos.importing import import_demos
+    from surgicai_vision.demos.imports.surgicai import import_demos
 
     if options.task is None:
         raise InputError(f"import-demos needs --task: the file does not say it; one of {', '.join(names.SUBTASKS)}.")
@@ -91,7 +91,7 @@ def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str
 
 
 def _import_bags(path: Path, options: Options, console: Console) -> dict[str, Any]:
-    from surgicai_vision.demos.bag_import import import_bags
+    from surgicai_vision.demos.imports.rosbag.importer import import_bags
 
     bags = bags_in(path)
     if not bags:

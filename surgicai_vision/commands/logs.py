@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision.errors import InputError
+from surgicai_vision.core.errors import InputError
 
 LOGS = ("auto", "tensorboard", "wandb", "none")
 """`auto` is TensorBoard where it is installed. Nothing is sent anywhere unless `wandb` is asked for."""

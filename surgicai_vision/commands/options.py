@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from surgicai_vision.config import TaskConfig, from_mapping
-from surgicai_vision.errors import BadFile, InputError, UnknownName, check_name
+from surgicai_vision.core.config import TaskConfig, from_mapping
+from surgicai_vision.core.errors import BadFile, InputError, UnknownName, check_name
 
 T = TypeVar("T")
 Check = Callable[[str, Any], None]
@@ -138,7 +138,7 @@ def executor_option() -> Any:
 
 
 def weights_option() -> Any:
-    """Declare `weights`: the files of pretrained weights; `registry.weights_of` reads it."""
+    """Declare `weights`: the files of pretrained weights; `encoders.weights_of` reads it."""
     return option(
         None,
         "file with the encoder's pretrained weights; NAME=FILE for the encoder NAME alone, once for each encoder",

@@ -4,12 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names, registry
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import many_of, not_negative, one_of, option, weights_option
-from surgicai_vision.errors import InputError
-from surgicai_vision.files import check_output, write_json
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.files import check_output, write_json
+from surgicai_vision.features import encoders
 
 EXAMPLE = "surgicai-vision probe --task grasp --encoder imagenet-lite,random --view front,back"
 RESULT = "probe.json"
@@ -17,9 +18,9 @@ RESULT = "probe.json"
 
 def _check_encoders(name: str, given: tuple[str, ...]) -> None:
     if not given:
-        raise InputError(f"{name} is empty; name at least one of {registry.encoder_choices()}.")
+        raise InputError(f"{name} is empty; name at least one of {encoders.encoder_choices()}.")
     for encoder in given:
-        registry.check_encoder_name(encoder)
+        encoders.check_encoder_name(encoder)
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Options:
     dataset: str | None = option(None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>")
     encoder: tuple[str, ...] = option(
         ("imagenet-lite",),
-        f"encoders, a comma list of {registry.encoder_choices()}",
+        f"encoders, a comma list of {encoders.encoder_choices()}",
         check=_check_encoders,
         metavar="NAME[,NAME]",
     )
@@ -42,7 +43,7 @@ class Options:
     )
     weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
-    pool: str = option("global", f"what is taken: {', '.join(registry.POOLS)}", check=one_of("pool", registry.POOLS))
+    pool: str = option("global", f"what is taken: {', '.join(encoders.POOLS)}", check=one_of("pool", encoders.POOLS))
     seed: int = option(0, "seed of the folds and of the intervals", check=not_negative)
     out: str | None = option(
         None, f"folder for {RESULT}; an earlier one is replaced", metavar="DIR",
@@ -55,7 +56,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     if not options.view:
         raise InputError("--view is empty; name at least one view.")
     for encoder in options.encoder:
-        registry.find_weights(encoder, options.weights, options.accept_licence)
+        encoders.find_weights(encoder, options.weights, options.accept_licence)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
     label = "-".join((dataset.task, "+".join(options.encoder).replace(":", "-"), "+".join(options.view)))
     out = Path(options.out) if options.out else folders.OUTPUTS / "probes" / label
@@ -69,10 +70,10 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
 def _rows(options: Options, name: str, dataset: Any, console: Console) -> list[dict[str, Any]]:
     """Encode what is not at hand and probe one encoder's views."""
-    from surgicai_vision.features import encode
-    from surgicai_vision.probe import probe
+    from surgicai_vision.features.cache import encode
+    from surgicai_vision.features.probe import probe
 
-    encoder = registry.load_encoder(name, options.weights, options.pool, options.accept_licence)
+    encoder = encoders.load_encoder(name, options.weights, options.pool, options.accept_licence)
     entries = {}
     for view in options.view:
         with console.stage(f"features: {name}, {view}", "frames") as progress:

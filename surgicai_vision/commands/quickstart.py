@@ -4,18 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import (
-    config_only,
-    many_of,
-    not_negative,
-    one_of,
-    option,
-    positive,
-)
-from surgicai_vision.quickstart import PolicyChoice, Quickstart
+from surgicai_vision.commands.options import config_only, many_of, not_negative, one_of, option, positive
+from surgicai_vision.core import names
+from surgicai_vision.experiments.quickstart import PolicyChoice, Quickstart
 
 EXAMPLE = "surgicai-vision quickstart"
 
@@ -41,7 +34,7 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Run it, print the table and say where the page is."""
-    from surgicai_vision.quickstart import run_quickstart
+    from surgicai_vision.experiments.quickstart import run_quickstart
 
     result = run_quickstart(plan_of(options), Path(options.out), console.stage, options.workers)
     console.say()

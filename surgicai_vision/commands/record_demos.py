@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
@@ -18,8 +17,9 @@ from surgicai_vision.commands.options import (
     share,
     task_config,
 )
-from surgicai_vision.config import TaskConfig
-from surgicai_vision.errors import InputError
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError
 
 EXAMPLE = "surgicai-vision record-demos --task grasp --episodes 50"
 
@@ -66,11 +66,11 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Record and say where the demonstrations are."""
+    from surgicai_vision.core.executor import Engine
     from surgicai_vision.demos.record import record
-    from surgicai_vision.demos.rolling import Disturbance
+    from surgicai_vision.demos.rollout import Disturbance
     from surgicai_vision.demos.store import MARKER, read_marker
-    from surgicai_vision.executor import Engine
-    from surgicai_vision.statistics import clopper_pearson
+    from surgicai_vision.evaluation.statistics import clopper_pearson
 
     if options.noise_from is not None and options.noise_from > options.noise:
         raise InputError(f"--noise-from is {options.noise_from:g}; it must be at most --noise, {options.noise:g}.")
@@ -114,7 +114,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
 def _learner(folder: Path, config: TaskConfig) -> Any:
     """Return the learner that drives."""
-    from surgicai_vision.dagger import learner_of
+    from surgicai_vision.experiments.dagger import learner_of
 
     return learner_of(folder, config)
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names
 from surgicai_vision.commands import folders, record_demos
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
@@ -19,7 +18,8 @@ from surgicai_vision.commands.options import (
     picture_size,
     positive,
 )
-from surgicai_vision.errors import InputError
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
 
 CODECS = ("h264", "av1")
 EXAMPLE = "surgicai-vision render-demos --task grasp --episodes 50 --view front,back --depth"
@@ -70,8 +70,8 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Record where that is asked for, render, and say where the dataset is."""
+    from surgicai_vision.core.executor import Engine
     from surgicai_vision.dataset import render_demos
-    from surgicai_vision.executor import Engine
 
     engine = Engine(options.executor, options.address)
     if options.demos and (options.task or options.episodes or options.env):

@@ -8,7 +8,7 @@ from typing import Any
 
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import not_negative, option
-from surgicai_vision.errors import BadFile, SurgicaiError
+from surgicai_vision.core.errors import BadFile, SurgicaiError
 
 EXAMPLE = "surgicai-vision report outputs/quickstart"
 STRIPS = 160
@@ -54,10 +54,10 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
 def _cells(folder: Path, console: Console) -> Sequence[Mapping[str, Any]]:
     """Return every cell of the sweep in `folder` with its state; nothing where it is no sweep, or not one of ours."""
-    from surgicai_vision.config import from_mapping, to_mapping
-    from surgicai_vision.files import read_json
+    from surgicai_vision.core.config import from_mapping, to_mapping
+    from surgicai_vision.core.files import read_json
+    from surgicai_vision.experiments.sweep import Grid, plan
     from surgicai_vision.report import GRID_FILE
-    from surgicai_vision.sweep import Grid, plan
 
     path = folder / GRID_FILE
     if not path.exists():

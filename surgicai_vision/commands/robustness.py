@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.evaluate import subject_of
@@ -18,7 +17,8 @@ from surgicai_vision.commands.options import (
     positive,
     weights_option,
 )
-from surgicai_vision.robustness import AXES, CURVES, MARK, STRENGTHS, robustness
+from surgicai_vision.core import names
+from surgicai_vision.evaluation.robustness import AXES, CURVES, MARK, STRENGTHS, robustness
 
 EXAMPLE = (
     "surgicai-vision robustness outputs/train/grasp-imagenet-lite-front-seed0 --axis light,blur --strength 0,0.5,1"

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
@@ -16,7 +15,8 @@ from surgicai_vision.commands.options import (
     picture_size,
     task_config,
 )
-from surgicai_vision.errors import InputError
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
 
 EXAMPLE = "surgicai-vision scene --task grasp --seed 0 --sheet sheet.png"
 QUALITIES = ("fast", "high")
@@ -43,9 +43,10 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Roll the expert once and draw the start and the end as every camera sees them."""
-    from surgicai_vision import pictures, subjects
-    from surgicai_vision.evaluation import evaluate
-    from surgicai_vision.provenance import provenance
+    from surgicai_vision.envs import contact_sheet
+    from surgicai_vision.evaluation import policy_spec
+    from surgicai_vision.evaluation.provenance import provenance
+    from surgicai_vision.evaluation.rollout import evaluate
 
     if options.film:
         return _film(options, console)
@@ -55,17 +56,20 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         raise InputError(f"--view is empty; give some of {', '.join(names.CAMERAS)}.")
     folders.check_file(path, "--sheet", (".png", ".jpg", ".pdf", ".svg"))
     with console.stage(f"rolling the expert of {options.task}", "steps") as progress:
-        episode = evaluate(subjects.expert, config, [options.seed], workers=1, progress=progress)[0]
+        episode = evaluate(policy_spec.expert, config, [options.seed], workers=1, progress=progress)[0]
     moments = {"start": episode.film.states[0], f"end, step {episode.row.steps}": episode.film.states[-1]}
     shown = [(moment, modality) for moment in moments for modality in names.MODALITIES]
     rows, total = [], len(options.view)
-    with console.stage("rendering", "views") as progress, pictures.stage(config, options.size, options.quality) as see:
+    with (
+        console.stage("rendering", "views") as progress,
+        contact_sheet.stage(config, options.size, options.quality) as see,
+    ):
         for done, view in enumerate(options.view):
             rows.append((view, [see(moments[moment], view, modality) for moment, modality in shown]))
             progress(done + 1, total)
     outcome = "success" if episode.row.success else f"failure ({episode.row.failure})"
     title = f"{options.task}, seed {options.seed}: the expert's episode, {outcome} after {episode.row.steps} steps"
-    figure = pictures.sheet(rows, [f"{moment}: {modality}" for moment, modality in shown], title)
+    figure = contact_sheet.sheet(rows, [f"{moment}: {modality}" for moment, modality in shown], title)
     figure.savefig(path, dpi=140)
     console.say(f"sheet: {path}")
     return {
@@ -81,23 +85,24 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
 def _film(options: Options, console: Console) -> dict[str, Any]:
     """Draw a row of moments for every subtask: the expert's episode from the seed, as the first view sees it."""
-    from surgicai_vision import pictures, subjects
-    from surgicai_vision.evaluation import evaluate
+    from surgicai_vision.envs import contact_sheet
+    from surgicai_vision.evaluation import policy_spec
+    from surgicai_vision.evaluation.rollout import evaluate
 
     path, rows, outcomes = Path(options.film or ""), [], {}
     folders.check_file(path, "--film", (".png", ".jpg", ".pdf", ".svg"))
     with console.stage("filming", "subtasks") as progress:
         for done, subtask in enumerate(names.SUBTASKS):
             config = task_config(subtask, options.env)
-            episode = evaluate(subjects.expert, config, [options.seed], workers=1)[0]
+            episode = evaluate(policy_spec.expert, config, [options.seed], workers=1)[0]
             last = len(episode.film.states) - 1
             moments = [episode.film.states[round(last * share / (FILM_FRAMES - 1))] for share in range(FILM_FRAMES)]
-            with pictures.stage(config, options.size, options.quality) as see:
+            with contact_sheet.stage(config, options.size, options.quality) as see:
                 rows.append((subtask, [see(state, options.view[0], names.RGB) for state in moments]))
             outcomes[subtask] = {"success": episode.row.success, "steps": episode.row.steps}
             progress(done + 1, len(names.SUBTASKS))
     columns = [f"{share / (FILM_FRAMES - 1):.0%} of the episode" for share in range(FILM_FRAMES)]
-    figure = pictures.sheet(rows, columns, f"the scripted expert, seed {options.seed}, seen by {options.view[0]}")
+    figure = contact_sheet.sheet(rows, columns, f"the scripted expert, seed {options.seed}, seen by {options.view[0]}")
     figure.savefig(path, dpi=110)
     console.say(f"film: {path}")
     return {"film": str(path), "view": options.view[0], "seed": options.seed, "subtasks": outcomes}

@@ -8,10 +8,10 @@ from typing import Any
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import address_option, executor_option, option, positive, read_yaml
-from surgicai_vision.config import from_mapping
-from surgicai_vision.errors import BadFile, UnknownName
-from surgicai_vision.files import configs_folder
-from surgicai_vision.sweep import AXES, Choice, Grid
+from surgicai_vision.core.config import from_mapping
+from surgicai_vision.core.errors import BadFile, UnknownName
+from surgicai_vision.core.files import configs_folder
+from surgicai_vision.experiments.sweep import AXES, Choice, Grid
 
 EXAMPLE = "surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/smoke --json"
 
@@ -42,8 +42,8 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Run the sweep, or list its cells."""
-    from surgicai_vision.executor import Engine
-    from surgicai_vision.sweep import read_choice, run_sweep
+    from surgicai_vision.core.executor import Engine
+    from surgicai_vision.experiments.sweep import read_choice, run_sweep
 
     path = grid_file(options.grid)
     grid = read_grid(path)
@@ -62,7 +62,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
 def _list(grid: Grid, out: Path, choice: Choice, workers: int, console: Console) -> dict[str, Any]:
     """Say what each cell is, and how long the rest takes."""
-    from surgicai_vision.sweep import STATES, estimate, plan
+    from surgicai_vision.experiments.sweep import STATES, estimate, plan
 
     states = plan(grid, out, choice)
     for state in states:

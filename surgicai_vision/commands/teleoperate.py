@@ -4,20 +4,12 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import (
-    config_only,
-    many_of,
-    not_negative,
-    one_of,
-    option,
-    positive,
-    task_config,
-)
-from surgicai_vision.config import TaskConfig
-from surgicai_vision.errors import InputError
+from surgicai_vision.commands.options import config_only, many_of, not_negative, one_of, option, positive, task_config
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.teleoperation.keyboard import key_table
 
 EXAMPLE = "surgicai-vision teleoperate --task grasp --web"
@@ -95,11 +87,11 @@ class Options:
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Let a person record and say what was kept."""
     from surgicai_vision import envs
-    from surgicai_vision.teleoperation.driving import Views, drive
-    from surgicai_vision.teleoperation.pacing import Pacer
+    from surgicai_vision.teleoperation.input_mapping import Steering
+    from surgicai_vision.teleoperation.loop import Views, drive
+    from surgicai_vision.teleoperation.pacer import Pacer
     from surgicai_vision.teleoperation.recordings import open_recordings
     from surgicai_vision.teleoperation.session import Rules, Session
-    from surgicai_vision.teleoperation.steering import Steering
 
     if not options.view:
         raise InputError("--view is empty; name at least one view.")

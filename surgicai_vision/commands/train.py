@@ -4,13 +4,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names, registry
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.logs import LOGS, open_log
 from surgicai_vision.commands.options import many_of, not_negative, one_of, option, positive, weights_option
-from surgicai_vision.config import DEVIATIONS
-from surgicai_vision.errors import InputError
+from surgicai_vision.core import names
+from surgicai_vision.core.config import DEVIATIONS
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.features import encoders
+from surgicai_vision.training import policies
 
 EXAMPLE = "surgicai-vision train --encoder random --view back"
 NO_ENCODER, STATE = "none", "state"
@@ -19,7 +21,7 @@ NO_ENCODER, STATE = "none", "state"
 
 def _check_encoder(name: str, given: str) -> None:
     if given not in (NO_ENCODER, STATE):
-        registry.check_encoder_option(name, given)
+        encoders.check_encoder_option(name, given)
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Options:
     )
     encoder: str = option(
         "imagenet-lite",
-        f"one of {registry.encoder_choices()}; none for proprioception alone, state for the state with the goal",
+        f"one of {encoders.encoder_choices()}; none for proprioception alone, state for the state with the goal",
         check=_check_encoder,
     )
     view: tuple[str, ...] | None = option(
@@ -48,9 +50,9 @@ class Options:
     )
     weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
-    pool: str = option("global", f"what is taken: {', '.join(registry.POOLS)}", check=one_of("pool", registry.POOLS))
-    policy: str = option("bc", f"one of {', '.join(registry.POLICIES)}", check=one_of("policy", registry.POLICIES))
-    recipe: str = option("paper", f"the policy's recipe: {', '.join(registry.recipe_names())}, or FILE.yaml")
+    pool: str = option("global", f"what is taken: {', '.join(encoders.POOLS)}", check=one_of("pool", encoders.POOLS))
+    policy: str = option("bc", f"one of {', '.join(policies.POLICIES)}", check=one_of("policy", policies.POLICIES))
+    recipe: str = option("paper", f"the policy's recipe: {', '.join(policies.recipe_names())}, or FILE.yaml")
     deviation: tuple[str, ...] | None = option(
         None,
         f"what to do as the released code did, a comma list of {', '.join(DEVIATIONS)}",
@@ -86,8 +88,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     """Encode what is not at hand, train and say where the checkpoint is."""
     encoder = None if options.encoder in (NO_ENCODER, STATE) else options.encoder
     if encoder:
-        registry.find_weights(encoder, options.weights, options.accept_licence)
-    from surgicai_vision.cells import Cell, train_cell
+        encoders.find_weights(encoder, options.weights, options.accept_licence)
+    from surgicai_vision.experiments.run import Cell, train_cell
 
     task = names.SUTURE if options.subtask else options.task
     cell = Cell(
@@ -103,13 +105,13 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         deviations=options.deviation,
         change=options.change or (),
     )
-    registry.load_recipe(cell.policy, cell.recipe, cell.changes)
+    policies.load_recipe(cell.policy, cell.recipe, cell.changes)
     label = f"{options.subtask}-of-{task}" if options.subtask else task
     out = Path(options.out) if options.out else folders.train_folder(label, cell.name, cell.seed)
     folders.check_folder(out, "training.json")
     dataset = folders.open_dataset(options.dataset, task, cell.view)
     if options.subtask:
-        from surgicai_vision.dataset.subtask import subtask_of
+        from surgicai_vision.dataset.subtask_frames import subtask_of
 
         dataset = subtask_of(dataset, options.subtask)
     cell = replace(cell, task=dataset.task)

@@ -7,11 +7,11 @@ own metadata writer, `reading` opens a dataset without torch, `checking` verifie
 the longest verified prefix of a broken one, `viewing` makes one of fewer views or of videos.
 """
 
-from surgicai_vision.dataset.checking import CheckReport, check_dataset
-from surgicai_vision.dataset.reading import Dataset, open_dataset
-from surgicai_vision.dataset.rendering import render_demos
-from surgicai_vision.dataset.repairing import Repair, repair_dataset
-from surgicai_vision.dataset.viewing import DatasetSummary, view_dataset
+from surgicai_vision.dataset.convert import DatasetSummary, view_dataset
+from surgicai_vision.dataset.reader import Dataset, open_dataset
+from surgicai_vision.dataset.render import render_demos
+from surgicai_vision.dataset.validate.check import CheckReport, check_dataset
+from surgicai_vision.dataset.validate.repair import Repair, repair_dataset
 
 __all__ = [
     "CheckReport",

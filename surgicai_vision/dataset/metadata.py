@@ -18,9 +18,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from surgicai_vision import names
-from surgicai_vision.dataset.statistics import Statistics
-from surgicai_vision.files import write_json
+from surgicai_vision.core import names
+from surgicai_vision.core.files import write_json
+from surgicai_vision.dataset.stats import Statistics
 
 CODEBASE_VERSION = "v3.0"
 FILES_PER_CHUNK, DATA_FILE_MB, VIDEO_FILE_MB = 1000, 100, 200

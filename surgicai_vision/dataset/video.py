@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from surgicai_vision.errors import BadFile
+from surgicai_vision.core.errors import BadFile
 
 CODECS = MappingProxyType(
     {

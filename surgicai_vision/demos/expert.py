@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.control import StepSize
@@ -27,7 +28,6 @@ from surgicai_vision.envs.geometry import (
     Stitch,
     grasp_in_needle,
 )
-from surgicai_vision.errors import InputError
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.holes import SURFACE
 from surgicai_vision.scene.rotations import matrix_to_rotvec, rotvec_to_matrix

@@ -5,7 +5,7 @@
 Seeds are taken in order from the first one; a seed at which the expert fails is written down as skipped in
 `demos.json` and the next one is taken, so what is kept depends on the seeds alone. The same command
 continues a run that was killed (the finished episodes lie in `<out>.work` until the folder is complete) and
-does nothing when it is complete. How an episode goes is in `surgicai_vision.demos.rolling`.
+does nothing when it is complete. How an episode goes is in `surgicai_vision.demos.rollout`.
 """
 
 import dataclasses
@@ -19,19 +19,19 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from surgicai_vision import names
-from surgicai_vision.config import TaskConfig, from_mapping, to_mapping
-from surgicai_vision.demos.rolling import CALM, Disturbance, Driver, roll
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, check_name
+from surgicai_vision.core.executor import LOCAL, Engine, Job, Progress, building, run, work_folder
+from surgicai_vision.core.files import check_output, code_version, read_json, sha256_file, whole_folder, write_json
+from surgicai_vision.demos.rollout import CALM, Disturbance, Driver, roll
 from surgicai_vision.demos.store import MARKER, list_demos, read_demo, read_marker, write_demo, write_marker
-from surgicai_vision.errors import InputError, OutputExists, SurgicaiError, check_name
-from surgicai_vision.executor import LOCAL, Engine, Job, Progress, building, run, work_folder
-from surgicai_vision.files import check_output, code_version, read_json, sha256_file, whole_folder, write_json
 
 SOURCES: Mapping[str, str] = MappingProxyType(
     {
         "expert": "surgicai_vision.demos.expert:Expert",
-        "dmp": "surgicai_vision.demos.imitator:Imitator",
-        "search": "surgicai_vision.demos.searching:Searcher",
+        "dmp": "surgicai_vision.demos.dmp.controller:Imitator",
+        "search": "surgicai_vision.demos.search_expert:Searcher",
     }
 )
 """Source → "module:class" of what acts; built as `class(env)`, or as `class(env, demos)` where it is `TAUGHT`."""

@@ -17,10 +17,10 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from surgicai_vision import names
-from surgicai_vision.config import TaskConfig, digest, from_mapping, to_mapping
-from surgicai_vision.errors import BadFile, InputError
-from surgicai_vision.files import read_json, sha256_file, write_bytes, write_json
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, digest, from_mapping, to_mapping
+from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.core.files import read_json, sha256_file, write_bytes, write_json
 
 FORMAT, VERSION = "surgicai-vision-demos", 1
 MARKER = "demos.json"

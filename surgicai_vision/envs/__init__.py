@@ -9,8 +9,9 @@ from typing import Any
 
 import gymnasium
 
-from surgicai_vision import names
-from surgicai_vision.config import RandomisationConfig, SceneConfig, TaskConfig, from_mapping
+from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig, from_mapping
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.grasp import Grasp
 from surgicai_vision.envs.handoff import Handoff
@@ -20,7 +21,6 @@ from surgicai_vision.envs.place import Place
 from surgicai_vision.envs.pullout import Pullout
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.envs.suture import Suture
-from surgicai_vision.errors import InputError
 
 __all__ = ["SUBTASKS", "SuturingEnv", "make", "make_task"]
 
@@ -74,7 +74,7 @@ for _task, _id in names.ENV_IDS.items():
         gymnasium.register(
             id=_id,
             entry_point="surgicai_vision.envs:make_task",
-            vector_entry_point="surgicai_vision.envs.vectorised:make_vector",
+            vector_entry_point="surgicai_vision.envs.vector_env:make_vector",
             kwargs={"task": _task},
             order_enforce=True,
             disable_env_checker=False,

@@ -6,7 +6,7 @@ it goes when the jaw opens. Only scenes of this level have the welds; the defaul
 
 import mujoco
 
-from surgicai_vision import names
+from surgicai_vision.core import names
 from surgicai_vision.envs import poses
 from surgicai_vision.scene.kinematics import Pose
 from surgicai_vision.scene.rotations import matrix_to_quaternion_flat

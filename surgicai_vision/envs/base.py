@@ -18,17 +18,17 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision import names
-from surgicai_vision.config import TaskConfig
-from surgicai_vision.envs import observation, passage, poses, randomisation
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError, PhysicsError
+from surgicai_vision.envs import hole_crossing, observation, poses, randomisation
+from surgicai_vision.envs.camera_rig import Pictures
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.observation import ObservationConfig
-from surgicai_vision.envs.pictures import Pictures
 from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.envs.success import Info, Target, measure, meets_demands
-from surgicai_vision.errors import InputError, PhysicsError
 from surgicai_vision.scene import build_scene, needle
 
 START_DRAWS = 60
@@ -109,7 +109,7 @@ class SuturingEnv(gymnasium.Env):
                 break
         else:
             raise PhysicsError(f"No start of '{self.config.task}' was physical in {START_DRAWS} draws.")
-        passage.remember_tip(simulation, simulation.memory)
+        hole_crossing.remember_tip(simulation, simulation.memory)
         self._remember_tool()
         info = self.measure()
         if axes.on:
@@ -124,7 +124,7 @@ class SuturingEnv(gymnasium.Env):
         simulation.keep_reads()
         memory.steps += 1.0
         self._add_path(subtask.arm)
-        passage.watch(simulation, memory, self.stitch.pair)
+        hole_crossing.watch(simulation, memory, self.stitch.pair)
         target = subtask.target(simulation, self.stitch)
         info = measure(simulation, subtask, self.stitch, self.config.tolerance, target)
         if self._progress(info):

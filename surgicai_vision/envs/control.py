@@ -12,8 +12,8 @@ cost more than the physics saves.
 import math
 from typing import NamedTuple
 
-from surgicai_vision.config import STEPS
-from surgicai_vision.errors import UnreachablePose
+from surgicai_vision.core.config import STEPS
+from surgicai_vision.core.errors import UnreachablePose
 from surgicai_vision.scene.kinematics import Joints, Pose, inverse_flat
 from surgicai_vision.scene.rotations import multiply_flat, rotvec_to_matrix_flat
 

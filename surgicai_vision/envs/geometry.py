@@ -29,8 +29,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.envs import poses
-from surgicai_vision.names import PSM1, PSM2
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.arm import GRASP_DEPTH, PAD_WIDTH
 from surgicai_vision.scene.holes import HolePair

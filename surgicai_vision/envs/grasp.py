@@ -6,12 +6,12 @@ from types import MappingProxyType
 
 import numpy as np
 
+from surgicai_vision.core.names import PSM2
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import Stitch, grasp_in_needle
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import GRASP_ANGLES
 from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
-from surgicai_vision.names import PSM2
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.arm import GRASP_DEPTH
 from surgicai_vision.scene.kinematics import Pose

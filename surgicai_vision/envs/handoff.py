@@ -5,6 +5,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.envs.geometry import HANDOFF_ANGLE, Stitch
 from surgicai_vision.envs.grasp import grasp_goal
 from surgicai_vision.envs.insert import draw_in_ball
@@ -12,7 +13,6 @@ from surgicai_vision.envs.place import draw_psm2_grasp
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import about_point, draw_rotation, hold_needle
 from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
-from surgicai_vision.names import PSM1, PSM2
 from surgicai_vision.scene.kinematics import Pose
 
 DRIVEN = (0.0, 0.002)

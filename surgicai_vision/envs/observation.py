@@ -22,9 +22,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from surgicai_vision import names
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.envs import poses
-from surgicai_vision.errors import InputError, check_name
 from surgicai_vision.scene.kinematics import STARTS, Pose
 from surgicai_vision.scene.rotations import (
     GIMBAL,

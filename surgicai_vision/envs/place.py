@@ -5,13 +5,13 @@ from types import MappingProxyType
 
 import numpy as np
 
+from surgicai_vision.core.names import PSM2
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import Stitch, needle_frame_flat
 from surgicai_vision.envs.grasp import lying_needle
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import GRASP_ANGLES, SAFE_ANGLES, draw_grasp_error, grasp_pose, hold_needle
 from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
-from surgicai_vision.names import PSM2
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.kinematics import Pose
 

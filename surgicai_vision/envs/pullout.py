@@ -5,6 +5,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import HANDOFF_ANGLE, Stitch, needle_frame_flat
 from surgicai_vision.envs.handoff import STRAIGHT, inserted_needle
@@ -12,7 +13,6 @@ from surgicai_vision.envs.place import draw_psm2_grasp
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import draw_grasp_error, grasp_pose, hold_needle
 from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
-from surgicai_vision.names import PSM1, PSM2
 from surgicai_vision.scene.kinematics import Pose
 
 GRASP_SHIFT, GRASP_TILT = 0.0015, math.radians(20.0)

@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision import names
-from surgicai_vision.config import RandomisationConfig
+from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig
 from surgicai_vision.scene import Scene, needle
 from surgicai_vision.scene.holes import Hole, HolePair
 from surgicai_vision.scene.rotations import matrix_to_quaternion, quaternion_to_matrix, rotvec_to_matrix

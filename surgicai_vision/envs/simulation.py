@@ -21,13 +21,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision import names
-from surgicai_vision.config import LATENCY_LIMIT
+from surgicai_vision.core import names
+from surgicai_vision.core.config import LATENCY_LIMIT
+from surgicai_vision.core.errors import InputError, UnreachablePose
 from surgicai_vision.envs import attach, control, poses, randomisation
 from surgicai_vision.envs.attach import Welds
 from surgicai_vision.envs.control import Command, StepSize
-from surgicai_vision.envs.memory import Memory
-from surgicai_vision.errors import InputError, UnreachablePose
+from surgicai_vision.envs.task_state import Memory
 from surgicai_vision.scene import Scene, kinematics, needle
 from surgicai_vision.scene.arm import GRASP_DEPTH
 from surgicai_vision.scene.kinematics import Pose

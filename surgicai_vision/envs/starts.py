@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision.core.errors import UnreachablePose
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import FIRST_GRASP, grasp_in_needle
 from surgicai_vision.envs.simulation import Simulation
-from surgicai_vision.errors import UnreachablePose
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.arm import GRASP_DEPTH, PAD_OFFSET
 from surgicai_vision.scene.rotations import rotvec_to_matrix

@@ -12,7 +12,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from surgicai_vision import names
+from surgicai_vision.core import names
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.scene.kinematics import Pose

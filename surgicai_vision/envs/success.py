@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.envs import passage, poses
+from surgicai_vision.envs import hole_crossing, poses
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.subtask import Subtask
@@ -50,9 +50,9 @@ def _meets_demands(simulation: Simulation, subtask: Subtask, stitch: Stitch, pre
     demands, passed = subtask.demands[preset], simulation.memory.passed
     if demands.contact and not contact:
         return False
-    if demands.holes and not (passed >= demands.holes and passage.in_both(simulation, stitch.pair)):
+    if demands.holes and not (passed >= demands.holes and hole_crossing.in_both(simulation, stitch.pair)):
         return False
-    return not demands.out or (passed == passage.OUT and passage.is_out(simulation, stitch.pair))
+    return not demands.out or (passed == hole_crossing.OUT and hole_crossing.is_out(simulation, stitch.pair))
 
 
 def _slip(simulation: Simulation, arm: str, contact: bool) -> NDArray[np.float64]:

@@ -6,10 +6,10 @@ it finished. When the pull-out begins PSM2 lets go by itself, as in the released
 another subtask by `begin`.
 """
 
-from surgicai_vision.config import DWELL
+from surgicai_vision.core.config import DWELL
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.envs.base import Info, SuturingEnv
 from surgicai_vision.envs.simulation import RELEASE_STEPS
-from surgicai_vision.errors import InputError
 
 PULLOUT_PHASE = 4
 

@@ -12,13 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import files
-from surgicai_vision.report import films, page, show
+from surgicai_vision.core import files
+from surgicai_vision.report import figures, filmstrips, page
 from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import group
-from surgicai_vision.report.origin import commands, origin
 from surgicai_vision.report.pairs import compare
-from surgicai_vision.report.reading import GRID_FILE, REFERENCES, RUN_FILE, Result, collect, read_results
+from surgicai_vision.report.provenance import commands, origin
+from surgicai_vision.report.reader import GRID_FILE, REFERENCES, RUN_FILE, Result, collect, read_results
 from surgicai_vision.report.tables import write_changed, write_tables
 
 __all__ = ["GRID_FILE", "REFERENCES", "RUN_FILE", "Result", "collect", "read_results", "write_report"]
@@ -33,7 +33,7 @@ def write_report(
     progress: Progress | None = None,
     *,
     cells: Sequence[Mapping[str, Any]] = (),
-    strips: int = films.MOST_STRIPS,
+    strips: int = filmstrips.MOST_STRIPS,
 ) -> Path:
     """Write the page and the tables of the results below `folder`; return the page's path.
 
@@ -53,11 +53,11 @@ def write_report(
     pairs = compare(groups)
     title = collected.run.get("title", folder.resolve().name)
     report(1, strips + 3)
-    reel = films.make_reel(groups, strips, lambda done, total: report(1 + done, total + 3))
+    reel = filmstrips.make_reel(groups, strips, lambda done, total: report(1 + done, total + 3))
     filled = {
         **page.numbers(collected, groups, pairs),
         **origin(collected, groups),
-        **show.static_pictures(groups, reel),
+        **figures.static_pictures(groups, reel),
         "details": page.details(groups, reel, {str(r.folder): commands(r, collected.run) for r in collected.results}),
         "footer": page.footer(collected),
         "title": title,

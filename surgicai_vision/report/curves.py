@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 
 from markupsafe import Markup
 
-from surgicai_vision import names, statistics
+from surgicai_vision.core import names
+from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Point, Series
-from surgicai_vision.report.condition import Condition
+from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.groups import Group
 
 MOST = len(charts.COLOURS)

@@ -9,9 +9,9 @@ from markupsafe import Markup
 
 from surgicai_vision.report import text
 from surgicai_vision.report.charts import KIND_COLOURS
-from surgicai_vision.report.films import Reel, Strip
+from surgicai_vision.report.filmstrips import Reel, Strip
 from surgicai_vision.report.groups import MEASURES, Group
-from surgicai_vision.report.reading import Result
+from surgicai_vision.report.reader import Result
 
 LETTERS = {"": "s", "missed": "m", "dropped": "d", "wrong_hole": "w", "time": "t", "physics": "p", "error": "e"}
 """Outcome of an episode → its letter in the page's data."""
@@ -70,7 +70,7 @@ def group_details(
 
 def _cell(result: Result, commands: Sequence[str]) -> dict[str, Any]:
     """Return one training seed: counts, episodes in short form, facts."""
-    from surgicai_vision.statistics import clopper_pearson
+    from surgicai_vision.evaluation.statistics import clopper_pearson
 
     rows, k = result.rows, sum(bool(row["success"]) for row in result.rows)
     return {

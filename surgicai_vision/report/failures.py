@@ -4,8 +4,9 @@ import base64
 import io
 from collections.abc import Iterator, Sequence
 
-from surgicai_vision import names, pictures
-from surgicai_vision.report.films import Reel, Strip
+from surgicai_vision.core import names
+from surgicai_vision.envs import contact_sheet
+from surgicai_vision.report.filmstrips import Reel, Strip
 from surgicai_vision.report.groups import Group, best_trained, of_task
 
 MOST = 8
@@ -24,7 +25,7 @@ def failure_sheet(groups: Sequence[Group], reel: Reel) -> bytes | None:
         return None
     widest = max(len(strip.frames) for strip in strips)
     rows = [(_title(strip), _frames(strip, widest)) for strip in strips]
-    figure = pictures.sheet(rows, [""] * widest, "how the best policies fail: start to end")
+    figure = contact_sheet.sheet(rows, [""] * widest, "how the best policies fail: start to end")
     content = io.BytesIO()
     figure.savefig(content, format="jpeg", dpi=DOTS, pil_kwargs={"quality": QUALITY})
     return content.getvalue()
@@ -45,7 +46,7 @@ def _title(strip: Strip) -> str:
     return f"{strip.choice.row['task']} {strip.choice.row['seed']}\n{strip.outcome}"
 
 
-def _frames(strip: Strip, count: int) -> list[pictures.Picture]:
+def _frames(strip: Strip, count: int) -> list[contact_sheet.Picture]:
     """Return the strip's frames, the last again where it has fewer than `count`."""
-    frames = [pictures.decoded(base64.b64decode(frame)) for frame in strip.frames]
+    frames = [contact_sheet.decoded(base64.b64decode(frame)) for frame in strip.frames]
     return [*frames, *[frames[-1]] * (count - len(frames))]

@@ -4,8 +4,8 @@ import re
 from collections.abc import Iterator, Sequence
 
 from surgicai_vision.report import paper, text
-from surgicai_vision.report.beside import beside_paper, our_text, paper_text
 from surgicai_vision.report.groups import Group
+from surgicai_vision.report.paper_comparison import beside_paper, our_text, paper_text
 
 HEAD = ("task", "policy", "views", "k/n", "success", "95 % interval", "across training seeds", "length [mm]", "steps")
 CAPTION = (

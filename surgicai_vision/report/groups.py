@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from surgicai_vision import statistics
+from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import text
-from surgicai_vision.report.condition import Condition, order
-from surgicai_vision.report.reading import Collected, Missing, Result
+from surgicai_vision.report.experiment_key import Condition, order
+from surgicai_vision.report.reader import Collected, Missing, Result
 
 KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
 """Kinds of failure in the order in which charts stack them."""

@@ -7,14 +7,14 @@ from typing import Any
 
 from markupsafe import Markup
 
-from surgicai_vision import names
+from surgicai_vision.core import names
 from surgicai_vision.report import charts, curves, paper, sections, text
 from surgicai_vision.report.episodes import group_details, letters
-from surgicai_vision.report.films import Reel
+from surgicai_vision.report.filmstrips import Reel
 from surgicai_vision.report.groups import Group, as_trained, best_trained, of_task
 from surgicai_vision.report.pairs import Pair
-from surgicai_vision.report.probing import probes
-from surgicai_vision.report.reading import Collected
+from surgicai_vision.report.probes import probes
+from surgicai_vision.report.reader import Collected
 
 FEW = 12
 """Rows up to which a table of every cell is open from the start."""
@@ -24,7 +24,7 @@ def render(page: dict[str, Any]) -> str:
     """Fill the template."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    loader = PackageLoader("surgicai_vision", "templates")
+    loader = PackageLoader("surgicai_vision.report", "templates")
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

@@ -10,8 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from surgicai_vision import names, statistics
-from surgicai_vision.report.condition import Condition
+from surgicai_vision.core import names
+from surgicai_vision.evaluation import statistics
+from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.groups import Group, of_task
 
 FACTORS: Mapping[str, str] = MappingProxyType(

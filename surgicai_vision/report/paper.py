@@ -6,7 +6,7 @@ policy, and every printed rate is a multiple of 1/60, so intervals are drawn for
 noise to the actions, another amount for each encoder.
 """
 
-from surgicai_vision import names
+from surgicai_vision.core import names
 
 SOURCE = "SurgicAI, NeurIPS 2024 Datasets and Benchmarks, Table 2"
 EPISODES = 60

@@ -10,15 +10,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import files, statistics
+from surgicai_vision.core import files
+from surgicai_vision.evaluation import statistics
+from surgicai_vision.evaluation.storage import parquet_bytes
 from surgicai_vision.report import text
-from surgicai_vision.report.beside import paper_rate
-from surgicai_vision.report.condition import Condition
+from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.formats import latex, markdown
 from surgicai_vision.report.groups import KINDS, MEASURES, Group, measured
 from surgicai_vision.report.pairs import Pair
-from surgicai_vision.report.reading import REFERENCES, Result
-from surgicai_vision.results import parquet_bytes
+from surgicai_vision.report.paper_comparison import paper_rate
+from surgicai_vision.report.reader import REFERENCES, Result
 
 FOLDER = "tables"
 

@@ -20,8 +20,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.errors import UnknownName
-from surgicai_vision.names import ARMS, FOLLOWING_CAMERAS, PSM1, PSM2
+from surgicai_vision.core.errors import UnknownName
+from surgicai_vision.core.names import ARMS, FOLLOWING_CAMERAS, PSM1, PSM2
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.rotations import matrix_to_quaternion
 

@@ -15,12 +15,13 @@ from types import MappingProxyType
 
 import mujoco
 
-from surgicai_vision import config as configuration
-from surgicai_vision import names
-from surgicai_vision.config import SceneConfig
-from surgicai_vision.errors import UnknownName
-from surgicai_vision.scene import arm, holes, kinematics, look, needle, phantom, rotations, thread
+from surgicai_vision.core import config as configuration
+from surgicai_vision.core import names
+from surgicai_vision.core.config import SceneConfig
+from surgicai_vision.core.errors import UnknownName
+from surgicai_vision.scene import arm, holes, kinematics, needle, phantom, rotations, thread
 from surgicai_vision.scene.cameras import add_following_cameras, add_world_cameras, add_wrist_camera
+from surgicai_vision.scene.visual import materials
 
 TIMESTEP = 0.002
 USER_DATA = 176
@@ -111,8 +112,8 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "surgicai-vision"
     _set_options(spec, config.thread)
-    look.add_materials(spec)
-    look.add_surroundings(spec)
+    materials.add_materials(spec)
+    materials.add_surroundings(spec)
     soft = {"contype": 0, "conaffinity": SURFACES | THREAD}
     phantom.add_table(spec, soft)
     phantom.add_phantom(spec, config.layout, needle=soft, arm={"contype": 0, "conaffinity": FIRM})
@@ -123,7 +124,7 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     if config.grasp == "attach":
         for name in names.ARMS:
             arm.add_weld(spec, name)
-    look.dress(spec, config.layout, config.instrument)
+    materials.dress(spec, config.layout, config.instrument)
     add_world_cameras(spec)
     add_following_cameras(spec)
     return spec

@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from surgicai_vision.errors import InputError, UnreachablePose, check_name
-from surgicai_vision.names import PSM1, PSM2
+from surgicai_vision.core.errors import InputError, UnreachablePose, check_name
+from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.scene.rotations import rpy_to_matrix
 
 Joints = tuple[float, float, float, float, float, float]

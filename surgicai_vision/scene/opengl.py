@@ -12,7 +12,7 @@ from collections.abc import Callable
 from types import MappingProxyType
 from typing import Any
 
-from surgicai_vision.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_name
 
 BACKENDS = MappingProxyType(
     {"egl": "mujoco.egl", "osmesa": "mujoco.osmesa", "glfw": "mujoco.glfw", "cgl": "mujoco.cgl"}

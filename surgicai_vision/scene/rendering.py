@@ -19,8 +19,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.errors import InputError, check_name
-from surgicai_vision.names import DEPTH, MODALITIES, PARTS, RGB, SEGMENTATION
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.names import DEPTH, MODALITIES, PARTS, RGB, SEGMENTATION
 from surgicai_vision.scene import opengl
 from surgicai_vision.scene.cameras import camera_id
 from surgicai_vision.scene.opengl import renderer_string

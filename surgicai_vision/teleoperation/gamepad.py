@@ -6,7 +6,7 @@ The same order serves a browser's Gamepad API as it is, and GLFW's gamepads afte
 from collections.abc import Sequence
 from types import MappingProxyType
 
-from surgicai_vision.teleoperation.commands import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
+from surgicai_vision.teleoperation.inputs import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
 
 AXES, BUTTONS = 4, 16
 """Left stick x y, right stick x y, each in [-1, 1], y downwards; and the buttons of the standard."""

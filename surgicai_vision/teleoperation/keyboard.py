@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from types import MappingProxyType
 from typing import NamedTuple
 
-from surgicai_vision.teleoperation.commands import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
+from surgicai_vision.teleoperation.inputs import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
 
 
 class Row(NamedTuple):

@@ -12,10 +12,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision.config import TaskConfig, to_mapping
+from surgicai_vision.core.config import TaskConfig, to_mapping
+from surgicai_vision.core.errors import BadFile, OutputExists, SurgicaiError
+from surgicai_vision.core.files import TEMPORARY, check_output, code_version
 from surgicai_vision.demos.store import MARKER, Demo, list_demos, read_demo, read_marker, write_demo, write_marker
-from surgicai_vision.errors import BadFile, OutputExists, SurgicaiError
-from surgicai_vision.files import TEMPORARY, check_output, code_version
 
 SOURCE = "teleoperate"
 

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from surgicai_vision import names
+from surgicai_vision.core import names
+from surgicai_vision.core.files import code_version
 from surgicai_vision.demos.store import Demo
-from surgicai_vision.files import code_version
-from surgicai_vision.teleoperation.commands import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
+from surgicai_vision.teleoperation.input_mapping import Steering
+from surgicai_vision.teleoperation.inputs import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
 from surgicai_vision.teleoperation.recordings import SOURCE, Recordings
-from surgicai_vision.teleoperation.steering import Steering
 
 WAITING, DRIVING, JUDGED, STOPPED = "waiting", "driving", "judged", "stopped"
 

@@ -28,11 +28,11 @@ from urllib.parse import parse_qs, urlsplit
 
 import cv2
 
-from surgicai_vision.errors import InputError
-from surgicai_vision.teleoperation.commands import Input, merged
-from surgicai_vision.teleoperation.driving import Pictures
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.teleoperation.gamepad import Gamepad
+from surgicai_vision.teleoperation.inputs import Input, merged
 from surgicai_vision.teleoperation.keyboard import TABLE, Keyboard, key_names
+from surgicai_vision.teleoperation.loop import Pictures
 from surgicai_vision.teleoperation.session import Status
 
 HOST = "127.0.0.1"

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision import names
-from surgicai_vision.errors import InputError
-from surgicai_vision.teleoperation.commands import Input, merged
-from surgicai_vision.teleoperation.driving import Pictures
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.teleoperation.gamepad import Gamepad
+from surgicai_vision.teleoperation.inputs import Input, merged
 from surgicai_vision.teleoperation.keyboard import Keyboard
+from surgicai_vision.teleoperation.loop import Pictures
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, Status
 
 NO_WINDOW = "No window can be opened ({}); add --web for a page that any browser shows, also through ssh -L."

@@ -23,7 +23,7 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Fetch, check and say where it is."""
-    from surgicai_vision.dataset.sharing import pull_dataset
+    from surgicai_vision.dataset.hub import pull_dataset
 
     out = Path(options.out) if options.out else folders.dataset_folder(options.repo.partition("/")[2] or options.repo)
     with console.stage("checking") as progress:

@@ -7,7 +7,7 @@ from typing import Any
 
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import option
-from surgicai_vision.errors import InputError
+from surgicai_vision.core.errors import InputError
 
 EXAMPLE = "surgicai-vision dataset push outputs/datasets/grasp --repo somebody/suturing-grasp --private"
 
@@ -25,8 +25,8 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Check, push and say where it is."""
-    from surgicai_vision.dataset.reading import open_dataset
-    from surgicai_vision.dataset.sharing import dataset_card, push_dataset
+    from surgicai_vision.dataset.hub import dataset_card, push_dataset
+    from surgicai_vision.dataset.reader import open_dataset
 
     if options.repo is None:
         raise InputError("dataset push needs --repo USER/NAME.")

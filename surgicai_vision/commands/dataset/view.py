@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision import names
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import many_of, one_of, option, positive
 from surgicai_vision.commands.render_demos import CODECS, say_error
-from surgicai_vision.errors import InputError
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
 
 EXAMPLE = "surgicai-vision dataset view outputs/datasets/grasp --view back --out outputs/datasets/grasp-back"
 

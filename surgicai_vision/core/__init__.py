@@ -1,0 +1,1 @@
+"""Core: what every stage stands on: names, configuration, errors, files, processes."""

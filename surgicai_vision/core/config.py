@@ -1,0 +1,273 @@
+"""Configuration: frozen dataclasses, the only schema. Built at the edge, saved beside every result.
+
+`from_mapping` builds a dataclass from plain data (YAML, JSON) and refuses unknown keys with the nearest
+name; `to_mapping` is its inverse; `digest` hashes the canonical JSON. Nothing here is instantiated by a
+name found in a file.
+"""
+
+import dataclasses
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+import yaml
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, UnknownName, check_name
+
+T = TypeVar("T")
+
+STEPS: Mapping[str, tuple[float, float, float]] = types.MappingProxyType(
+    {"paper": (0.5e-3, 2.0, 0.05), "released": (1.0e-3, 3.0, 0.05), "shipped": (1.5e-3, 3.0, 0.05)}
+)
+"""Step preset → translation [m], rotation [deg], jaw [rad] of an action of 1 (facts.md §1: the image
+evaluation, the RL training script, the trajectories shipped with the release)."""
+
+SUBTASK_STEPS = 200
+"""Control steps a subtask may take (paper, image policies)."""
+DWELL = 15
+"""Control steps a subtask's success must hold, in a whole procedure, before the next one begins."""
+CLOCK_PERIOD, CLOCK_SIZE = 25, 3
+"""Control steps in which the hand of `clock` goes round, and how many numbers `clock` tells."""
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """What stands in the scene. Its digest, with the geometry's version, is the scene hash.
+
+    Attributes:
+        layout: phantom layout, one of `names.LAYOUTS`.
+        hole_pair: 1..4, the pair of holes the stitch goes through.
+        thread: number of thread segments, 0 for none.
+        instrument: PSM instrument, "400006" (Large Needle Driver of SurgicAI) or "420006".
+        grasp: "friction" (contact forces only) or "attach" (a weld, the released code's rule).
+    """
+
+    layout: str = "simple"
+    hole_pair: int = 1
+    thread: int = 0
+    instrument: str = "400006"
+    grasp: str = "friction"
+
+    def __post_init__(self) -> None:
+        check_name("layout", self.layout, names.LAYOUTS)
+        check_name("grasp level", self.grasp, names.GRASPS)
+        check_name("instrument", self.instrument, ("400006", "420006"))
+        if self.hole_pair not in (1, 2, 3, 4):
+            raise InputError(f"hole_pair is {self.hole_pair!r}; allowed: 1, 2, 3, 4.")
+        if self.thread not in (0, 10, 20, 40):
+            raise InputError(f"thread is {self.thread!r} segments; allowed: 0, 10, 20, 40.")
+
+
+LATENCY_LIMIT = 5
+"""Longest latency [control steps]: 100 ms."""
+RANDOMISATION_LIMITS: Mapping[str, float] = types.MappingProxyType(
+    {
+        "light": 0.9,
+        "colour": 0.9,
+        "camera_shift": 20.0,
+        "camera_turn": 20.0,
+        "camera_fovy": 15.0,
+        "needle_thickness": 0.3,
+        "friction": 0.5,
+        "phantom_shift": 5.0,
+        "kinematic_error": 1.0,
+        "needle_size": 0.1,
+        "latency": LATENCY_LIMIT,
+    }
+)
+"""Axis → largest magnitude: beyond it cameras lose the scene, or the procedure is no longer possible."""
+
+
+@dataclass(frozen=True)
+class RandomisationConfig:
+    """How much of each thing differs from episode to episode; 0 is off. Each axis is drawn uniformly from ± its value.
+
+    Attributes:
+        light: brightness of each light, as a fraction of it.
+        colour: tint of the tissue and of what surrounds it, as a fraction of each colour channel.
+        camera_shift: place of each camera along each axis [mm]; the endoscope's two move as one.
+        camera_turn: rotation of each camera about each axis [deg].
+        camera_fovy: vertical field of view of each camera [deg].
+        needle_thickness: fraction of the needle's thickness.
+        needle_size: fraction of the radius and the length of the needle's arc.
+        friction: fraction of every friction coefficient.
+        phantom_shift: place of the phantom, its holes and goals, in x and y [mm].
+        kinematic_error: offset of each arm's first three joints that the arm does not know of; 1 is ±5°, ±5°, ±5 mm,
+            the joint errors of the surgical robotics challenge.
+        latency: an action takes effect this many control steps later; the same in every episode.
+    """
+
+    light: float = 0.0
+    colour: float = 0.0
+    camera_shift: float = 0.0
+    camera_turn: float = 0.0
+    camera_fovy: float = 0.0
+    needle_thickness: float = 0.0
+    friction: float = 0.0
+    phantom_shift: float = 0.0
+    kinematic_error: float = 0.0
+    needle_size: float = 0.0
+    latency: int = 0
+
+    def __post_init__(self) -> None:
+        for axis, limit in RANDOMISATION_LIMITS.items():
+            if not 0 <= getattr(self, axis) <= limit:
+                raise InputError(f"randomisation: {axis} is {getattr(self, axis)}; allowed: 0 to {limit}.")
+
+    @property
+    def on(self) -> tuple[str, ...]:
+        """Return the axes that are not 0."""
+        return tuple(axis for axis in RANDOMISATION_LIMITS if getattr(self, axis))
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """One task in one scene: everything that decides what an episode is.
+
+    Attributes:
+        task: one of `names.TASKS`.
+        scene: the scene.
+        step: step-size preset, a key of `STEPS`.
+        tolerance: "paper" or "released" success tolerances.
+        reward: "sparse" (0 on success, else -1) or "dense".
+        max_steps: episode limit [control steps]; 0 takes the paper's, 200 a subtask, 1,000 for the five in a row.
+        randomisation: what differs from episode to episode besides the start; nothing by default.
+    """
+
+    task: str = "grasp"
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    step: str = "paper"
+    tolerance: str = "paper"
+    reward: str = "sparse"
+    max_steps: int = 0
+    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
+
+    def __post_init__(self) -> None:
+        check_name("task", self.task, names.TASKS)
+        check_name("step preset", self.step, STEPS)
+        check_name("tolerance preset", self.tolerance, ("paper", "released"))
+        check_name("reward", self.reward, ("sparse", "dense"))
+        if self.max_steps < 0:
+            raise InputError(f"max_steps is {self.max_steps}; it must be at least 1, or 0 for the paper's limit.")
+        if self.max_steps == 0:
+            subtasks = len(names.SUBTASKS) if self.task == names.SUTURE else 1
+            object.__setattr__(self, "max_steps", SUBTASK_STEPS * subtasks)
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """Where SurgicAI's released code departs from its paper, each a switch of its own; all are off by default.
+
+    The sixth, its training (one hidden layer, 1e-4, 40 epochs, split over transitions), is plain settings of the
+    recipe "released".
+
+    Attributes:
+        action_noise: evaluation adds uniform noise to the translation, as much as the encoder's file says.
+        preprocessing: R3M and CLIP are fed ImageNet's statistics in place of their own.
+        batch_norm_drift: the frozen network stands under `train()`, so its BatchNorm statistics drift.
+        bgr: pictures are handed over as BGR and read as RGB.
+        three_evaluations: one trained policy is evaluated three times, where the paper trains five.
+    """
+
+    action_noise: bool = False
+    preprocessing: bool = False
+    batch_norm_drift: bool = False
+    bgr: bool = False
+    three_evaluations: bool = False
+
+
+DEVIATIONS = tuple(switch.name for switch in dataclasses.fields(Deviations))
+
+
+def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str = "configuration") -> T:
+    """Build the dataclass `cls` from plain data, nested dataclasses included.
+
+    Raises:
+        UnknownName: a key that `cls` does not have.
+        InputError: a value of the wrong type, or one that has no default and is missing.
+    """
+    if not isinstance(mapping, Mapping):
+        raise InputError(f"{where}: expected a table of keys, got {type(mapping).__name__}.")
+    hints = typing.get_type_hints(cls)
+    values = {}
+    for key, value in mapping.items():
+        if key not in hints:
+            raise UnknownName(f"key in {where}", key, hints)
+        values[key] = _convert(hints[key], value, f"{where}: {key}")
+    nothing = dataclasses.MISSING
+    for item in dataclasses.fields(cls):  # type: ignore[arg-type]
+        if item.name not in values and item.default is nothing and item.default_factory is nothing:
+            raise InputError(f"{where}: '{item.name}' is missing.")
+    return cls(**values)
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    """Return `value` as the type `hint` says, or raise `InputError`."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _convert(next(a for a in arguments if a is not type(None)), value, where)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return from_mapping(hint, value, where)
+    if origin is tuple:
+        if isinstance(value, str) or not isinstance(value, (list, tuple)):
+            raise InputError(f"{where}: expected a list, got {value!r}.")
+        return tuple(_convert(arguments[0], item, where) for item in value)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(hint, type) and (not isinstance(value, hint) or (hint is int and isinstance(value, bool))):
+        raise InputError(f"{where}: expected {hint.__name__}, got {value!r}.")
+    return value
+
+
+def to_mapping(config: Any) -> dict[str, Any]:
+    """Return a frozen dataclass as plain JSON data."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def read_changes(texts: Iterable[str]) -> dict[str, Any]:
+    """Read `clock=false`, `epochs=10` as keys and their YAML values.
+
+    Raises:
+        InputError: a text of another form, or a key given twice.
+    """
+    changes: dict[str, Any] = {}
+    for text in texts:
+        key, sign, value = text.partition("=")
+        if not sign or not key or key in changes:
+            raise InputError(f"change '{text}' is not understood; give KEY=VALUE, each key once, such as clock=false.")
+        try:
+            changes[key] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise InputError(f"change '{text}': {value!r} is no YAML value.") from None
+    return changes
+
+
+def digest(value: Any) -> str:
+    """sha256 (hex) of the canonical JSON of a dataclass or of plain data."""
+    plain = dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
+    return hashlib.sha256(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def check_every(every: int) -> None:
+    """Raise `InputError` unless a frame every so many steps makes a whole number of frames a second."""
+    if every < 1 or names.FPS % every:
+        allowed = ", ".join(str(number) for number in range(1, names.FPS + 1) if names.FPS % number == 0)
+        raise InputError(f"every is {every}; it must divide the {names.FPS} frames a second: {allowed}.")
+
+
+def clock(steps: np.ndarray) -> np.ndarray:
+    """Return what a policy with a clock is told of the control steps (N,) since its subtask began, (N, 3) float32.
+
+    The share of `SUBTASK_STEPS`, and sine and cosine of a hand that goes round once in `CLOCK_PERIOD` steps: the share
+    alone changes too little in a few steps to act by.
+    """
+    turn = 2.0 * np.pi * steps / CLOCK_PERIOD
+    return np.stack([steps / SUBTASK_STEPS, np.sin(turn), np.cos(turn)], axis=1).astype(np.float32)

@@ -1,0 +1,170 @@
+"""Files: written whole or not at all (temporary name, fsync, rename), hashed, and safe to read.
+
+Every stage writes through this module, so a process killed at any moment leaves either the old file, the
+new one, or a temporary name that the next run removes.
+"""
+
+import functools
+import hashlib
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision import __version__
+from surgicai_vision.core.errors import BadFile, InputError, OutputExists
+
+CACHE_VARIABLE = "SURGICAI_VISION_CACHE"
+TEMPORARY = ".partial-"
+"""Prefix of temporary names; anything so named may be deleted when no process writes."""
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write `content` to `path` atomically."""
+    temporary = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}-{path.name}")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `value` as indented JSON, atomically."""
+    write_bytes(path, (json.dumps(value, indent=2, sort_keys=True) + "\n").encode())
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON; `BadFile` where it is missing or damaged."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
+    except ValueError as error:
+        raise BadFile(f"{path} is not valid JSON ({error}).") from None
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `path`; rename it to `path` at the end, or remove it on an error."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}-{path.name}")
+    temporary.mkdir()
+    try:
+        yield temporary
+        sync_tree(temporary)
+        os.rename(temporary, path)
+        sync_folder(path.parent)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def sync_tree(folder: Path) -> None:
+    """Flush every file below `folder` to disk."""
+    for root, _, files in os.walk(folder):
+        for name in files:
+            descriptor = os.open(os.path.join(root, name), os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        sync_folder(Path(root))
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's entries to disk."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def check_output(path: Path, *, may_resume: str | None = None) -> None:
+    """Refuse an output folder that cannot be written or holds foreign things, before any work.
+
+    Args:
+        path: the folder to be made.
+        may_resume: name of a file whose presence in `path` marks it as ours, to be continued.
+    """
+    if path.exists():
+        if not path.is_dir():
+            raise OutputExists(f"--out {path} is a file; give a folder that does not exist yet.")
+        ours = may_resume is not None and (path / may_resume).exists()
+        if any(path.iterdir()) and not ours:
+            raise OutputExists(f"--out {path} already holds files; give a folder that does not exist yet.")
+    parent = path
+    while not parent.exists():
+        parent = parent.parent
+    if not os.access(parent, os.W_OK | os.X_OK) or not parent.is_dir():
+        raise InputError(f"--out {path} cannot be written: no permission on {parent}; choose another folder.")
+
+
+def claim(path: Path, owner: dict[str, Any], what: str) -> None:
+    """Write whose folder this is into the file `path` in it; refuse a folder of somebody else.
+
+    Args:
+        path: a file in the folder, which is made.
+        owner: plain data: everything the folder's content depends on.
+        what: what the folder holds, for the message.
+
+    Raises:
+        OutputExists: the file is there and says something else.
+    """
+    if path.exists() and read_json(path) != owner:
+        raise OutputExists(f"{path.parent} holds {what} of another policy, task or starts; give another --out.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, owner)
+
+
+def sha256_file(path: Path) -> str:
+    """sha256 (hex) of a file's bytes."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+PACKAGE = Path(__file__).parent.parent
+"""The package `surgicai_vision`."""
+FAMILIES = ("encoders", "policies")
+"""Packages beside this one whose sources decide results."""
+SHARED = (PACKAGE / "core" / "names.py", PACKAGE / "core" / "config.py")
+"""Modules whose sources decide every stage's results."""
+
+
+@functools.cache
+def code_version(*stages: str) -> str:
+    """Return "<version>+<12 hex digits>": the sha256 over the sources of this package.
+
+    Args:
+        stages: only these stages ("envs", "demos", …) and the shared modules; none means all of them. The families
+            "encoders" and "policies" stand beside the package and are named to be counted.
+    """
+    package = PACKAGE
+    digest = hashlib.sha256()
+    for family in FAMILIES:
+        for path in sorted((package.parent / family).rglob("*.py")) if family in stages else ():
+            digest.update(f"{family}/{path.name}".encode() + b"\0" + path.read_bytes() + b"\0")
+    for path in sorted(package.rglob("*.py")):
+        stage = path.relative_to(package).parts[0]
+        if not stages or stage in stages or path in SHARED:
+            digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes() + b"\0")
+    return f"{__version__}+{digest.hexdigest()[:12]}"
+
+
+def cache_root() -> Path:
+    """Return $SURGICAI_VISION_CACHE, or ~/.cache/surgicai-vision."""
+    return Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "surgicai-vision")
+
+
+def configs_folder() -> Path:
+    """Return the folder of the configurations that ship with the package (in a checkout: `configs/`)."""
+    shipped = PACKAGE / "configs"
+    return shipped if shipped.is_dir() else PACKAGE.parent / "configs"

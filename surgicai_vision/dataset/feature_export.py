@@ -1,0 +1,80 @@
+"""Export a dataset with frozen features in place of pictures, for LeRobot's ACT and Diffusion.
+
+    export_features(dataset, rows, about, out)
+
+The features of all views stand side by side in `observation.environment_state`, which both policies take without
+any picture. `meta/surgicai.json` says in `features` which encoder they are of, so that the env shows the same.
+"""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, OutputExists
+from surgicai_vision.core.files import write_json
+from surgicai_vision.dataset import schema
+from surgicai_vision.dataset.reader import Dataset
+from surgicai_vision.dataset.stats import column_statistics
+from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, assemble
+
+
+def export_features(dataset: Dataset, rows: Sequence[np.ndarray], about: Mapping[str, Any], out: Path) -> None:
+    """Write `out`: the columns of `dataset` and its features, no pictures.
+
+    Args:
+        dataset: an opened dataset.
+        rows: (N, dim) features of each view.
+        about: `encoder`, `views` and `weights_sha256`, kept in `meta/surgicai.json`.
+        out: the new dataset's folder.
+
+    Raises:
+        OutputExists: there is something at `out`.
+        InputError: features of another number of frames.
+    """
+    if out.exists():
+        raise OutputExists(f"{out} exists; give a folder that does not exist yet.")
+    for entry in rows:
+        if len(entry) != dataset.length:
+            raise InputError(f"{len(entry)} features of {dataset.length} frames; encode this dataset.")
+    width = sum(entry.shape[1] for entry in rows)
+    features = schema.features((), dataset.image_size, depth=False, segmentation=False)
+    features[names.ENVIRONMENT_STATE] = {"dtype": "float32", "shape": (width,), "names": None}
+    columns = {key: dataset.columns()[key] for key in schema.COLUMNS}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as scratch:
+        shards, digests = [], []
+        for episode in np.unique(dataset.episode_index):
+            where = np.flatnonzero(dataset.episode_index == episode)
+            part = {key: values[where] for key, values in columns.items()}
+            digests.append(schema.EpisodeDigest(()).hexdigest(part))
+            part[names.ENVIRONMENT_STATE] = np.concatenate([entry[where] for entry in rows], axis=1).astype(np.float32)
+            shards.append(_write_shard(Path(scratch) / str(episode), part))
+        meta = {
+            **dataset.meta,
+            "views": [],
+            "depth": False,
+            "segmentation": False,
+            "features": dict(about),
+            "exported_from": dataset.fingerprint,
+            "digest": schema.dataset_digest(digests),
+        }
+        assemble(shards, out, features, names.TASK_TEXTS[dataset.task], meta)
+
+
+def _write_shard(folder: Path, columns: Mapping[str, np.ndarray]) -> Path:
+    """Write one episode as `assemble` reads it."""
+    folder.mkdir()
+    arrays = {}
+    for key, values in columns.items():
+        flat = pa.array(np.ascontiguousarray(values).ravel())
+        arrays[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim == 2 else flat
+    pq.write_table(pa.table(arrays), folder / EPISODE_FILE)
+    statistics = {key: column_statistics(values) for key, values in columns.items()}
+    write_json(folder / SUMMARY_FILE, {"statistics": statistics})
+    return folder

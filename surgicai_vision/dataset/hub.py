@@ -1,0 +1,230 @@
+"""Share a dataset on the Hugging Face Hub: with a card that says what it is, checked before and after.
+
+    push_dataset(Path("dataset"), "somebody/suturing-grasp")
+    pull_dataset("somebody/suturing-grasp", Path("dataset"))
+    dataset_card(open_dataset(Path("dataset")), "somebody/suturing-grasp")
+
+A push is one commit, tagged with LeRobot's format version as its own loader asks for. Without a network both end at
+once with one line.
+"""
+
+import io
+import os
+import shutil
+import socket
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
+from surgicai_vision.core.executor import Progress, building
+from surgicai_vision.core.files import check_output
+from surgicai_vision.dataset import schema
+from surgicai_vision.dataset.metadata import CODEBASE_VERSION
+from surgicai_vision.dataset.reader import Dataset, open_dataset
+from surgicai_vision.dataset.validate.check import CheckReport, check_dataset
+
+CARD = "README.md"
+LICENCE = "mit"
+CONNECT_SECONDS = 3.0
+"""How long the Hub may take to answer before it counts as out of reach."""
+
+KEPT = ("meta", "data", "videos")
+"""Folders of a LeRobot v3 dataset; nothing else of a folder is pushed or pulled."""
+
+
+def dataset_card(dataset: Dataset, repo: str, licence: str = LICENCE) -> str:
+    """Return the card of a dataset, Markdown with the Hub's header."""
+    meta = dataset.meta
+    pictures = [key for key, _, _ in schema.picture_keys(dataset.views, dataset.has_depth, dataset.has_segmentation)]
+    size = f"{dataset.image_size} × {dataset.image_size}"
+    lost = "".join(
+        f" The video of `{view}` is off by {error:.2f} of 255 on average."
+        for view, error in meta.get("video_error", {}).items()
+    )
+    stored = f"as {dataset.video} video.{lost}" if dataset.video else "lossless."
+    rows = "\n".join(f"| `{key}` | {text} |" for key, text in COLUMN_TEXTS.items())
+    shown = "\n".join(f"| `{key}` | {size} |" for key in pictures)
+    return f"""---
+license: {licence}
+task_categories:
+- robotics
+tags:
+- LeRobot
+- surgical-robotics
+- suturing
+- imitation-learning
+configs:
+- config_name: default
+  data_files: data/*/*.parquet
+---
+
+# {repo.partition("/")[2]}
+
+{names.TASK_TEXTS[dataset.task]}
+
+{meta["episodes"]} simulated demonstrations of the task `{dataset.task}` in robotic suturing: {dataset.length} frames
+at {dataset.fps} per second, by {", ".join(meta["sources"])}. LeRobot {CODEBASE_VERSION} format, by surgicai-vision
+({meta["code_version"]}). Pictures of {size} pixels, {stored}
+
+| column | content |
+|---|---|
+{rows}
+{shown}
+
+Lengths in metres, angles in radians, depth in metres. The cameras' intrinsics and poses, the task's configuration and
+the renderer ({", ".join(meta["renderers"])}) are in `{names.META_FILE}`.
+Digest of the decoded content: `{meta["digest"]}`.
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("{repo}")
+```
+
+```sh
+surgicai-vision dataset pull {repo} --out dataset
+surgicai-vision dataset check dataset
+```
+"""
+
+
+COLUMN_TEXTS = {
+    names.STATE: f"measured tip of the active arm in its base: {', '.join(names.STATE_NAMES)}",
+    names.ACTION: f"{', '.join(names.ACTION_NAMES)}, each in [-1, 1]",
+    names.NEEDLE_POSE: "needle in the world: x, y, z and quaternion w, x, y, z",
+    names.PHASE: f"index in {', '.join(names.SUBTASKS)}",
+    names.SEED: "seed of the episode's start",
+    names.REWARD: "reward of the frame's action",
+    names.SUCCESS: "success after the frame's action",
+    names.CONTACT: "jaws touch the needle after the frame's action",
+    names.DONE: "last frame of the episode",
+}
+
+
+def push_dataset(
+    path: Path,
+    repo: str,
+    *,
+    private: bool = False,
+    licence: str = LICENCE,
+    progress: Progress | None = None,
+    api: Any = None,
+) -> str:
+    """Push a dataset of ours with its card, in one commit; return the commit's address.
+
+    Args:
+        path: the dataset.
+        repo: "user/name"; made when it does not exist.
+        private: make it private.
+        licence: the Hub's short name of a licence.
+        progress: called while it is checked.
+        api: a `huggingface_hub.HfApi`; made here by default.
+
+    Raises:
+        InputError: a bad name.
+        BadFile: the dataset is damaged.
+        SurgicaiError: offline, or the Hub refuses.
+    """
+    dataset = open_dataset(path)
+    api = _api(repo, api)
+    _whole(check_dataset(path, progress), str(path))
+    from huggingface_hub import CommitOperationAdd
+
+    card = dataset_card(dataset, repo, licence)
+    files = [file for name in KEPT for file in sorted((path / name).rglob("*")) if file.is_file()]
+    operations = [CommitOperationAdd(file.relative_to(path).as_posix(), file) for file in files]
+    operations.append(CommitOperationAdd(CARD, io.BytesIO(card.encode())))
+    with _hub(repo):
+        api.create_repo(repo, repo_type="dataset", private=private, exist_ok=True)
+        text = f"{dataset.meta['episodes']} episodes of {dataset.task}"
+        commit = api.create_commit(repo, operations, commit_message=text, repo_type="dataset")
+        if any(tag.name == CODEBASE_VERSION for tag in api.list_repo_refs(repo, repo_type="dataset").tags):
+            api.delete_tag(repo, tag=CODEBASE_VERSION, repo_type="dataset")
+        api.create_tag(repo, tag=CODEBASE_VERSION, revision=commit.oid, repo_type="dataset")
+    return str(commit.commit_url)
+
+
+def pull_dataset(
+    repo: str, out: Path, *, revision: str | None = None, progress: Progress | None = None, api: Any = None
+) -> CheckReport:
+    """Fetch a dataset into the new folder `out` and check it; the same command goes on with what was fetched.
+
+    Raises:
+        InputError: a bad name.
+        OutputExists: `out` holds something.
+        BadFile: what came is damaged or no dataset.
+        SurgicaiError: offline, or the Hub refuses.
+    """
+    check_output(out)
+    api = _api(repo, api)
+    with building(out) as (store, result):
+        fetched = store / "fetched"
+        with _hub(repo):
+            wanted = [f"{name}/**" for name in KEPT]
+            api.snapshot_download(
+                repo, repo_type="dataset", revision=revision, local_dir=fetched, allow_patterns=[*wanted, CARD]
+            )
+        shutil.rmtree(fetched / ".cache", ignore_errors=True)  # the Hub client's notes
+        report = check_dataset(fetched, progress)
+        _whole(report, repo)
+        if out.exists():
+            out.rmdir()  # empty: checked before
+        os.rename(fetched, result)
+    return report
+
+
+def _whole(report: CheckReport, where: str) -> None:
+    if not report.ok:
+        raise BadFile(f"{where} is damaged: {report.problems[0]} See `surgicai-vision dataset check --help`.")
+
+
+def _api(repo: str, api: Any) -> Any:
+    """Return the Hub's client after a look at the name and the network."""
+    from huggingface_hub import HfApi, constants
+    from huggingface_hub.errors import HFValidationError
+    from huggingface_hub.utils import validate_repo_id
+
+    try:
+        validate_repo_id(repo)
+    except HFValidationError:
+        raise InputError(f"'{repo}' is no name on the Hub; it is written user/name.") from None
+    if repo.count("/") != 1:
+        raise InputError(f"'{repo}' does not say whose it is; write user/name.")
+    if api is not None:
+        return api
+    if constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "TRUE", "YES", "ON"):
+        raise SurgicaiError("HF_HUB_OFFLINE is set: nothing is pushed or pulled; unset it to use the Hub.")
+    _reach(constants.ENDPOINT)
+    return HfApi()
+
+
+def _reach(endpoint: str) -> None:
+    """Raise `SurgicaiError` at once where the Hub, or the proxy on the way to it, does not answer."""
+    wanted = urllib.parse.urlsplit(endpoint)
+    proxy = urllib.request.getproxies().get(wanted.scheme)
+    target = urllib.parse.urlsplit(proxy) if proxy else wanted
+    port = target.port or (443 if target.scheme == "https" else 80)
+    try:
+        socket.create_connection((target.hostname or "", port), timeout=CONNECT_SECONDS).close()
+    except OSError as error:
+        raise SurgicaiError(
+            f"The Hub at {wanted.hostname} cannot be reached ({error.strerror or error}); nothing is pushed or pulled."
+        ) from None
+
+
+@contextmanager
+def _hub(repo: str) -> Iterator[None]:
+    """Turn what the Hub refuses into one line."""
+    import httpx
+    from huggingface_hub.errors import HfHubHTTPError
+
+    try:
+        yield
+    except (HfHubHTTPError, httpx.HTTPError, OSError) as error:
+        text = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        raise SurgicaiError(f"The Hub refused {repo}: {text[:200]}") from None

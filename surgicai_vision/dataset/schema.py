@@ -1,0 +1,124 @@
+"""Layout of our datasets: which LeRobot features there are, and the hash over what they hold.
+
+`features(views, size, …)` is the LeRobot feature table; `episode_digest` hashes one episode's decoded
+pictures and columns in a fixed order, and `dataset_digest` the episodes in theirs, so that a dataset has one
+digest however it was compressed, split into files or rendered.
+"""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from surgicai_vision.core import names
+
+VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        names.STATE: names.STATE_NAMES,
+        names.ACTION: names.ACTION_NAMES,
+        names.NEEDLE_POSE: ("x", "y", "z", "qw", "qx", "qy", "qz"),
+        names.BOTH_ARMS: names.BOTH_ARMS_NAMES,
+        names.PRIVILEGED_STATE: names.PRIVILEGED_NAMES,
+    }
+)
+"""float32 columns and the names of their elements; [m], [rad] and unit quaternions; privileged_state in [cm]."""
+
+SCALARS: Mapping[str, str] = MappingProxyType(
+    {
+        names.REWARD: "float32",
+        names.DONE: "bool",
+        names.SUCCESS: "bool",
+        names.CONTACT: "bool",
+        names.PHASE: "int64",
+        names.SEED: "int64",
+    }
+)
+"""One-element columns → dtype. Reward, done, success and contact are those after the frame's action."""
+
+COLUMNS = (*VECTORS, *SCALARS)
+"""Every column of ours that is no picture, in the order of the digest."""
+
+PICTURE_AXES = ("height", "width", "channels")
+
+
+def picture_keys(views: Sequence[str], depth: bool, segmentation: bool) -> list[tuple[str, str, str]]:
+    """Return (key, view, modality) of every picture column, in the order of the digest."""
+    keys = [(names.image_key(view), view, names.RGB) for view in views]
+    if depth:
+        keys += [(names.depth_key(view), view, names.DEPTH) for view in views]
+    if segmentation:
+        keys += [(names.segmentation_key(view), view, names.SEGMENTATION) for view in views]
+    return keys
+
+
+def features(views: Sequence[str], size: int, depth: bool, segmentation: bool) -> dict[str, dict[str, Any]]:
+    """Return the LeRobot feature table.
+
+    A segmentation picture is stored as RGB with the part's index in all three channels: LeRobot admits
+    one-channel pictures as depth only.
+    """
+    table: dict[str, dict[str, Any]] = {}
+    for key, _, modality in picture_keys(views, depth, segmentation):
+        channels = 1 if modality == names.DEPTH else 3
+        table[key] = {"dtype": "image", "shape": (size, size, channels), "names": list(PICTURE_AXES)}
+        if modality == names.DEPTH:
+            table[key]["info"] = {"is_depth_map": True, "depth_unit": "m"}
+    for key, elements in VECTORS.items():
+        table[key] = {"dtype": "float32", "shape": (len(elements),), "names": list(elements)}
+    for key, dtype in SCALARS.items():
+        table[key] = {"dtype": dtype, "shape": (1,), "names": None}
+    return table
+
+
+def column_bytes(key: str, values: np.ndarray) -> bytes:
+    """Return the bytes of a column as they enter the digest."""
+    dtype = "float32" if key in VECTORS else SCALARS[key]
+    return np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
+
+
+class PictureDigest:
+    """sha256 over the decoded frames of one picture column."""
+
+    def __init__(self) -> None:
+        self._total = hashlib.sha256()
+
+    def add(self, frame: np.ndarray) -> None:
+        """Count the next frame (H, W, channels)."""
+        self._total.update(str((frame.shape, frame.dtype.name)).encode())
+        self._total.update(np.ascontiguousarray(frame))
+
+    def hexdigest(self) -> str:
+        """Return the column's digest."""
+        return self._total.hexdigest()
+
+
+class EpisodeDigest:
+    """sha256 over one episode: its columns in the order of `COLUMNS`, then each picture column."""
+
+    def __init__(self, keys: Iterable[str]):
+        self._pictures = {key: PictureDigest() for key in keys}
+        self._known: dict[str, str] = {}
+
+    def add(self, key: str, frame: np.ndarray) -> None:
+        """Count the next decoded frame (H, W, channels) of a picture column."""
+        self._pictures[key].add(frame)
+
+    def take(self, key: str, digest: str) -> None:
+        """Take a picture column's digest, of a `PictureDigest`, in the place of its frames."""
+        self._known[key] = digest
+
+    def hexdigest(self, columns: Mapping[str, np.ndarray]) -> str:
+        """Return the episode's digest."""
+        total = hashlib.sha256()
+        for key in COLUMNS:
+            total.update(key.encode() + b"\0" + column_bytes(key, columns[key]))
+        for key, picture in self._pictures.items():
+            total.update(key.encode() + b"\0" + bytes.fromhex(self._known.get(key) or picture.hexdigest()))
+        return total.hexdigest()
+
+
+def dataset_digest(episodes: Iterable[str]) -> str:
+    """sha256 (hex) over the episodes' digests, in order."""
+    return hashlib.sha256("".join(episodes).encode()).hexdigest()

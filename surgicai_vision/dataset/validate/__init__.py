@@ -1,0 +1,1 @@
+"""Validate: check a dataset, and repair a broken one."""

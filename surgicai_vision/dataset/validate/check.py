@@ -1,0 +1,197 @@
+"""Check a dataset, ours or anyone's: counts, order, pictures, numbers, statistics and the digest, every frame of it.
+
+    report = check_dataset(Path("dataset"))
+    report.ok, report.problems        # each problem one line
+
+What is checked: `meta/surgicai.json`, LeRobot's `meta/info.json`, `meta/episodes` and `meta/stats.json` agree
+with the data and with each other; index columns are gapless and in order; every number is finite; every
+picture decodes, has its size, is not of one colour and is not the one before it while the arm or the needle
+moved; depth is positive; the digest over the decoded content is the one recorded when it was rendered. Of another
+LeRobot dataset, everything that is not ours alone; its digest is that over its files.
+"""
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import digest as digest_of
+from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.executor import Progress
+from surgicai_vision.core.files import read_json, sha256_file
+from surgicai_vision.dataset import schema
+from surgicai_vision.dataset.reader import Dataset, open_dataset
+from surgicai_vision.dataset.stats import column_statistics
+from surgicai_vision.dataset.validate.lerobot_files import INFO, LeRobotFiles
+from surgicai_vision.dataset.validate.rules import PictureWatch, episode_problems, number_problems
+from surgicai_vision.dataset.validate.verify import Verifier
+
+MOST_PROBLEMS = 50
+"""Problems listed; the rest is counted."""
+STATISTICS_TOLERANCE = 1e-4
+"""Largest deviation of a column's statistics from the recomputed ones, relative to the largest value."""
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What a check found: frames and episodes read, the digest of the content, and one line a problem."""
+
+    frames: int
+    episodes: int
+    digest: str
+    problems: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Say whether there is no problem."""
+        return not self.problems
+
+
+def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
+    """Read all of a dataset and report what is wrong with it.
+
+    Args:
+        path: a dataset of ours or another LeRobot v3 dataset.
+        progress: called with (done, total, "frames" or "episodes").
+
+    Raises:
+        BadFile: it cannot be opened at all.
+    """
+    if (path / INFO).is_file() and not (path / names.META_FILE).exists():
+        return _check_foreign(LeRobotFiles(path), progress or (lambda done, total, unit: None))
+    dataset = open_dataset(path)
+    problems: list[str] = []
+    columns = dataset.columns()
+    keys = [key for key, _, _ in schema.picture_keys(dataset.views, dataset.has_depth, dataset.has_segmentation)]
+    _check_order(dataset, columns, problems)
+    problems.extend(number_problems(columns))
+    _check_lerobot(dataset, columns, keys, problems)
+    digests = []
+    bounds = dataset.bounds()
+    for start, stop in bounds:
+        rows = {key: columns[key][start:stop] for key in schema.COLUMNS}
+        digests.append(_check_episode(dataset, keys, start, stop, rows, problems))
+        if progress:
+            progress(stop, dataset.length, "frames")
+    digest = schema.dataset_digest(digests)
+    if digest != dataset.meta.get("digest"):
+        problems.append(f"digest: the content has {digest[:16]}…, its {names.META_FILE} says otherwise.")
+    return CheckReport(dataset.length, len(bounds), digest, _listed(problems))
+
+
+def _listed(problems: list[str]) -> tuple[str, ...]:
+    """Return the problems, the last ones counted where there are many."""
+    more = len(problems) - MOST_PROBLEMS
+    return (*problems[:MOST_PROBLEMS], *([f"… and {more} more."] if more > 0 else []))
+
+
+def _check_foreign(files: LeRobotFiles, progress: Progress) -> CheckReport:
+    """Check a LeRobot dataset that is not ours."""
+    rows: list[tuple[int, int, int]] = []
+    start, claimed = 0, int(files.info.get("total_episodes") or 0)
+    with tempfile.TemporaryDirectory(prefix="surgicai-vision-") as scratch:
+        for number, episode in enumerate(Verifier(files).episodes(Path(scratch))):
+            count = len(episode.table)
+            rows.append((count, start, start + count))
+            start += count
+            progress(number + 1, max(claimed, number + 1), "episodes")
+    problems = list(files.problems)
+    if (files.info.get("total_frames"), files.info.get("total_episodes")) != (start, len(rows)):
+        problems.append(
+            f"{INFO}: it counts {files.info.get('total_episodes')} episodes and {files.info.get('total_frames')} "
+            f"frames; {len(rows)} and {start} are whole."
+        )
+    written = [
+        tuple(row.get(key) for key in ("length", "dataset_from_index", "dataset_to_index")) for row in files.rows
+    ]
+    if written != rows:
+        problems.append("meta/episodes: its rows are not the episodes of the data.")
+    missing = [key for key, row in files.features.items() if row["dtype"] != "string" and key not in files.statistics]
+    if missing:
+        problems.append(f"meta/stats.json: no statistics of {', '.join(missing)}.")
+    data = [*files.data_files(), *sorted(files.path.glob("videos/*/chunk-*/file-*.mp4"))]
+    return CheckReport(start, len(rows), digest_of([sha256_file(file) for file in data]), _listed(problems))
+
+
+def _check_order(dataset: Dataset, columns: Mapping[str, np.ndarray], problems: list[str]) -> None:
+    """Check the index columns and the ends of the episodes."""
+    if not np.array_equal(columns["index"], np.arange(dataset.length)):
+        problems.append("index: not 0, 1, 2, … over the dataset.")
+    bounds = dataset.bounds()
+    if [int(dataset.episode_index[start]) for start, _ in bounds] != list(range(len(bounds))):
+        problems.append("episode_index: episodes are not 0, 1, 2, … in order.")
+    if len(bounds) != dataset.meta.get("episodes"):
+        problems.append(f"episodes: {len(bounds)} in the data, {dataset.meta.get('episodes')} in {names.META_FILE}.")
+    for number, (start, stop) in enumerate(bounds):
+        problems.extend(
+            episode_problems(number, {key: rows[start:stop] for key, rows in columns.items()}, dataset.fps)
+        )
+
+
+def _check_lerobot(dataset: Dataset, columns: Mapping[str, np.ndarray], keys: list[str], problems: list[str]) -> None:
+    """Check LeRobot's own metadata against the data."""
+    try:
+        info = read_json(dataset.path / "meta/info.json")
+        statistics = read_json(dataset.path / "meta/stats.json")
+        table = pa.concat_tables(
+            pq.read_table(file, columns=["episode_index", "length", "dataset_from_index", "dataset_to_index"])
+            for file in sorted(dataset.path.glob("meta/episodes/chunk-*/file-*.parquet"))
+        )
+    except (BadFile, OSError, pa.ArrowException) as error:
+        problems.append(f"LeRobot's metadata cannot be read ({(str(error).splitlines() or [''])[0]}).")
+        return
+    bounds = dataset.bounds()
+    if (info.get("total_frames"), info.get("total_episodes")) != (dataset.length, len(bounds)):
+        problems.append("meta/info.json: its counts are not those of the data.")
+    missing = [key for key in (*keys, *schema.COLUMNS) if key not in info.get("features", {})]
+    if missing:
+        problems.append(f"meta/info.json: no feature {', '.join(missing)}.")
+    expected = [(number, stop - start, start, stop) for number, (start, stop) in enumerate(bounds)]
+    if list(zip(*(column.to_pylist() for column in table.columns), strict=True)) != expected:
+        problems.append("meta/episodes: its rows are not the episodes of the data.")
+    for key in schema.COLUMNS:
+        _check_statistics(key, statistics.get(key), columns[key], problems)
+    problems.extend(f"meta/stats.json: no statistics of {key}." for key in keys if key not in statistics)
+
+
+def _check_statistics(key: str, recorded: Any, values: np.ndarray, problems: list[str]) -> None:
+    """Check a column's recorded statistics against its values."""
+    if not isinstance(recorded, dict):
+        problems.append(f"meta/stats.json: no statistics of {key}.")
+        return
+    exact = column_statistics(values)
+    scale = max(1.0, *(abs(value) for value in (*exact["min"], *exact["max"])))
+    for name in ("min", "max", "mean", "std", "count"):
+        given = np.ravel(np.asarray(recorded.get(name, np.nan), dtype=np.float64))
+        fits = given.shape == np.shape(exact[name])
+        if not fits or not np.allclose(given, exact[name], atol=STATISTICS_TOLERANCE * scale):
+            problems.append(f"meta/stats.json: {name} of {key} is not that of the data.")
+
+
+def _check_episode(
+    dataset: Dataset, keys: list[str], start: int, stop: int, rows: Mapping[str, np.ndarray], problems: list[str]
+) -> str:
+    """Check one episode's pictures; return the digest of its content."""
+    digest = schema.EpisodeDigest(keys)
+    for key in keys:
+        watch = PictureWatch(key, dataset.image_size, dataset.views, rows, key not in dataset.video_keys)
+        for index, frame in enumerate(_frames(dataset, key, start, stop, problems)):
+            digest.add(key, frame)
+            problem = watch.problem(index, frame)
+            if problem:
+                problems.append(f"frame {start + index}, {key}: {problem}.")
+    return digest.hexdigest(rows)
+
+
+def _frames(dataset: Dataset, key: str, start: int, stop: int, problems: list[str]) -> Iterator[np.ndarray]:
+    """Yield an episode's pictures of one column; those before the first that cannot be decoded."""
+    try:
+        yield from dataset.decoded(key, start, stop)
+    except BadFile as error:
+        problems.append(str(error))

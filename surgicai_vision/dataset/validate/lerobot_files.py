@@ -1,0 +1,207 @@
+"""The files of anyone's LeRobot v3 dataset, read one episode at a time and without trust.
+
+    files = LeRobotFiles(Path("dataset"))
+    files.features, files.fps, files.tasks, files.rows      # what its metadata says
+    for table in files.episodes(scratch): …                 # one pyarrow table an episode, in order
+
+Nothing is needed but `meta/info.json`: what else is missing or damaged is listed in `problems`, a data file without a
+footer is salvaged into `scratch`, and reading ends where the data does.
+"""
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.files import read_json
+from surgicai_vision.dataset.metadata import INDEX_FEATURES, arrow_schema
+from surgicai_vision.dataset.validate.recovery import LEROBOT, Writing, salvage
+from surgicai_vision.dataset.writer import compression
+
+INFO, STATISTICS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
+DATA, EPISODES = "data/chunk-*/file-*.parquet", "meta/episodes/chunk-*/file-*.parquet"
+VERSIONS = ("v3.0", "v3.1")
+UNREADABLE = (OSError, KeyError, ValueError, TypeError, pa.ArrowException)
+
+
+class LeRobotFiles:
+    """A LeRobot dataset's metadata and its way to the data.
+
+    Attributes:
+        path: its folder.
+        info: content of `meta/info.json`.
+        features: LeRobot's feature table, shapes as tuples.
+        fps: frames per second.
+        tasks: sentence of every task index.
+        rows: rows of `meta/episodes`, in order; none where they cannot be read.
+        statistics: content of `meta/stats.json`.
+        problems: what is wrong so far, one line each.
+
+    Raises:
+        BadFile: no `meta/info.json` of a LeRobot v3 dataset.
+    """
+
+    def __init__(self, path: Path):
+        self.path = Path(path)
+        if not (self.path / INFO).is_file():
+            raise BadFile(f"{self.path} is no LeRobot dataset: it has no {INFO}, without which nothing can be read.")
+        self.info = read_json(self.path / INFO)
+        self.problems: list[str] = []
+        try:
+            self.features = {
+                str(key): {**row, "shape": tuple(int(side) for side in row["shape"])}
+                for key, row in self.info["features"].items()
+            }
+            self.fps = float(self.info["fps"])
+            self._own = {key: row for key, row in self.features.items() if key not in INDEX_FEATURES}
+            self.schema = arrow_schema(self._own)
+            version = self.info["codebase_version"]
+        except (KeyError, TypeError, ValueError, AttributeError, pa.ArrowException) as error:
+            raise BadFile(f"{self.path / INFO} is not that of a LeRobot dataset ({line(error)}).") from None
+        if version not in VERSIONS or not self.fps > 0:
+            raise BadFile(f"{self.path / INFO}: version {version!r}, {self.fps:g} fps; read: {', '.join(VERSIONS)}.")
+        self.tasks = self._read_tasks()
+        self.rows = self._read_rows()
+        self.statistics = self._read_statistics()
+
+    @property
+    def video_keys(self) -> tuple[str, ...]:
+        """Features stored as videos."""
+        return tuple(key for key, row in self.features.items() if row["dtype"] == "video")
+
+    @property
+    def image_keys(self) -> tuple[str, ...]:
+        """Features stored as pictures in the data files."""
+        return tuple(key for key, row in self.features.items() if row["dtype"] == "image")
+
+    def data_files(self) -> list[Path]:
+        """Return the data files, in order."""
+        return sorted(self.path.glob(DATA))
+
+    def video_file(self, key: str, chunk: int, file: int) -> Path:
+        """Return the path of one video file."""
+        return self.path / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
+
+    def _read_tasks(self) -> dict[int, str]:
+        try:
+            table = pq.read_table(self.path / TASKS)
+            name = "task" if "task" in table.column_names else "__index_level_0__"
+            pairs = zip(table.column("task_index").to_pylist(), table.column(name).to_pylist(), strict=True)
+            return {int(index): str(text) for index, text in pairs}
+        except UNREADABLE as error:
+            self.problems.append(f"{TASKS} cannot be read ({line(error)}).")
+            return {}
+
+    def _read_rows(self) -> list[dict[str, Any]]:
+        """Read `meta/episodes` up to the first row that is missing or not in order."""
+        rows: list[dict[str, Any]] = []
+        files = sorted(self.path.glob(EPISODES))
+        try:
+            for file in files:
+                rows.extend(pq.ParquetFile(file).read().to_pylist())
+        except UNREADABLE as error:
+            self.problems.append(f"meta/episodes cannot be read ({line(error)}).")
+        if not files:
+            self.problems.append("meta/episodes is missing.")
+        for number, row in enumerate(rows):
+            if row.get("episode_index") != number:
+                self.problems.append(f"meta/episodes: row {number} is of episode {row.get('episode_index')}.")
+                return rows[:number]
+        return rows
+
+    def _read_statistics(self) -> dict[str, Any]:
+        try:
+            return dict(read_json(self.path / STATISTICS))
+        except (BadFile, TypeError, ValueError) as error:
+            self.problems.append(line(error))
+            return {}
+
+    def episodes(self, scratch: Path) -> Iterator[pa.Table]:
+        """Yield the episodes' rows in order; salvaged files are written into `scratch`."""
+        waiting: pa.Table | None = None
+        for group in self._groups(scratch):
+            for part in _split(group):
+                if waiting is not None and _number(waiting) == _number(part):
+                    waiting = pa.concat_tables([waiting, part])
+                    continue
+                if waiting is not None:
+                    yield waiting
+                waiting = part
+        if waiting is not None:
+            yield waiting
+
+    def _groups(self, scratch: Path) -> Iterator[pa.Table]:
+        """Yield row groups with the columns of the schema, until one cannot be read."""
+        for file in self.data_files():
+            name = file.relative_to(self.path)
+            try:
+                reader = self._open(file, scratch)
+                for number in range(reader.num_row_groups):
+                    yield reader.read_row_group(number, self.schema.names).select(self.schema.names).combine_chunks()
+            except UNREADABLE as error:
+                self.problems.append(f"{name} cannot be read further ({line(error)}).")
+                return
+
+    def _open(self, file: Path, scratch: Path) -> pq.ParquetFile:
+        """Open a data file, or what can be salvaged of it."""
+        try:
+            return pq.ParquetFile(file)
+        except (OSError, pa.ArrowException):
+            self.problems.append(f"{file.relative_to(self.path)} has no footer: its writer was killed.")
+        mended = scratch / "-".join(file.relative_to(self.path).parts)
+        depth = [key for key, row in self._own.items() if (row.get("info") or {}).get("is_depth_map")]
+        for writing in (LEROBOT, Writing(compression(self.schema, depth), False)):
+            if salvage(file, self.sample(), mended, writing):
+                return pq.ParquetFile(mended)
+        raise ValueError("no whole row group in it")
+
+    def sample(self) -> pa.Table:
+        """Return a table of one row in the schema."""
+        columns = {}
+        for field in self.schema:
+            shape = self.features.get(field.name, {"shape": (1,)})["shape"]
+            columns[field.name] = pa.array([_example(field.type, shape)], field.type)
+        return pa.table(columns, schema=self.schema)
+
+
+def _example(kind: Any, shape: tuple[int, ...]) -> Any:
+    """Return a value of an Arrow type, lists of the feature's length."""
+    if pa.types.is_struct(kind):
+        return {"bytes": b"x", "path": "x"}
+    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        return [_example(kind.value_type, shape[1:])] * shape[0]
+    if pa.types.is_string(kind):
+        return "x"
+    return pa.types.is_boolean(kind) or 0
+
+
+def _number(table: pa.Table) -> int:
+    return cast(int, table.column("episode_index")[0].as_py())
+
+
+def _split(table: pa.Table) -> Iterator[pa.Table]:
+    """Cut a table where `episode_index` changes."""
+    if not len(table):
+        return
+    numbers = table.column("episode_index").to_numpy()
+    starts = [0, *((numbers[1:] != numbers[:-1]).nonzero()[0] + 1).tolist(), len(table)]
+    for start, stop in itertools.pairwise(starts):
+        yield table.slice(start, stop - start)
+
+
+def contents(column: pa.ChunkedArray) -> list[tuple[bytes | None, str | None]]:
+    """Return the (bytes, path) of a column of pictures."""
+    whole = column.combine_chunks()
+    return list(
+        zip(pc.struct_field(whole, "bytes").to_pylist(), pc.struct_field(whole, "path").to_pylist(), strict=True)
+    )
+
+
+def line(error: Exception) -> str:
+    """Return the first line of an error's text."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]

@@ -1,0 +1,196 @@
+"""Repair a broken LeRobot dataset, anyone's or ours: keep its longest verified prefix.
+
+    repair = repair_dataset(Path("dataset"))                       # the original stays beside it as dataset.broken
+    repair = repair_dataset(Path("dataset"), Path("mended"))       # the original stays as it is
+
+LeRobot's writer leaves data files without footers, no `meta/episodes` and an `info.json` that counts what is not
+there when it is killed. The episodes that can be verified from the first on (`verifying`) are written into a new
+folder with fresh metadata and statistics, which appears whole and is checked before it takes the old one's place.
+"""
+
+import ctypes
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import BadFile, SurgicaiError
+from surgicai_vision.core.executor import Progress, claim, work_folder
+from surgicai_vision.core.files import check_output, sync_folder, whole_folder, write_json
+from surgicai_vision.dataset import schema
+from surgicai_vision.dataset.metadata import INDEX_FEATURES, EpisodeRow, video_path, write_metadata
+from surgicai_vision.dataset.validate.check import CheckReport, check_dataset
+from surgicai_vision.dataset.validate.lerobot_files import LeRobotFiles
+from surgicai_vision.dataset.validate.verify import Verified, Verifier
+from surgicai_vision.dataset.writer import DataFiles
+
+EXCHANGE = 2
+"""RENAME_EXCHANGE of renameat2(2): swap two names in one step."""
+HERE = -100
+"""AT_FDCWD."""
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What a repair did.
+
+    Attributes:
+        path: the whole dataset.
+        episodes: episodes kept.
+        frames: frames kept.
+        claimed: episodes the broken dataset said it had.
+        original: where the broken dataset is; None when nothing was broken.
+        problems: what was wrong, one line each.
+    """
+
+    path: Path
+    episodes: int
+    frames: int
+    claimed: int
+    original: Path | None
+    problems: tuple[str, ...]
+
+
+def repair_dataset(path: Path, out: Path | None = None, progress: Progress | None = None) -> Repair:
+    """Write the longest verified prefix of the dataset `path` to `out`, or put it in the place of `path`.
+
+    A dataset with nothing wrong is left alone, and `out` is not made.
+
+    Args:
+        path: a LeRobot v3 dataset.
+        out: folder to make; by default `path` itself, whose original becomes `<path>.broken`.
+        progress: called with (episodes verified, episodes claimed, "episodes").
+
+    Raises:
+        BadFile: no LeRobot dataset, or not one whole episode in it.
+        OutputExists: `out` holds something.
+    """
+    before = _checked(path)
+    files = LeRobotFiles(path)
+    claimed = int(files.info.get("total_episodes") or 0)
+    if before is not None and before.ok:
+        return Repair(path, before.episodes, before.frames, claimed, None, ())
+    if out is not None:
+        check_output(out)
+    elif _free(path, "broken") is None:
+        raise BadFile(f"Beside {path} there are already 100 broken ones; give --out DIR.")
+    work = work_folder(out or path)
+    try:
+        with claim(work):
+            made = work / "result"
+            shutil.rmtree(made, ignore_errors=True)
+            rows = _write(files, made, work, claimed, progress or (lambda done, total, unit: None))
+            after = check_dataset(made)
+            if not after.ok:
+                raise SurgicaiError(f"The repair of {path} does not pass its own check: {after.problems[0]}")
+            problems = tuple(files.problems) or (before.problems if before else ())
+            original = _commit(made, path, out)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return Repair(out or path, len(rows), rows[-1].stop, claimed, original, problems)
+
+
+def _checked(path: Path) -> CheckReport | None:
+    """Check a dataset; None where it cannot even be opened."""
+    try:
+        return check_dataset(path)
+    except BadFile:
+        return None
+
+
+def _write(files: LeRobotFiles, made: Path, scratch: Path, claimed: int, progress: Progress) -> list[EpisodeRow]:
+    """Write the verified prefix as the folder `made`; return its episodes' rows."""
+    verifier = Verifier(files)
+    features = {key: row for key, row in files.features.items() if key not in INDEX_FEATURES}
+    rows: list[EpisodeRow] = []
+    digests: list[str] = []
+    with whole_folder(made) as folder, tempfile.TemporaryDirectory(dir=scratch) as mended:
+        data = DataFiles(folder, features, files.fps)
+        for episode in verifier.episodes(Path(mended)):
+            rows.append(_append(data, len(rows), episode))
+            digests.append(episode.digest)
+            progress(len(rows), max(claimed, len(rows)), "episodes")
+        data.close()
+        if not rows:
+            raise BadFile(f"{files.path} cannot be repaired: not one episode is whole ({_why(files.problems)})")
+        for key, videos in verifier.video_files.items():
+            for number in sorted({row.videos[key][0] for row in rows}):
+                target = folder / video_path(key, number)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(videos[number], target)
+        texts = _texts(files.tasks, rows)
+        write_metadata(folder, features, texts, rows, files.info)
+        if verifier.ours:
+            write_json(folder / names.META_FILE, _meta(verifier.ours, rows, digests, claimed))
+    return rows
+
+
+def _append(data: DataFiles, number: int, episode: Verified) -> EpisodeRow:
+    """Write one episode."""
+    row = data.append(number, episode.table, episode.statistics)
+    return EpisodeRow(row.start, row.stop, row.file, row.statistics, episode.tasks, episode.videos)
+
+
+def _texts(tasks: Mapping[int, str], rows: Sequence[EpisodeRow]) -> list[str]:
+    """Return the sentence of every task index."""
+    if tasks:
+        return [tasks.get(index, f"task {index}") for index in range(max(tasks) + 1)]
+    named = {text for row in rows for text in row.tasks}
+    return [f"task {index}" for index in range(len(named))]
+
+
+def _meta(ours: Mapping[str, Any], rows: Sequence[EpisodeRow], digests: Sequence[str], claimed: int) -> dict[str, Any]:
+    """Return `meta/surgicai.json` of the prefix; it is the result of no request any more."""
+    return {
+        **ours,
+        "request": None,
+        "repaired": {"episodes_before": claimed, "digest_before": ours.get("digest")},
+        "frames": rows[-1].stop,
+        "episodes": len(rows),
+        "digest": schema.dataset_digest(digests),
+    }
+
+
+def _why(problems: Sequence[str]) -> str:
+    return " ".join(problems[-2:]) or "its data files are missing."
+
+
+def _free(path: Path, ending: str) -> Path | None:
+    """Return a name beside `path` that is not taken."""
+    tried = [path.with_name(f"{path.name}.{ending}{number or ''}") for number in range(100)]
+    return next((name for name in tried if not name.exists()), None)
+
+
+def _commit(made: Path, path: Path, out: Path | None) -> Path:
+    """Move the repaired folder to its place; return where the original is."""
+    if out is not None:
+        if out.exists():
+            out.rmdir()  # empty: checked before
+        os.rename(made, out)
+        sync_folder(out.parent)
+        return path
+    original = _free(path, "broken")
+    assert original is not None
+    os.rename(made, original)
+    if not _exchange(original, path):
+        # Not on this file system: the two steps leave, between them, both folders whole under other names.
+        aside = _free(path, "repaired")
+        assert aside is not None
+        os.rename(original, aside)
+        os.rename(path, original)
+        os.rename(aside, path)
+    sync_folder(path.parent)
+    return original
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Swap two folders' names in one step; say whether that was done."""
+    try:
+        swap = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):
+        return False
+    return not swap(HERE, os.fsencode(one.resolve()), HERE, os.fsencode(other.resolve()), EXCHANGE)

@@ -1,0 +1,127 @@
+"""Encode a dataset's pictures as videos, one job for each view and block of episodes, and look at what came of it.
+
+A block is a video file of its own. Blocks depend on the dataset alone, so files are the same for any workers.
+"""
+
+import functools
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from surgicai_vision.core import names
+from surgicai_vision.core.executor import LOCAL, Engine, Job, Progress, run
+from surgicai_vision.core.files import read_json, write_json
+from surgicai_vision.dataset import schema
+from surgicai_vision.dataset.metadata import video_path
+from surgicai_vision.dataset.reader import Dataset, open_dataset
+from surgicai_vision.dataset.video import VideoWriter, read_frames
+
+BLOCK_FRAMES = 2000
+"""Frames of a block, at least, but for the last: some 10 MB of video, half a minute of one core."""
+VIDEO_FILE, LOOK_FILE = "video.mp4", "look.json"
+
+Place = tuple[int, float, float]
+"""(number of the video file, first second, second after the last)."""
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """One view of one episode, encoded.
+
+    Attributes:
+        place: where it is in the view's videos.
+        digest: sha256 (hex) of its decoded frames, as `layout.EpisodeDigest` takes it.
+        error: sum over its frames of the mean absolute error, out of 255.
+    """
+
+    place: Place
+    digest: str
+    error: float
+
+
+def encode_views(
+    dataset: Dataset,
+    folder: Path,
+    views: Sequence[str],
+    video: str,
+    *,
+    store: Path,
+    workers: int = 1,
+    engine: Engine = LOCAL,
+    progress: Progress | None = None,
+) -> list[dict[str, Encoded]]:
+    """Encode `views` into the videos of the LeRobot folder `folder`; return every episode's by their keys.
+
+    Args:
+        dataset: a dataset of pictures.
+        folder: gets `videos/`.
+        views: cameras.
+        video: codec, a key of `video.CODECS`.
+        store: folder of the jobs' results.
+        workers: processes.
+        engine: what runs them.
+        progress: called with (frames done, frames, "frames"), of all views.
+    """
+    blocks, bounds = _blocks(dataset.bounds()), dataset.bounds()
+    same = {"dataset": str(dataset.path.resolve()), "video": video}
+    jobs = [
+        Job(
+            "encode-video",
+            {**same, "view": view, "first": first, "stop": stop},
+            (dataset.meta["digest"],),
+            bounds[stop - 1][1] - bounds[first][0],
+            ("dataset",),
+        )
+        for view in views
+        for first, stop in blocks
+    ]
+    results = iter(run(jobs, store, workers=workers, engine=engine, unit="frames", progress=progress))
+    episodes: list[dict[str, Encoded]] = [{} for _ in bounds]
+    for view in views:
+        key = names.image_key(view)
+        for number, (first, stop) in enumerate(blocks):
+            result = next(results)
+            target = folder / video_path(key, number)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(result / VIDEO_FILE, target)
+            start = bounds[first][0]
+            for index, row in zip(range(first, stop), read_json(result / LOOK_FILE), strict=True):
+                low, high = ((frame - start) / dataset.fps for frame in bounds[index])
+                episodes[index][key] = Encoded((number, low, high), row["digest"], row["error"])
+    return episodes
+
+
+def _blocks(bounds: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return (first episode, episode after the last) of every block."""
+    blocks, first = [], 0
+    for index, (_, stop) in enumerate(bounds):
+        if stop - bounds[first][0] >= BLOCK_FRAMES or index == len(bounds) - 1:
+            blocks.append((first, index + 1))
+            first = index + 1
+    return blocks
+
+
+@functools.lru_cache(maxsize=1)
+def _dataset(folder: str) -> Dataset:
+    return open_dataset(Path(folder))
+
+
+def encode_block(folder: Path, dataset: str, video: str, view: str, first: int, stop: int) -> None:
+    """Job "encode-video": encode a view of the episodes first … stop - 1, and compare each frame with its picture."""
+    data, key, path = _dataset(dataset), names.image_key(view), folder / VIDEO_FILE
+    bounds = data.bounds()[first:stop]
+    begin, end = bounds[0][0], bounds[-1][1]
+    with VideoWriter(path, video, data.fps, data.image_size) as writer:
+        for picture in data.decoded(key, begin, end):
+            writer.add(picture)
+    rows, decoded = [], read_frames(path, 0, end - begin, data.fps)
+    for low, high in bounds:
+        digest, error = schema.PictureDigest(), 0.0
+        for before, after in zip(data.decoded(key, low, high), decoded, strict=False):
+            error += float(np.abs(after.astype(np.int16) - before).mean())
+            digest.add(after)
+        rows.append({"digest": digest.hexdigest(), "error": error})
+    write_json(folder / LOOK_FILE, rows)

@@ -1,0 +1,1 @@
+"""Dynamic movement primitives: fitted to demonstrations, executed from new starts."""

@@ -1,0 +1,1 @@
+"""Imports: recordings made elsewhere become demonstrations in this scene."""

@@ -1,0 +1,259 @@
+"""Replay recorded arm motions in our scene: kinematics, no physics.
+
+    demo, clipped = Replay(config).demo(episode)
+
+A recording of SurgicAI holds the commanded tip pose of one arm and nothing of the needle. In every state the
+arm stands at the recorded pose, the other one at its start or, in handoff, holding the needle, and the needle
+lies where the task's definition puts it:
+
+* handoff: still; its 105° point is where the goal grasps it.
+* grasp: still; its 17.5° point is where the goal grasps it. (The angle was drawn from 5°–20° and not recorded;
+  the shipped set has the needle's tip on the entry, which gives 15°–20°.)
+* place, insert: rigid in the jaws as it is when they stand at the goal, that is with the tip on the entry and
+  perpendicular to it, or with the 100° point 2 mm beyond the exit.
+* pullout: rigid in PSM1's jaws, grasped as the handoff's goal grasps it.
+
+Sources: needle points, insertion depth and lift from SurgicAI's released code (the project's facts); the
+relations between needle and goal were fitted to needle poses that were derived independently for handoff, place
+and insert, and the tests compare with those.
+
+The first transition of a pullout episode is dropped: a jump from the start pose, a fault of the recorder.
+"""
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import STEPS, TaskConfig
+from surgicai_vision.core.errors import UnreachablePose
+from surgicai_vision.core.files import code_version
+from surgicai_vision.demos.store import Demo
+from surgicai_vision.scene import kinematics, needle
+from surgicai_vision.scene.holes import PAIRS
+from surgicai_vision.scene.rotations import matrix_to_rotvec, rpy_to_matrix
+
+LIFT = 0.005
+"""Height of the tip frame over the needle's plane at the released code's grasp goals [m]."""
+GRASP_ANGLE, HANDOFF_ANGLE, INSERT_ANGLE = (float(angle) for angle in np.radians([17.5, 105.0, 100.0]))
+INSERT_DEPTH = 0.002
+"""Distance of the needle's 100° point beyond the exit at the goal of insert [m]."""
+MOST_CLIPPED = 0.01
+"""Largest share of a recording's steps that may exceed a step preset for it to serve."""
+HOLD_ANGLES = np.radians([15.0, 20.0, 25.0, 30.0, 10.0, 35.0, 40.0, 5.0])
+"""Points of the needle at which PSM2 may hold it during the handoff, tried in this order: SurgicAI draws its
+grasps from 10°–50° after the approach's 5°–20°."""
+RADIAL_SLACK, DEPTHS = 0.004, (0.004, 0.014)
+"""A held needle's arc lies within this of the jaws' axis, and its plane within these distances of the tip frame
+[m]; place and insert recordings have 1.5 mm and 8–10 mm."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One recorded episode of T steps.
+
+    Attributes:
+        pose: commanded tip pose and jaw, x y z [m] roll pitch yaw jaw [rad], (T + 1, 7).
+        goal: the same of the goal, (7,).
+        action: as recorded, (T, 7).
+        reward: as recorded, (T,).
+        success: after the step, as recorded, (T,) bool.
+    """
+
+    pose: np.ndarray
+    goal: np.ndarray
+    action: np.ndarray
+    reward: np.ndarray
+    success: np.ndarray
+
+
+def trimmed(episode: Episode, task: str) -> Episode:
+    """Return the episode without the jump that opens every pullout recording."""
+    if task != "pullout":
+        return episode
+    return Episode(episode.pose[1:], episode.goal, episode.action[1:], episode.reward[1:], episode.success[1:])
+
+
+def pose_matrix(seven: np.ndarray) -> np.ndarray:
+    """Return T_base_tip (4, 4) of x y z [m] roll pitch yaw [rad] (the jaw is ignored)."""
+    pose = np.eye(4)
+    pose[:3, :3] = rpy_to_matrix(*seven[3:6])
+    pose[:3, 3] = seven[:3]
+    return pose
+
+
+def needle_path(episode: Episode, task: str) -> np.ndarray:
+    """Return T_world_needle (T + 1, 4, 4) of a recorded episode; see the module's docstring for the rules."""
+    base = kinematics.base_in_world(names.ACTIVE_ARM[task])
+    goal = base @ pose_matrix(episode.goal)
+    tips = base @ np.stack([pose_matrix(row) for row in episode.pose])
+    if task in ("grasp", "handoff"):
+        return np.broadcast_to(goal @ np.linalg.inv(_grasp(task)), tips.shape)
+    if task == "pullout":
+        return tips @ np.linalg.inv(_grasp("handoff"))
+    return tips @ np.linalg.inv(goal) @ _needle_at_goal(task)
+
+
+def _grasp(task: str) -> np.ndarray:
+    """Return T_needle_tip (4, 4) at the goal of grasp or handoff.
+
+    The jaws come down the normal of the needle's plane; PSM1 closes along -radial, PSM2 along +radial.
+    """
+    angle, sign = (GRASP_ANGLE, 1.0) if task == "grasp" else (HANDOFF_ANGLE, -1.0)
+    pose = np.eye(4)
+    y, z = sign * needle.radial(angle), np.array([0.0, 0.0, -1.0])
+    pose[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
+    pose[:3, 3] = needle.point(angle) - LIFT * z
+    return pose
+
+
+def _needle_at_goal(task: str) -> np.ndarray:
+    """Return T_world_needle (4, 4) when place or insert is done, at the first pair of holes of layout "simple"."""
+    pair = PAIRS["simple"][0]
+    # Columns: radial, tangent and normal of the needle's point, in the hole's frame.
+    if task == "place":
+        hole, angle = pair.entry.pose, needle.TIP_ANGLE
+        target = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    else:
+        hole, angle = pair.exit.pose, INSERT_ANGLE
+        target = np.array([[-1.0, 0, 0, INSERT_DEPTH], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    point = np.eye(4)
+    point[:3, 0], point[:3, 1], point[:3, 3] = -needle.radial(angle), needle.tangent(angle), needle.point(angle)
+    return hole @ target @ np.linalg.inv(point)
+
+
+def grip_error(episode: Episode, task: str) -> float:
+    """Return how far the needle would lie outside the jaws that hold it [m]; 0 where it is inside or not held."""
+    if task not in ("place", "insert"):
+        return 0.0
+    base = kinematics.base_in_world(names.ACTIVE_ARM[task])
+    x, y, z = (np.linalg.inv(needle_path(episode, task)[0]) @ base @ pose_matrix(episode.pose[0]))[:3, 3]
+    radial = abs(np.hypot(x, y) - needle.RADIUS) - RADIAL_SLACK
+    return float(max(radial, DEPTHS[0] - z, z - DEPTHS[1], 0.0))
+
+
+def actions(episode: Episode, step: str) -> tuple[np.ndarray, int]:
+    """Return the motion as actions of our envs, (T, 7) float32, and how many had to be clipped to [-1, 1]."""
+    return moves(np.stack([pose_matrix(row) for row in episode.pose]), episode.pose[:, 6], step)
+
+
+def moves(tip: np.ndarray, jaw: np.ndarray, step: str) -> tuple[np.ndarray, int]:
+    """Return a motion as actions, (T, 7) float32, and how many had to be clipped to [-1, 1].
+
+    Args:
+        tip: T_base_tip (T + 1, 4, 4).
+        jaw: (T + 1,) [rad].
+        step: a key of `STEPS`.
+    """
+    metres, degrees, opening = STEPS[step]
+    turns = [matrix_to_rotvec(after[:3, :3] @ before[:3, :3].T) for before, after in itertools.pairwise(tip)]
+    shifts = np.diff(tip[:, :3, 3], axis=0)
+    values = np.column_stack([shifts / metres, np.stack(turns) / np.radians(degrees), np.diff(jaw) / opening])
+    inside = np.clip(values, -1.0, 1.0)
+    return inside.astype(np.float32), int((np.abs(values - inside) > 1e-4).any(axis=1).sum())
+
+
+@dataclass(frozen=True)
+class Track:
+    """Where everything is in each of T + 1 states.
+
+    Attributes:
+        arms: arm → T_base_tip (T + 1, 4, 4) and jaw (T + 1,) [rad]; others stand at their start.
+        needle: T_world_needle (T + 1, 4, 4).
+        grasp_angle: the needle's point that is grasped [rad], where the task has one.
+        passed: `Memory.passed` in each state, (T + 1,), or None: as the task's start has it.
+    """
+
+    arms: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    needle: np.ndarray
+    grasp_angle: float
+    passed: np.ndarray | None = None
+
+
+class Replay:
+    """Replays episodes of one task."""
+
+    def __init__(self, config: TaskConfig):
+        import surgicai_vision.envs as envs
+
+        self.config = config
+        self._env: Any = envs.make(config)
+
+    def demo(self, episode: Episode) -> tuple[Demo, int]:
+        """Return the episode as a demonstration, and how many actions were clipped.
+
+        Raises:
+            UnreachablePose: a pose outside the arms' joint limits.
+        """
+        task = self.config.task
+        tips = np.stack([pose_matrix(row) for row in episode.pose])
+        track = Track(
+            {names.ACTIVE_ARM[task]: (tips, episode.pose[:, 6])},
+            needle_path(episode, task),
+            GRASP_ANGLE if task == "grasp" else 0.0,
+        )
+        states, infos = self.play(track)
+        action, clipped = actions(episode, self.config.step)
+        demo = self.as_demo(
+            "surgicai",
+            states,
+            action=action,
+            reward=episode.reward.astype(np.float32),
+            success=episode.success,
+            contact=np.array([info["contact"] for info in infos[1:]]),
+        )
+        return demo, clipped
+
+    def play(self, track: Track) -> tuple[np.ndarray, list[dict[str, Any]]]:
+        """Pose the scene state by state; return the states (T + 1, n) and what is measured in each.
+
+        Raises:
+            UnreachablePose: a pose outside the arms' joint limits.
+        """
+        from surgicai_vision.envs.teleport import pose_scene
+
+        env = self._env
+        env.reset(seed=0)
+        arms = dict(track.arms)
+        if self.config.task == "handoff" and names.PSM2 not in arms:
+            tip, jaw = self._hold(track.needle[0])
+            arms[names.PSM2] = np.broadcast_to(tip, track.needle.shape), np.full(len(track.needle), jaw)
+        states, infos = [], []
+        for index, needle_pose in enumerate(track.needle):
+            poses = {arm: (tip[index], float(jaw[index])) for arm, (tip, jaw) in arms.items()}
+            pose_scene(env, **poses, T_world_needle=needle_pose)
+            memory = env.simulation.memory
+            memory.grasp_angle = track.grasp_angle or memory.grasp_angle
+            if track.passed is not None:
+                memory.passed = float(track.passed[index])
+            infos.append(env.measure())
+            states.append(env.get_state())
+        return np.stack(states), infos
+
+    def reward(self, success: bool, info: Mapping[str, Any]) -> float:
+        """Return the env's reward of a state that is judged a success or none."""
+        return self._env.reward({**info, "is_success": success})
+
+    def as_demo(self, source: str, states: np.ndarray, **columns: np.ndarray) -> Demo:
+        """Return states and the columns `action`, `reward`, `success`, `contact` as a demonstration."""
+        phase = np.full(len(states) - 1, names.SUBTASKS.index(self.config.task), np.int8)
+        scene = self._env.scene.hash
+        return Demo(self.config, -1, source, scene, code_version(), states, phase=phase, **columns)
+
+    def _hold(self, needle_pose: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return PSM2's pose (T_base_tip, jaw) that holds the needle near its base."""
+        from surgicai_vision.envs.geometry import grasp_in_needle
+        from surgicai_vision.envs.starts import CLOSED_JAW
+
+        base = np.linalg.inv(kinematics.base_in_world(names.PSM2))
+        for angle in HOLD_ANGLES:
+            tip = base @ needle_pose @ grasp_in_needle(names.PSM2, float(angle))
+            try:
+                kinematics.inverse(tip, self.config.scene.instrument)
+            except UnreachablePose:
+                continue
+            return tip, CLOSED_JAW
+        raise UnreachablePose("PSM2 cannot reach the needle to hold it during the handoff.")

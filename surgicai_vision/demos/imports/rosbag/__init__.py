@@ -1,0 +1,1 @@
+"""ROS bags: read without ROS, resampled, segmented and replayed in this scene."""

@@ -1,0 +1,206 @@
+"""ROS messages: the few types that describe a demonstration, decoded from bytes without running a line of theirs.
+
+`rosbags` would turn a bag's message definitions into Python code and run it. Here a definition is data: a table of
+fields that a cursor follows. The tables below are the published ones (common_interfaces, ambf_msgs); only of AMBF's
+own types, which changed between its versions, is the bag's text read, and it may name nothing but what stands here.
+
+    layout = layout_of("geometry_msgs/PoseStamped", ros1=True)
+    decode(data, layout, ros1=True)["pose.position.x"]
+"""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from surgicai_vision.core.errors import BadFile
+from surgicai_vision.demos.imports.rosbag.config import clean
+
+PRIMITIVES: Mapping[str, str] = MappingProxyType(
+    {
+        "bool": "B", "byte": "b", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
+        "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+    }
+)  # fmt: skip
+"""ROS type → `struct` code."""
+STRING = "string"
+
+_WHOLE = ["int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"]
+_NAMES = {"int": "Int", "uint": "UInt"}
+
+
+def _spelled(whole: str) -> str:
+    kind = whole.rstrip("0123456789")
+    return _NAMES[kind] + whole[len(kind) :]
+
+
+WHOLE_NUMBERS = tuple(f"std_msgs/{_spelled(whole)}" for whole in _WHOLE)
+DEFINITIONS: Mapping[str, str] = MappingProxyType(
+    {
+        "std_msgs/Header": "uint32 sec\nuint32 nanosec\nstring frame_id",
+        "std_msgs/String": "string data",
+        "std_msgs/Float32": "float32 data",
+        "std_msgs/Float64": "float64 data",
+        **{name: f"{whole} data" for name, whole in zip(WHOLE_NUMBERS, _WHOLE, strict=True)},
+        "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
+        "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+        "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+        "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+        "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
+        "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+        "geometry_msgs/Wrench": "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque",
+        "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
+        "geometry_msgs/TransformStamped": (
+            "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
+        ),
+        "sensor_msgs/JointState": (
+            "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
+        ),
+        "ambf_msgs/RigidBodyState": (
+            "Header header\nuint32 sim_step\nstd_msgs/String identifier\nstd_msgs/String name\nfloat32 wall_time\n"
+            "float32 sim_time\nfloat32 mass\ngeometry_msgs/Point pInertia\ngeometry_msgs/Pose pose\n"
+            "geometry_msgs/Twist twist\ngeometry_msgs/Wrench wrench\nstring[] children_names\nstring[] joint_names\n"
+            "float32[] joint_positions\nfloat32[] joint_velocities\nfloat32[] joint_efforts"
+        ),
+        "ambf_msgs/ObjectState": (
+            "Header header\nuint32 sim_step\nstd_msgs/String name\nfloat32 wall_time\nfloat32 sim_time\nfloat32 mass\n"
+            "geometry_msgs/Point pInertia\ngeometry_msgs/Pose pose\ngeometry_msgs/Wrench wrench\n"
+            "string userdata_description\nstring[] children_names\nstring[] joint_names\nfloat32[] userdata\n"
+            "float32[] joint_positions"
+        ),
+    }
+)
+"""Message type → its fields, one "type name" a line. ROS 1 headers have a counter before the stamp: `_flatten`."""
+AMBF = ("ambf_msgs/RigidBodyState", "ambf_msgs/ObjectState")
+MAX_FIELDS, MAX_TEXT = 200, 20_000
+"""Fields of a definition, and characters of its text, that are read."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """One number, text, or sequence of them."""
+
+    name: str
+    kind: str
+    many: bool
+
+
+Layout = tuple[Field, ...]
+
+
+def layout_of(kind: str, *, ros1: bool, text: str = "") -> Layout:
+    """Return a type's fields in the order of its bytes.
+
+    Args:
+        kind: a key of `DEFINITIONS`.
+        ros1: serialised by ROS 1.
+        text: the definition in the bag; read for AMBF's types alone.
+
+    Raises:
+        BadFile: an unknown type, or a definition of AMBF's with fields that are not among the known types.
+    """
+    if kind not in DEFINITIONS:
+        raise BadFile(f"messages of type {clean(kind)} are not read; known are {', '.join(sorted(DEFINITIONS))}.")
+    own = text.split("\n====", 1)[0] if kind in AMBF else ""
+    return tuple(_flatten(own if own.strip() else DEFINITIONS[kind], "", ros1))
+
+
+def _flatten(text: str, prefix: str, ros1: bool) -> list[Field]:
+    fields: list[Field] = []
+    for kind, name in _lines(text):
+        many = kind.endswith("[]")
+        plain = kind.removesuffix("[]")
+        plain = "std_msgs/Header" if plain == "Header" else plain.replace("/msg/", "/")
+        if plain in PRIMITIVES or plain == STRING:
+            fields.append(Field(prefix + name, plain, many))
+        elif plain in DEFINITIONS and plain not in AMBF and not many:
+            if plain == "std_msgs/Header" and ros1:
+                fields.append(Field(f"{prefix}{name}.seq", "uint32", False))
+            fields += _flatten(DEFINITIONS[plain], f"{prefix}{name}.", ros1)
+        else:
+            raise BadFile(f"a message definition has a field of type {clean(kind)}, which is not read.")
+    if len(fields) > MAX_FIELDS:
+        raise BadFile(f"a message definition has {len(fields)} fields; above {MAX_FIELDS} are not read.")
+    return fields
+
+
+def _lines(text: str) -> list[tuple[str, str]]:
+    """Return (type, name) of each field of a definition; comments and constants are left out."""
+    if len(text) > MAX_TEXT:
+        raise BadFile(f"a message definition has {len(text)} characters; above {MAX_TEXT} are not read.")
+    pairs = []
+    for line in text.splitlines():
+        words = line.split("#", 1)[0].split()
+        if not words or any("=" in word for word in words):
+            continue
+        if len(words) < 2 or not words[1].isidentifier():
+            raise BadFile(f"a message definition has the line '{clean(line.strip())}', which is no 'type name'.")
+        pairs.append((words[0], words[1]))
+    return pairs
+
+
+def decode(data: bytes | memoryview, layout: Layout, *, ros1: bool) -> dict[str, Any]:
+    """Return a message's fields by name, nested ones with dots.
+
+    Args:
+        data: serialised; of ROS 2 with CDR's four bytes of encapsulation.
+        layout: its fields.
+        ros1: serialised by ROS 1, which does not align.
+
+    Raises:
+        ValueError: bytes that do not fit the layout: too few, too many, a length beyond the end.
+    """
+    cursor = _Cursor(bytes(data), ros1)
+    values = {field.name: cursor.take(field) for field in layout}
+    cursor.finish()
+    return values
+
+
+class _Cursor:
+    """Goes through a message's bytes."""
+
+    def __init__(self, data: bytes, ros1: bool):
+        self._order, self._start, self._aligned = "<", 0, not ros1
+        if not ros1:
+            if len(data) < 4 or data[:2] not in (b"\0\0", b"\0\1"):
+                raise ValueError("no plain CDR")
+            self._order, self._start = "<" if data[1] else ">", 4
+        self._data, self._place = data, self._start
+
+    def take(self, field: Field) -> Any:
+        """Return the next field's value: a number, a text, or a tuple of them."""
+        if not field.many:
+            return self._text() if field.kind == STRING else self._numbers(PRIMITIVES[field.kind], 1)[0]
+        count = self._numbers("I", 1)[0]
+        if count > len(self._data) - self._place:
+            raise ValueError(f"a sequence of {count} in {len(self._data)} bytes")
+        if field.kind == STRING:
+            return tuple(self._text() for _ in range(count))
+        return self._numbers(PRIMITIVES[field.kind], count) if count else ()
+
+    def finish(self) -> None:
+        """Refuse bytes that are left over, other than CDR's padding."""
+        left = len(self._data) - self._place
+        if left > (3 if self._aligned else 0):
+            raise ValueError(f"{left} bytes too many")
+
+    def _numbers(self, code: str, count: int) -> tuple[Any, ...]:
+        size = struct.calcsize(f"={code}")
+        if self._aligned:
+            self._place += -(self._place - self._start) % size
+        end = self._place + size * count
+        if end > len(self._data):
+            raise ValueError(f"{end - len(self._data)} bytes too few")
+        values = struct.unpack_from(f"{self._order}{count}{code}", self._data, self._place)
+        self._place = end
+        return values
+
+    def _text(self) -> str:
+        count = self._numbers("I", 1)[0]
+        end = self._place + count
+        if end > len(self._data):
+            raise ValueError(f"a text of {count} in {len(self._data)} bytes")
+        text = self._data[self._place : end].decode()
+        self._place = end
+        return text.removesuffix("\0")

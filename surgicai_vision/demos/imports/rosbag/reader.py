@@ -1,0 +1,310 @@
+"""Bags as arrays: what ROS 1 and ROS 2 recorded on a few topics, before anything is believed about it.
+
+    arrays = read(Path("trial.bag"), {"psm2_pose": "/PSM2/measured_cp", "needle": "/needle/measured_cp"})
+
+The library `rosbags` opens the containers: `.bag`, a ROS 2 folder (`metadata.yaml` with sqlite3 or mcap storage), a
+single `.db3` or `.mcap`. Messages are decoded by `ros_messages`, never by code made from the bag's own definitions.
+Runs where `foreign` puts it.
+
+Returned is `topics`, what there is, and per role whose topic is there, of N messages in the order of the bag:
+`<role>.time` when received and `<role>.stamp` in the header (0 where there is none), both (N,) int64 [ns];
+`<role>.value`; `<role>.type` and `<role>.frame`, one text each. Values: poses (N, 7), x y z in the recording's unit
+and a unit quaternion w x y z; joints (N, 6); jaw (N,); label (N,) texts.
+"""
+
+import bz2
+import itertools
+import re
+import sqlite3
+from array import array
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import lz4.frame
+import numpy as np
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag1 import reader as ros1_reader
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2 import reader as ros2_reader
+from rosbags.rosbag2 import storage_mcap
+
+from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.demos.imports.rosbag.config import ENDINGS, METADATA, clean, is_bag, listed
+from surgicai_vision.demos.imports.rosbag.messages import AMBF, WHOLE_NUMBERS, Layout, decode, layout_of
+
+POSES = (
+    "geometry_msgs/PoseStamped",
+    "geometry_msgs/TransformStamped",
+    "geometry_msgs/Pose",
+    "geometry_msgs/Transform",
+)
+KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "pose": POSES,
+        "joints": ("sensor_msgs/JointState", *AMBF),
+        "jaw": ("sensor_msgs/JointState", "std_msgs/Float64", "std_msgs/Float32", *AMBF),
+        "needle": (*POSES, *AMBF),
+        "label": ("std_msgs/String", *WHOLE_NUMBERS),
+    }
+)
+"""What a role's last word means → the message types that can say it."""
+ROLES = ("psm1_pose", "psm1_jaw", "psm1_joints", "psm2_pose", "psm2_jaw", "psm2_joints", "needle", "label")
+
+MAX_MESSAGES, MAX_MESSAGE, MAX_CHUNK, MAX_METADATA, MAX_DEPTH = 5_000_000, 2**20, 2**26, 2**18, 20
+"""What is read at most: messages of all roles, bytes of a message, of an unpacked chunk, of the text that describes a
+ROS 2 folder, and how deep its brackets go. ROS packs chunks of 768 KB; one picture makes them larger."""
+MAX_LISTED = 1000
+"""Topics of a bag that are looked at to be named."""
+UNIT = 0.01
+"""Furthest a quaternion's length may be from 1."""
+_POSE_FIELDS = (
+    ("pose.position", "pose.orientation"),
+    ("position", "orientation"),
+    ("transform.translation", "transform.rotation"),
+    ("translation", "rotation"),
+)
+
+
+def read(path: Path, topics: Mapping[str, str], needed: Collection[str] = ()) -> dict[str, np.ndarray]:
+    """Read the messages of some topics.
+
+    Args:
+        path: the bag.
+        topics: role, one of `ROLES` → topic.
+        needed: roles whose topic must be there; the others may be missing.
+
+    Raises:
+        InputError: a needed topic is not there, or of a type that cannot be its role's; names what there is.
+        BadFile: missing, damaged, malicious, or with numbers that are not finite.
+    """
+    try:
+        _inspect(path)
+        with Reader1(path) if path.suffix == ".bag" else Reader2(path) as reader:
+            return _read(reader, path, topics, needed)
+    except InputError as error:
+        raise error if str(path) in str(error) else type(error)(f"{path}: {error}") from None
+    except Exception as error:  # a damaged bag can fail in any way, and ask for any amount of memory
+        line = clean((str(error).splitlines() or ["it asks for too much"])[0], 160)
+        raise BadFile(f"{path} is not a readable bag ({type(error).__name__}: {line}).") from None
+
+
+def _read(reader: Any, path: Path, topics: Mapping[str, str], needed: Collection[str]) -> dict[str, np.ndarray]:
+    ros1 = isinstance(reader, Reader1)
+    there = {connection.topic: _plain(connection.msgtype) for connection in reader.connections}
+    known = [f"{clean(topic)} ({clean(kind)})" for topic, kind in sorted(there.items())[:MAX_LISTED]]
+    missing = [role for role in needed if topics[role] not in there]
+    if missing:
+        wanted_topic = topics[missing[0]]
+        raise InputError(f"{path} has no topic {wanted_topic} ({missing[0]}); it has {listed(known, wanted_topic)}.")
+    wanted = [connection for connection in reader.connections if connection.topic in topics.values()]
+    layouts = {}
+    for connection in wanted:
+        _check_kind(connection, topics)
+        layouts[connection.topic] = layout_of(_plain(connection.msgtype), ros1=ros1, text=connection.msgdef.data)
+    columns = {role: _Column(role, topic, path) for role, topic in topics.items() if topic in there}
+    if wanted:
+        _fill(reader, wanted, layouts, columns, ros1)
+    arrays = {"topics": np.array(known, dtype=str)}
+    for role, column in columns.items():
+        if len(column.times):
+            arrays |= column.arrays(there[topics[role]])
+        elif role in needed:
+            raise InputError(f"{path} has no message on {topics[role]} ({role}).")
+    return arrays
+
+
+def _fill(
+    reader: Any, wanted: list[Any], layouts: Mapping[str, Layout], columns: Mapping[str, "_Column"], ros1: bool
+) -> None:
+    """Read the messages of the wanted connections into the columns of their roles."""
+    heard: dict[str, list[_Column]] = {}
+    for column in columns.values():
+        heard.setdefault(column.topic, []).append(column)
+    for number, (connection, time, data) in enumerate(reader.messages(wanted)):
+        if number >= MAX_MESSAGES or len(data) > MAX_MESSAGE:
+            raise BadFile(f"it has over {MAX_MESSAGES} messages, or one over {MAX_MESSAGE >> 20} MB.")
+        try:
+            message = decode(data, layouts[connection.topic], ros1=ros1)
+        except ValueError as error:
+            kind = clean(_plain(connection.msgtype))
+            raise BadFile(f"a message on {connection.topic} is no {kind} ({error}).") from None
+        for column in heard[connection.topic]:
+            column.add(time, message)
+
+
+def _check_kind(connection: Any, topics: Mapping[str, str]) -> None:
+    """Refuse a topic whose messages cannot say what its role needs."""
+    kind = _plain(connection.msgtype)
+    for role, topic in topics.items():
+        allowed = KINDS[role.rsplit("_", 1)[-1]]
+        if topic == connection.topic and kind not in allowed:
+            raise InputError(f"{topic} ({role}) holds {clean(kind)}; {role} is read from {', '.join(allowed)}.")
+
+
+class _Column:
+    """What one role's topic said: numbers by the hundred thousand, so kept as numbers.
+
+    Args:
+        role: one of `ROLES`.
+        topic: its topic.
+        path: the bag, for messages.
+    """
+
+    def __init__(self, role: str, topic: str, path: Path):
+        self.topic, self.times = topic, array("q")
+        self._name, self._where = role, f"{path}: {topic} ({role})"
+        self._read = _VALUES[role.rsplit("_", 1)[-1]]
+        self._stamps, self._numbers, self._width = array("q"), array("d"), 0
+        self._texts: list[str] = []
+        self._frames: set[str] = set()
+
+    def add(self, time: int, message: Mapping[str, Any]) -> None:
+        """Take a message that was received at `time` [ns]."""
+        try:
+            value = self._read(message)
+        except (IndexError, KeyError):
+            raise InputError(f"{self._where} has messages without the values that {self._name} needs.") from None
+        self.times.append(time)
+        self._stamps.append(message.get("header.sec", 0) * 10**9 + message.get("header.nanosec", 0))
+        self._frames.add(str(message.get("header.frame_id", "")))
+        if len(self._frames) > 1:
+            raise InputError(f"{self._where} changes its frame: {clean(', '.join(sorted(self._frames)), 160)}.")
+        if isinstance(value, str):
+            self._texts.append(value)
+        else:
+            self._numbers.extend(value)
+            self._width = len(value)
+
+    def arrays(self, kind: str) -> dict[str, np.ndarray]:
+        """Return the role's arrays.
+
+        Raises:
+            BadFile: numbers that are not finite, rotations that are none.
+        """
+        value = np.array(self._texts) if self._texts else np.array(self._numbers).reshape(-1, self._width)
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            raise BadFile(f"{self._where} holds numbers that are not finite.")
+        if self._width == 7:
+            lengths = np.linalg.norm(value[:, 3:], axis=1)
+            if np.abs(lengths - 1.0).max() > UNIT:
+                raise BadFile(f"{self._where} holds rotations that are no unit quaternions.")
+            value[:, 3:] /= lengths[:, None]
+        return {
+            f"{self._name}.time": np.array(self.times),
+            f"{self._name}.stamp": np.array(self._stamps),
+            f"{self._name}.value": value[:, 0] if self._width == 1 else value,
+            f"{self._name}.type": np.array(kind),
+            f"{self._name}.frame": np.array(next(iter(self._frames))),
+        }
+
+
+def _pose(message: Mapping[str, Any]) -> list[float]:
+    for place, turn in _POSE_FIELDS:
+        if f"{place}.x" in message:
+            return [message[f"{place}.{axis}"] for axis in "xyz"] + [message[f"{turn}.{axis}"] for axis in "wxyz"]
+    raise KeyError("pose")
+
+
+def _joints(message: Mapping[str, Any]) -> list[float]:
+    values = message["position"] if "position" in message else message["joint_positions"]
+    if len(values) < 6:
+        raise IndexError("six joints")
+    return [float(value) for value in values[:6]]
+
+
+def _jaw(message: Mapping[str, Any]) -> list[float]:
+    if "data" in message:
+        return [float(message["data"])]
+    # AMBF's state of a PSM has its two fingers behind the six joints.
+    return [float(message["position"][0] if "position" in message else message["joint_positions"][6])]
+
+
+_VALUES: Mapping[str, Callable[[Mapping[str, Any]], Any]] = MappingProxyType(
+    {
+        "pose": _pose,
+        "needle": _pose,
+        "joints": _joints,
+        "jaw": _jaw,
+        "label": lambda message: str(message["data"])[:64],
+    }
+)
+
+
+def _plain(kind: str) -> str:
+    """Return a message type as ROS 1 spells it."""
+    return kind.replace("/msg/", "/")
+
+
+# -- before rosbags sees it -------------------------------------------------------------------------------------------
+
+
+def _inspect(path: Path) -> None:
+    """Refuse what `rosbags` would follow too far: what is no bag, files of packed files, databases with programs."""
+    if not path.exists():
+        raise BadFile(f"Cannot read {path}: no such file.")
+    if not is_bag(path):
+        raise BadFile(f"{path} is no bag; a bag is a file ending in {', '.join(ENDINGS)} or a folder with {METADATA}.")
+    if path.is_dir():
+        _inspect_metadata(path / METADATA)
+    for database in [path] if path.suffix == ".db3" else sorted(path.glob("*.db3")) if path.is_dir() else []:
+        _inspect_database(database)
+
+
+def _inspect_metadata(path: Path) -> None:
+    """Look at a folder's description before `rosbags` parses it: a YAML parser takes seconds over deep brackets."""
+    size = path.stat().st_size
+    if size > MAX_METADATA:
+        raise BadFile(f"{path} has {size} bytes; above {MAX_METADATA} are not read.")
+    text = path.read_text(encoding="utf-8", errors="replace")
+    opened = itertools.accumulate(1 if mark in "[{" else -1 for mark in re.findall(r"[][{}]", text))
+    if "rosbag2_bagfile_information:" not in text or max(opened, default=0) > MAX_DEPTH:
+        raise BadFile(f"{path} is no description of a ROS 2 bag.")
+    if re.search(r"compression_mode\W+file\b", text, re.IGNORECASE):
+        raise BadFile(f"{path.parent} is packed file by file; unpack it first (zstd -d, then `ros2 bag reindex`).")
+
+
+def _inspect_database(path: Path) -> None:
+    """Refuse a database with anything but tables and indices: views and triggers are programs."""
+    connection = sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)
+    try:
+        rows = connection.execute("SELECT type, name, sql FROM sqlite_master").fetchmany(1000)
+    finally:
+        connection.close()
+    for kind, name, sql in rows:
+        if kind not in ("table", "index") or "VIRTUAL" in str(sql).upper() or "GENERATED" in str(sql).upper():
+            raise BadFile(f"{path} has a {clean(kind)} '{clean(name, 40)}', which no ROS 2 bag has; it is not read.")
+
+
+def _bounded(whole: bytes) -> bytes:
+    if len(whole) > MAX_CHUNK:
+        raise BadFile(f"a chunk unpacks to more than {MAX_CHUNK >> 20} MB; it is not read.")
+    return whole
+
+
+def _bz2(data: bytes) -> bytes:
+    return _bounded(bz2.BZ2Decompressor().decompress(data, MAX_CHUNK + 1))
+
+
+def _lz4(data: bytes) -> bytes:
+    return _bounded(lz4.frame.LZ4FrameDecompressor().decompress(data, MAX_CHUNK + 1))
+
+
+def _zstd(data: bytes) -> bytes:
+    return _bounded(_unpacker().decompress(data, MAX_CHUNK + 1))
+
+
+_unpacker = storage_mcap.zstd.ZstdDecompressor
+
+
+class _Zstd:
+    """What `rosbags` uses of zstd for single messages."""
+
+    decompress = staticmethod(_zstd)
+
+
+# `rosbags` unpacks a chunk however large it becomes; here it stops at `MAX_CHUNK`.
+ros1_reader.decompressors.update({"bz2": _bz2, "lz4": _lz4})
+storage_mcap.DECOMPRESSORS.update({"lz4": lambda data, _: _lz4(data), "zstd": lambda data, _: _zstd(data)})
+setattr(ros2_reader, "zstd", _Zstd)  # noqa: B010  # typed as a module

@@ -1,0 +1,215 @@
+"""Recording: what a bag says of both arms and the needle, at the control rate and in our frames.
+
+    recording = recording_of(read_foreign(path, "bag", topics=config.all_topics), config)
+
+Each topic has its own times, with jitter and messages lost. Times are those of the headers where there are headers
+(shifted by the median delay, so that they agree with topics that have none), or else those of reception. Positions,
+joints and jaws are interpolated linearly between the two messages around a sample, rotations by slerp; labels and
+commands (a jaw from `servo_jp`) are those last heard. A sample between two messages further apart than `max_gap` is
+not `valid`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.demos.imports.rosbag.config import BagConfig, clean, listed
+from surgicai_vision.demos.imports.rosbag.messages import AMBF
+from surgicai_vision.scene import kinematics
+
+RATE = float(names.FPS)
+"""Samples per second: the control rate."""
+LONGEST = 3600.0
+"""Longest recording that is resampled [s]."""
+AMBF_UNIT = 0.1
+"""Metres in a unit of length of the challenge's AMBF scenes (its `SimToSI`)."""
+COMMANDS = ("servo_jp", "move_jp")
+"""Last words of CRTK's topics that command joints."""
+ELSEWHERE = ("ecm", "cam")
+"""What the name of a frame that is no arm's base contains: poses relative to the endoscope."""
+
+Arrays = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One arm's motion: T_base_tip (N, 4, 4), and one finger's angle (N,) [rad] or None where nothing says it."""
+
+    tip: np.ndarray
+    jaw: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """N samples at `RATE`.
+
+    Attributes:
+        arms: arm → its motion; arms that were not recorded are missing.
+        needle: T_world_needle (N, 4, 4), or None.
+        label: label last heard, (N,) texts, "" before the first; or None.
+        valid: (N,) bool; False in a gap of any topic but labels and commands.
+        time: since the first sample, as recorded, (N,) [s].
+        topics: every topic of the bag with its type, for messages.
+    """
+
+    arms: Mapping[str, Arm]
+    needle: np.ndarray | None
+    label: np.ndarray | None
+    valid: np.ndarray
+    time: np.ndarray
+    topics: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Return the number of samples N."""
+        return len(self.valid)
+
+
+def recording_of(arrays: Arrays, config: BagConfig, instrument: str) -> Recording:
+    """Return what was read from a bag at the control rate.
+
+    Args:
+        arrays: see `bags.read`.
+        config: how to read it.
+        instrument: the instrument whose joints these are, where there are joints and no pose.
+
+    Raises:
+        InputError: no arm, no time in which all topics overlap, poses in a frame that is not the arm's base.
+    """
+    times = _times(arrays, config)
+    roles = _roles(arrays, config)
+    steady = [role for role in roles if not _told(role, config)]
+    begin = max(times[role].min() for role in steady)
+    end = min(times[role].max() for role in steady)
+    if not begin < end <= begin + LONGEST * 1e9 * config.speed:
+        raise InputError(
+            f"The topics overlap in {(end - begin) / 1e9:.1f} s; that must be above 0 and at most {LONGEST:.0f} s."
+        )
+    step = 1e9 / RATE * config.speed
+    grid = np.arange(0.0, (end - begin) + 1e-6 * step, step)
+    tracks = {role: _distinct(times[role], arrays[f"{role}.value"], begin) for role in roles}
+    valid = np.ones(len(grid), bool)
+    for role in steady:
+        valid &= _covered(tracks[role][0], grid, config.max_gap * 1e9)
+    arms: dict[str, Arm] = {}
+    for role in roles:
+        arm, _, kind = role.partition("_")
+        if kind in ("pose", "joints"):
+            jaw = _jaw(f"{arm}_jaw", tracks, grid, config)
+            arms[arm] = Arm(_tip(role, tracks[role], grid, arrays, config, instrument), jaw)
+    needle = _needle(tracks["needle"], grid, arrays, config) if "needle" in tracks else None
+    label = None
+    if "label.value" in arrays:
+        spoken = _distinct(times["label"], arrays["label.value"], begin)
+        label = np.where(spoken[0][0] <= grid, _last(spoken, grid), "")
+    return Recording(arms, needle, label, valid, grid / 1e9, tuple(map(str, arrays["topics"])))
+
+
+def _told(role: str, config: BagConfig) -> bool:
+    """Say whether a role's topic has commands, which come when something changes and hold until the next."""
+    return role.endswith("_jaw") and config.all_topics[role].rsplit("/", 1)[-1] in COMMANDS
+
+
+def _last(track: "Track", grid: np.ndarray) -> np.ndarray:
+    """Return the value last heard at each sample, before the first one the first."""
+    times, values = track
+    return values[np.maximum(np.searchsorted(times, grid, side="right") - 1, 0)]
+
+
+def _jaw(role: str, tracks: Mapping[str, "Track"], grid: np.ndarray, config: BagConfig) -> np.ndarray | None:
+    """Return one finger's angle (N,) [rad]; None where it is not on record."""
+    if role not in tracks:
+        return None
+    return config.jaw * (_last(tracks[role], grid) if _told(role, config) else np.interp(grid, *tracks[role]))
+
+
+def _roles(arrays: Arrays, config: BagConfig) -> list[str]:
+    """Return the roles that are interpolated: of each arm its pose or else its joints, its jaw, and the needle."""
+    roles: list[str] = []
+    for arm in names.ARMS:
+        placed = [role for role in (f"{arm}_pose", f"{arm}_joints") if f"{role}.value" in arrays][:1]
+        roles += placed + [role for role in (f"{arm}_jaw",) if placed and f"{role}.value" in arrays]
+    if not roles:
+        wanted = ", ".join(config.all_topics[f"{arm}_pose"] for arm in names.ARMS)
+        there = listed(arrays["topics"].tolist(), wanted)
+        raise InputError(f"The recording has the pose of no arm: none of {wanted}. The topics are {there}.")
+    return [*roles, "needle"] if "needle.value" in arrays else roles
+
+
+def _times(arrays: Arrays, config: BagConfig) -> dict[str, np.ndarray]:
+    """Return each role's times [ns], int64, on one clock."""
+    roles = [key.removesuffix(".time") for key in arrays if key.endswith(".time")]
+    stamped = [role for role in roles if (arrays[f"{role}.stamp"] > 0).all()]
+    times = {role: arrays[f"{role}.time"] for role in roles}
+    if config.clock == "bag" or (config.clock == "auto" and not stamped):
+        return times
+    if not stamped:
+        raise InputError("clock is 'stamp', but the messages have no stamps; take 'bag' or 'auto'.")
+    late = np.concatenate([times[role] - arrays[f"{role}.stamp"] for role in stamped])
+    shift = int(np.median(late))
+    return {**times, **{role: arrays[f"{role}.stamp"] + shift for role in stamped}}
+
+
+def _distinct(times: np.ndarray, values: np.ndarray, begin: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return times since `begin` [ns] in order and once each, with their values; of a repeated time the last."""
+    order = np.argsort(times, kind="stable")
+    since, values = (times[order] - begin).astype(np.float64), values[order]
+    last = np.append(np.diff(since) > 0, True)
+    return since[last], values[last]
+
+
+def _covered(times: np.ndarray, grid: np.ndarray, gap: float) -> np.ndarray:
+    """Say of each sample whether the messages around it are at most `gap` [ns] apart."""
+    after = np.clip(np.searchsorted(times, grid, side="left"), 0, len(times) - 1)
+    before = np.clip(np.searchsorted(times, grid, side="right") - 1, 0, len(times) - 1)
+    return times[after] - times[before] <= gap
+
+
+def resampled(times: np.ndarray, poses: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return poses (M, 7), x y z and quaternion w x y z, at other times as matrices (N, 4, 4)."""
+    found = np.tile(np.eye(4), (len(grid), 1, 1))
+    for axis in range(3):
+        found[:, axis, 3] = np.interp(grid, times, poses[:, axis])
+    turns = Rotation.from_quat(poses[:, 3:], scalar_first=True)
+    inside = np.clip(grid, times[0], times[-1])
+    found[:, :3, :3] = (Slerp(times, turns)(inside) if len(times) > 1 else turns[[0] * len(grid)]).as_matrix()
+    return found
+
+
+def as_matrix(pose: tuple[float, ...]) -> np.ndarray:
+    """Return x y z [m] and a quaternion w x y z as a pose (4, 4); the identity of nothing."""
+    return resampled(np.zeros(1), np.array([pose], dtype=float), np.zeros(1))[0] if pose else np.eye(4)
+
+
+Track = tuple[np.ndarray, np.ndarray]
+"""Times [ns] and values."""
+
+
+def _tip(role: str, track: Track, grid: np.ndarray, arrays: Arrays, config: BagConfig, instrument: str) -> np.ndarray:
+    """Return an arm's T_base_tip (N, 4, 4) from its poses or its joints."""
+    arm, kind = role.split("_")
+    times, values = track
+    if kind == "joints":
+        joints = np.column_stack([np.interp(grid, times, np.unwrap(column)) for column in values.T])
+        unit = AMBF_UNIT if str(arrays[f"{role}.type"]) in AMBF else config.length_scale
+        joints[:, kinematics.INSERTION] *= unit
+        return np.stack([kinematics.forward(row, instrument) for row in joints])
+    placed = getattr(config.frames, arm)
+    frame = str(arrays[f"{role}.frame"]).lower()
+    if not placed and any(part in frame for part in ELSEWHERE):
+        raise InputError(
+            f"{config.all_topics[role]} is in frame '{clean(frame)}', not in {arm}'s base. Take the topic that is "
+            f"(dVRK: /{arm.upper()}/local/measured_cp), or give the frame's place in the base as frames: {arm}."
+        )
+    scaled = values * np.array([config.length_scale] * 3 + [1.0] * 4)
+    return as_matrix(placed) @ resampled(times, scaled, grid) @ np.linalg.inv(as_matrix(config.frames.tip))
+
+
+def _needle(track: Track, grid: np.ndarray, arrays: Arrays, config: BagConfig) -> np.ndarray:
+    """Return T_world_needle (N, 4, 4)."""
+    scale = config.needle_scale or (AMBF_UNIT if str(arrays["needle.type"]) in AMBF else 1.0)
+    poses = resampled(track[0], track[1] * np.array([scale] * 3 + [1.0] * 4), grid)
+    return as_matrix(config.frames.needle) @ poses @ np.linalg.inv(as_matrix(config.frames.needle_offset))

@@ -1,0 +1,262 @@
+"""Segments: which part of a recording is which subtask, by labels or by what happens to the needle.
+
+    for segment in segments(recording, pair, config, task=None): ...
+
+By labels: the longest runs of one subtask. By events, in the order of the procedure, over and over:
+
+    grasp    until PSM2 holds the needle
+    place    until the tip passes the entry
+    insert   until the needle is where PSM1 will take it, after the tip has passed the exit
+    handoff  until PSM1 holds the needle
+    pullout  until the needle's last move in PSM1's jaws, after it has left the exit
+
+An arm holds the needle when its jaw is closed (0.2 rad, where the surgical robotics challenge grasps) with the needle
+within reach of its pads, for 0.1 s. Holes are passed by the very test of the envs (`envs.passage`). A recording that
+starts late starts with the subtask that is then under way, and a needle that is held as near to the entry as an
+insertion starts (5.5 mm, 12°) is inserted, not placed.
+"""
+
+import itertools
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.demos.imports.rosbag.config import NOTHING, BagConfig
+from surgicai_vision.demos.imports.rosbag.resample import RATE, Recording
+from surgicai_vision.envs import hole_crossing, poses
+from surgicai_vision.envs.geometry import Stitch, needle_frame
+from surgicai_vision.envs.insert import START_SHIFT, START_TURN
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.envs.task_state import Memory
+from surgicai_vision.scene import kinematics, needle
+from surgicai_vision.scene.arm import GRASP_DEPTH
+from surgicai_vision.scene.holes import HolePair
+from surgicai_vision.scene.kinematics import Pose
+from surgicai_vision.scene.rotations import geodesic_angle
+
+HOLD_JAW, HOLD_REACH, STILL = 0.2, 0.003, 0.02
+"""An arm holds the needle with its finger below this angle [rad], the needle this near its grasp point [m], and the
+finger not closing by more than this in the next 0.2 s [rad]."""
+SUSTAINED = 5
+"""Samples an event must last: 0.1 s."""
+SHORTEST = 10
+"""Samples of the shortest segment that is taken: 0.2 s."""
+ARRIVED, ARRIVED_TURN = 0.0005, np.radians(2.0)
+"""The needle has arrived when it is this near to where PSM1 takes it [m, rad]."""
+SLOW, SLOW_TURN, SLOW_JAW = 0.2e-3, np.radians(0.1), np.radians(1.0)
+"""Below these speeds an arm rests [m/s, rad/s]; the first two are the paper's."""
+WINDOW = 5
+"""Speeds are taken over this many samples to either side, 0.2 s in all: less would be the sensors' noise."""
+DRIFT, DRIFT_TURN = 0.25e-3, np.radians(1.0)
+"""A resting arm's sample is kept once it has crept this far from the last one kept: half a step."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Samples `start` to `stop`, the last one included, of one subtask."""
+
+    task: str
+    start: int
+    stop: int
+
+
+def segments(recording: Recording, pair: HolePair, config: BagConfig, task: str | None) -> list[Segment]:
+    """Return the segments of a recording, or those of one task, in order.
+
+    Args:
+        recording: the recording.
+        pair: the holes the needle goes through.
+        config: how to segment it.
+        task: the subtask that is wanted, and what a recording without labels and needle shows; None for all.
+
+    Raises:
+        InputError: nothing to segment by, an unknown label, or nothing found.
+    """
+    way = config.segmentation
+    if way == "auto":
+        way = "labels" if recording.label is not None else "events" if recording.needle is not None else NOTHING
+    if way == NOTHING:
+        if task is None:
+            raise InputError("The recording has no labels and no needle to segment it by: say what it shows (--task).")
+        return [Segment(task, 0, len(recording) - 1)]
+    found = _by_labels(recording, config) if way == "labels" else _by_events(recording, pair)
+    wanted = [segment for segment in found if task in (None, segment.task)]
+    if not wanted:
+        listed = ", ".join(sorted({segment.task for segment in found})) or "none"
+        raise InputError(f"The recording shows no {task or 'subtask'}; segmented by {way} it shows {listed}.")
+    return wanted
+
+
+def _by_labels(recording: Recording, config: BagConfig) -> list[Segment]:
+    if recording.label is None:
+        raise InputError(f"The recording has no labels; wanted is the topic {config.all_topics['label']}.")
+    meaning = {label: config.subtask_of(str(label)) for label in np.unique(recording.label)}
+    subtasks = np.array([meaning[label] for label in recording.label])
+    edges = [0, *(np.flatnonzero(subtasks[1:] != subtasks[:-1]) + 1), len(subtasks)]
+    runs = [
+        # The state after a run's last action is the first one of the next run.
+        Segment(str(subtasks[start]), int(start), min(int(stop), len(subtasks) - 1))
+        for start, stop in itertools.pairwise(edges)
+    ]
+    return [run for run in runs if run.task != NOTHING and run.stop - run.start >= SHORTEST]
+
+
+# -- events -----------------------------------------------------------------------------------------------------------
+
+
+def _by_events(recording: Recording, pair: HolePair) -> list[Segment]:
+    if recording.needle is None:
+        raise InputError("Contact and hole events need the needle's pose; the recording has none. Segment by labels.")
+    lying, last = recording.needle, len(recording) - 1
+    passed = holes_passed(lying, pair)
+    inside = (passed == 1.0) | (passed == 2.0)
+    first, second = (holds(recording, arm) for arm in names.ARMS)
+    found: list[Segment] = []
+    start = 0
+    while start < last:
+        taken = _next(second | inside, start)
+        entered = _next(inside, taken)
+        placed = taken if entered > taken and inside[entered] and _near_entry(lying[taken], pair) else entered
+        given = _next(first, _next(passed >= 2.0, placed))
+        there = _arrival(lying, placed, given) if first[given] else given
+        end = _release(first, lying, given) if first[given] else given
+        cuts = [start, taken, placed, there, given, end]
+        happened = [second[taken] or inside[taken], True, True, first[given], True]
+        found += [
+            Segment(task, begin, stop)
+            for task, begin, stop, done in zip(names.SUBTASKS, cuts[:-1], cuts[1:], happened, strict=True)
+            if done and stop - begin >= SHORTEST
+        ]
+        start = _next(~first, max(end, start + 1))
+    return found
+
+
+def _next(event: np.ndarray, start: int) -> int:
+    """Return the first sample from `start` on that an event holds, or the last sample."""
+    found = np.flatnonzero(event[start:])
+    return start + int(found[0]) if len(found) else len(event) - 1
+
+
+def holds(recording: Recording, arm: str) -> np.ndarray:
+    """Say of each sample whether an arm holds the needle, by the geometry alone, (N,) bool."""
+    motion = recording.arms.get(arm)
+    if motion is None or motion.jaw is None or recording.needle is None:
+        return np.zeros(len(recording), bool)
+    return held(arm, motion.tip, motion.jaw, recording.needle)
+
+
+def held(arm: str, tip: np.ndarray, jaw: np.ndarray, lying: np.ndarray) -> np.ndarray:
+    """Say whether an arm holds the needle: T_base_tip and T_world_needle (N, 4, 4), jaw (N,) [rad] → (N,) bool."""
+    tips = kinematics.base_in_world(arm) @ tip
+    grasps = tips[:, :3, 3] + GRASP_DEPTH * tips[:, :3, 2]
+    # In the needle's frame, clamped to its arc: the distance from a point to the nearest point of the needle.
+    x, y, z = np.einsum("nji,nj->in", lying[:, :3, :3], grasps - lying[:, :3, 3])
+    angle = np.clip(np.arctan2(y, -x), 0.0, needle.TIP_ANGLE)
+    away = np.sqrt((x + needle.RADIUS * np.cos(angle)) ** 2 + (y - needle.RADIUS * np.sin(angle)) ** 2 + z**2)
+    # A jaw that goes on closing has not closed on anything yet.
+    later = np.stack([np.pad(jaw, (0, shift), mode="edge")[shift:] for shift in range(2 * WINDOW)]).min(axis=0)
+    return sustained((jaw < HOLD_JAW) & (jaw <= later + STILL) & (away < HOLD_REACH))
+
+
+def sustained(event: np.ndarray) -> np.ndarray:
+    """Return an event (N,) bool without its runs shorter than `SUSTAINED`, save one that the recording cuts short."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], event.astype(int), [0]])))
+    kept = np.zeros(len(event), bool)
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        kept[start:stop] = stop - start >= SUSTAINED or stop == len(event)
+    return kept
+
+
+class _Lying:
+    """A needle alone: what `envs.passage` asks of a simulation."""
+
+    radius = needle.RADIUS
+
+    def __init__(self, pose: Pose):
+        self._pose = pose
+
+    def needle(self) -> Pose:
+        return self._pose
+
+    def needle_point(self, angle: float) -> tuple[float, float, float]:
+        x, y, z = (poses.square(self._pose) @ [*needle.point(angle), 1.0])[:3].tolist()
+        return x, y, z
+
+
+def holes_passed(lying: np.ndarray, pair: HolePair) -> np.ndarray:
+    """Return `Memory.passed` of each needle pose (N, 4, 4), as an episode would have it, (N,).
+
+    A needle that is out and comes back to the entry begins the next stitch, with none passed.
+    """
+    memory = Memory()
+    passed = []
+    for index, pose in enumerate(lying):
+        seen = cast(Simulation, _Lying(poses.flat(pose)))
+        if index == 0:
+            hole_crossing.remember_tip(seen, memory)
+            memory.passed = 2.0 if hole_crossing.in_both(seen, pair) else 0.0
+        else:
+            hole_crossing.watch(seen, memory, pair)
+            tip = np.array([memory.tip_x, memory.tip_y, memory.tip_z]) - pair.entry.centre
+            before = tip @ pair.entry.rotation[:, 2] > 0.0 and np.linalg.norm(tip) < START_SHIFT
+            if memory.passed == hole_crossing.OUT and before:
+                memory.passed = 0.0
+        passed.append(memory.passed)
+    return np.array(passed)
+
+
+def _near_entry(pose: np.ndarray, pair: HolePair) -> bool:
+    """Say whether a needle is as near to the goal of place as an insertion starts."""
+    goal = Stitch.of(pair).place()
+    tip = needle_frame(needle.TIP_ANGLE)
+    away = np.linalg.norm((pose @ tip - goal @ tip)[:3, 3])
+    return bool(away <= START_SHIFT and geodesic_angle(pose[:3, :3], goal[:3, :3]) <= START_TURN)
+
+
+def _arrival(lying: np.ndarray, start: int, stop: int) -> int:
+    """Return the sample in [start, stop] from which the needle stays where it is at `stop`."""
+    there = lying[stop]
+    away = np.linalg.norm(lying[start : stop + 1, :3, 3] - there[:3, 3], axis=1) > ARRIVED
+    turn = Rotation.from_matrix(lying[start : stop + 1, :3, :3]) * Rotation.from_matrix(there[:3, :3]).inv()
+    far = np.flatnonzero(away | (turn.magnitude() > ARRIVED_TURN))
+    return start + int(far[-1]) + 1 if len(far) else start
+
+
+def _release(first: np.ndarray, lying: np.ndarray, given: int) -> int:
+    """Return the sample of the needle's last move in PSM1's jaws."""
+    loose = np.flatnonzero(~first[given:])
+    end = given + int(loose[0]) - 1 if len(loose) else len(first) - 1
+    return max(_arrival(lying, given, end), given)
+
+
+# -- pauses -----------------------------------------------------------------------------------------------------------
+
+
+def moving(tip: np.ndarray, jaw: np.ndarray) -> np.ndarray:
+    """Return the indices of the samples without the pauses; the first and the last are always kept.
+
+    Args:
+        tip: T_base_tip (N, 4, 4) at `RATE`.
+        jaw: finger's angle (N,) [rad].
+    """
+    count = len(tip)
+    before = np.maximum(np.arange(count) - WINDOW, 0)
+    after = np.minimum(np.arange(count) + WINDOW, count - 1)
+    time = np.maximum(after - before, 1) / RATE
+    turns = Rotation.from_matrix(tip[:, :3, :3])
+    speed = np.linalg.norm(tip[after, :3, 3] - tip[before, :3, 3], axis=1) / time
+    turning = (turns[after] * turns[before].inv()).magnitude() / time
+    active = (speed >= SLOW) | (turning >= SLOW_TURN) | (np.abs(jaw[after] - jaw[before]) / time >= SLOW_JAW)
+    kept = [0]
+    for index in range(1, count):
+        last = tip[kept[-1]]
+        crept = np.linalg.norm(tip[index, :3, 3] - last[:3, 3]) > DRIFT
+        if active[index] or crept or geodesic_angle(tip[index, :3, :3], last[:3, :3]) > DRIFT_TURN:
+            kept.append(index)
+    if kept[-1] != count - 1:
+        kept.append(count - 1)
+    return np.array(kept)

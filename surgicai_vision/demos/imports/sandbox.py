@@ -1,0 +1,142 @@
+"""Read foreign recordings at arm's length: in a process of its own, with limits, without a network.
+
+    arrays = read_foreign(Path("regrasp_all_episodes_merged.pkl"))
+    arrays = read_foreign(Path("trial.bag"), "bag", topics={"psm2_pose": "/PSM2/measured_cp"})
+
+The child sets its limits before it opens the file: memory, processor time, size of what it writes, and, where the
+kernel lets it, a network namespace of its own with nothing in it; an audit hook that cannot be removed then ends
+every attempt to start a process, to open a socket, to change or to write any file (its one result is open by then).
+It hands back plain arrays (npz without pickles). Whatever goes wrong in it is a `BadFile`, or the `InputError` of its
+reader.
+"""
+
+import contextlib
+import importlib
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
+
+READERS: Mapping[str, str] = MappingProxyType(
+    {"surgicai": "surgicai_vision.demos.imports.surgicai_pickle", "bag": "surgicai_vision.demos.imports.rosbag.reader"}
+)
+"""Kind of file → the module whose `read(path, …)` returns its arrays."""
+
+MEMORY, PROCESSOR_SECONDS, WALL_SECONDS, WRITTEN = 2 * 2**30, 60, 120, 2**30
+"""Limits of the child: bytes of address space, seconds, bytes of one file."""
+
+REFUSED = (
+    "socket.",
+    "subprocess.",
+    "os.system",
+    "os.exec",
+    "os.fork",
+    "os.posix_spawn",
+    "os.spawn",
+    "ctypes.",
+    "pty.",
+    "os.chmod",
+    "os.kill",
+    "os.link",
+    "os.mkdir",
+    "os.remove",
+    "os.rename",
+    "os.rmdir",
+    "os.symlink",
+    "os.truncate",
+    "shutil.",
+    "tempfile.",
+)
+"""Audit events (by their beginning) that end the child."""
+
+
+def read_foreign(path: Path, kind: str = "surgicai", **options: Any) -> dict[str, np.ndarray]:
+    """Read a recording in a limited child process.
+
+    Args:
+        path: the file, or a bag's folder.
+        kind: a key of `READERS`; see its `read` for what comes back.
+        options: further arguments of it, plain data.
+
+    Raises:
+        BadFile: what the reader refuses, and what exceeds the limits.
+        InputError: what the reader says the caller asked wrongly for.
+    """
+    if not path.is_file() and not (path.is_dir() and kind == "bag"):
+        raise BadFile(f"Cannot read {path}: {'it is a folder' if path.is_dir() else 'no such file'}.")
+    with tempfile.TemporaryDirectory(prefix="surgicai-vision-") as folder:
+        result = Path(folder) / "arrays.npz"
+        command = [sys.executable, "-m", "surgicai_vision.demos.imports.sandbox", str(path), str(result), kind]
+        try:
+            child = subprocess.run(
+                [*command, json.dumps(options)],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=WALL_SECONDS,
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": _search_path()},
+            )
+        except subprocess.TimeoutExpired:
+            raise BadFile(f"{path} was not read within {WALL_SECONDS} s.") from None
+        if child.returncode == InputError.exit_code:
+            told = json.loads(child.stderr.splitlines()[-1])
+            raise (BadFile if told["bad"] else InputError)(told["line"])
+        if child.returncode:
+            raise BadFile(
+                f"{path} could not be read within the limits ({MEMORY >> 30} GB of memory, "
+                f"{PROCESSOR_SECONDS} s of processor time)."
+            )
+        with np.load(result, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+
+
+def _search_path() -> str:
+    """Return a PYTHONPATH by which the child finds the same package."""
+    return str(Path(__file__).parents[3])
+
+
+def _limit() -> None:
+    """Take from this process what reading a file does not need."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_CPU, (PROCESSOR_SECONDS, PROCESSOR_SECONDS))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (WRITTEN, WRITTEN))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    for namespaces in (os.CLONE_NEWNET, os.CLONE_NEWUSER | os.CLONE_NEWNET):
+        with contextlib.suppress(OSError):  # not every kernel and container lets us
+            os.unshare(namespaces)
+            break
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        flags = arguments[2] if event == "open" else None
+        writes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+        if writes or event.startswith(REFUSED):
+            os._exit(1)
+
+    sys.addaudithook(hook)
+
+
+def main(path: str, result: str, kind: str, options: str) -> int:
+    """Read `path`, write its arrays to `result`; the child's whole program."""
+    read = importlib.import_module(READERS[kind]).read
+    with open(result, "wb") as file:
+        _limit()
+        try:
+            arrays = read(Path(path), **json.loads(options))
+        except SurgicaiError as error:
+            print(json.dumps({"bad": isinstance(error, BadFile), "line": str(error)}), file=sys.stderr)
+            return InputError.exit_code
+        np.savez(file, **arrays)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

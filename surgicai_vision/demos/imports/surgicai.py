@@ -1,0 +1,243 @@
+"""Import SurgicAI's recordings: its arm motions, replayed state by state in our scene.
+
+    summary = import_demos(Path("regrasp_all_episodes_merged.pkl"), task="handoff", out=Path("demos"))
+
+Read (`foreign`), cut into episodes, check that the motion can be the task's, infer the step preset, replay
+(`replay`), write. Half of the released insertions, and a few placements, turn the long way round, because the released
+code compares yaw angles without unwrapping them; our arm's roll joint cannot follow, so they are `unwound`: the same
+path, with the yaw going the short way at the same times. The recorded rotation increments are roll, pitch and yaw;
+ours are rotation vectors in the base's axes, so actions are recomputed from the poses and the recorded ones only tell
+the step size. Where more than one in a hundred would not fit into it, the next larger preset is taken.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import STEPS, TaskConfig
+from surgicai_vision.core.errors import BadFile, InputError, UnreachablePose, check_name
+from surgicai_vision.core.executor import Progress, building
+from surgicai_vision.core.files import check_output, code_version, sha256_file, whole_folder
+from surgicai_vision.demos.imports.replay import MOST_CLIPPED, Episode, Replay, actions, grip_error, trimmed
+from surgicai_vision.demos.imports.sandbox import read_foreign
+from surgicai_vision.demos.record import finished
+from surgicai_vision.demos.store import MARKER, list_demos, read_marker, write_demo, write_marker
+
+OPEN_JAW = 0.4
+"""A jaw wider than this [rad] after the first step belongs to a grasp; the recordings have 0.8 or 0."""
+AGREEMENT = 0.02
+"""A step agrees with a preset when it is within this of action × step size, in units of the step size."""
+STEP_LIMIT = 200
+"""Episode limit of the image evaluation (facts of SurgicAI); longer recordings raise it."""
+
+
+@dataclass(frozen=True)
+class ImportSummary:
+    """What an import made.
+
+    Attributes:
+        paths: the demonstrations' files.
+        step: the step preset inferred from the motion.
+        steps: number of recorded steps.
+        disagreeing: steps that differ from action × step size by more than `AGREEMENT`.
+        clipped: steps whose action left [-1, 1] on conversion and was clipped.
+        skipped: episodes that could not be replayed, {"episode", "reason"}.
+        unwound: episodes whose yaw was sent the short way.
+    """
+
+    paths: tuple[Path, ...]
+    step: str
+    steps: int
+    disagreeing: int
+    clipped: int
+    skipped: tuple[Mapping[str, Any], ...]
+    unwound: int = 0
+
+
+def import_demos(file: Path, *, task: str, out: Path, progress: Progress | None = None) -> ImportSummary:
+    """Import a recording of SurgicAI into the folder of demonstrations `out`.
+
+    Args:
+        file: a pickle as SurgicAI writes it, or an npz of the same arrays.
+        task: what it shows, one of `names.SUBTASKS`; the file does not say it.
+        out: folder to make; the same import of the same file finds it finished.
+        progress: called with (episodes done, episodes, "episodes").
+
+    Raises:
+        UnknownName: an unknown task.
+        BadFile: an unreadable recording.
+        InputError: the motion cannot be that of the task.
+        OutputExists: `out` holds something else.
+    """
+    check_name("subtask", task, names.SUBTASKS)
+    check_output(out, may_resume=MARKER)
+    arrays = read_foreign(file)
+    request = {"file": sha256_file(file), "task": task}
+    if not finished(out, request):
+        episodes = split(arrays)
+        check_task(episodes, task)
+        episodes = [trimmed(episode, task) for episode in episodes]
+        step, disagreeing = infer_step(episodes)
+        wound = sum(is_wound(episode) for episode in episodes)
+        episodes = [unwound(episode) for episode in episodes]
+        step = roomy(episodes, step)
+        limit = max(STEP_LIMIT, *(len(episode.action) for episode in episodes))
+        config = TaskConfig(task, step=step, tolerance="released", reward="dense", max_steps=limit)
+        with building(out) as (_, result), whole_folder(result) as folder:
+            notes, skipped = _write(folder, episodes, config, progress or (lambda done, total, unit: None))
+            notes.update(step=step, steps=sum(len(e.action) for e in episodes), disagreeing=disagreeing, unwound=wound)
+            kept = len(episodes) - len(skipped)
+            details = {"request": request, "skipped": skipped, "episodes": kept, "notes": notes}
+            write_marker(folder, task, "surgicai", code=code_version(), **details)
+    marker = read_marker(out)
+    return ImportSummary(tuple(list_demos(out)), skipped=tuple(marker["skipped"]), **marker["notes"])
+
+
+def _write(
+    folder: Path, episodes: list[Episode], config: TaskConfig, progress: Progress
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Replay and write the episodes; return notes and the skipped ones."""
+    replay = Replay(config)
+    skipped: list[dict[str, Any]] = []
+    clipped = count = 0
+    for index, episode in enumerate(episodes):
+        try:
+            demo, beyond = replay.demo(episode)
+        except UnreachablePose as error:
+            skipped.append({"episode": index, "reason": str(error)})
+        else:
+            write_demo(folder, count, demo)
+            count, clipped = count + 1, clipped + beyond
+        progress(index + 1, len(episodes), "episodes")
+    if not count:
+        raise InputError(f"No episode can be replayed in our scene: {skipped[0]['reason']}")
+    return {"clipped": clipped}, skipped
+
+
+def split(arrays: Mapping[str, np.ndarray]) -> list[Episode]:
+    """Cut transitions into episodes at `done`; metres instead of centimetres.
+
+    Raises:
+        BadFile: the last episode is not done, or a transition does not continue the one before.
+    """
+    ends = np.flatnonzero(arrays["done"] > 0.5)
+    if not len(ends) or ends[-1] != len(arrays["done"]) - 1:
+        raise BadFile("The recording does not end with a transition that is done; it seems cut off.")
+    metres = np.array([0.01, 0.01, 0.01, 1.0, 1.0, 1.0, 1.0])
+    episodes, start = [], 0
+    for number, end in enumerate(ends):
+        rows = slice(start, end + 1)
+        before, after = arrays["observation"][rows], arrays["next_observation"][rows]
+        if not np.allclose(after[:-1, :7], before[1:, :7], atol=1e-4):
+            raise BadFile(f"The recording jumps inside episode {number}: a next observation is not the next one.")
+        if not np.allclose(before[:, 7:14] - before[:, :7], before[:, 14:], atol=1e-3):
+            raise BadFile(f"Episode {number}: its observations are not (current, goal, goal - current).")
+        if len(before) < 2:
+            raise BadFile(f"Episode {number} has {len(before)} transition; an episode has at least 2.")
+        poses = np.concatenate([before[:, :7], after[-1:, :7]]) * metres
+        action, reward, success = (arrays[key][rows] for key in ("action", "reward", "success"))
+        episodes.append(Episode(poses, before[0, 7:14] * metres, action, reward, success > 0.5))
+        start = end + 1
+    return episodes
+
+
+def check_task(episodes: list[Episode], task: str) -> None:
+    """Refuse a task that the motion contradicts: another arm, open jaws on a held needle, a needle beside them.
+
+    Raises:
+        InputError: the contradiction, and the tasks that would fit.
+    """
+    # PSM1 works at positive x of its base and PSM2 at negative x, in every recording.
+    arm = names.PSM1 if np.median([episode.pose[:, 0].mean() for episode in episodes]) > 0 else names.PSM2
+    # After the first step: the first one of a pullout recording starts from another pose.
+    jaw = float(np.median([episode.pose[1, 6] for episode in episodes]))
+    grasps = ("grasp", "handoff") if jaw > OPEN_JAW else ("place", "insert", "pullout")
+    fits = [name for name in grasps if names.ACTIVE_ARM[name] == arm]
+    if task not in fits:
+        raise InputError(
+            f"The recording is no {task}: it moves {arm} and begins with its jaw at {jaw:.2f} rad; "
+            f"that fits {' or '.join(fits)}."
+        )
+    errors = [grip_error(trimmed(episode, task), task) for episode in episodes]
+    if np.median(errors) > 0.0:
+        raise InputError(
+            f"The recording is no {task}: with its goal the needle would lie {np.median(errors) * 1e3:.0f} mm outside "
+            f"the jaws; that fits {' or '.join(name for name in fits if name != task) or 'no task'}."
+        )
+
+
+def roomy(episodes: list[Episode], step: str) -> str:
+    """Return the smallest preset from `step` on that nearly all actions fit into, or the one that most fit into."""
+    total = sum(len(episode.action) for episode in episodes)
+    sizes = list(STEPS)[list(STEPS).index(step) :]
+    clipped = {size: sum(actions(episode, size)[1] for episode in episodes) for size in sizes}
+    return next(
+        (size for size in sizes if clipped[size] <= MOST_CLIPPED * total), min(sizes, key=lambda s: clipped[s])
+    )
+
+
+def is_wound(episode: Episode) -> bool:
+    """Say whether an episode turns further than half a turn in yaw."""
+    return bool(abs(episode.pose[-1, 5] - episode.pose[0, 5]) > np.pi)
+
+
+def unwound(episode: Episode) -> Episode:
+    """Return an episode whose yaw ends where it ended, but goes there the short way."""
+    if not is_wound(episode):
+        return episode
+    travel = episode.pose[-1, 5] - episode.pose[0, 5]
+    short = travel - 2 * np.pi * np.round(travel / (2 * np.pi))
+    pose = episode.pose.copy()
+    pose[:, 5] = pose[0, 5] + (pose[:, 5] - pose[0, 5]) * short / travel
+    return dataclasses.replace(episode, pose=pose)
+
+
+def infer_step(episodes: list[Episode]) -> tuple[str, int]:
+    """Return the step preset that explains the motion best, and the steps it does not explain.
+
+    The first release's insertions have a step of 0.25 mm, which is no preset of ours: a motion that any other constant
+    step explains gets the smallest preset that is as large.
+
+    Raises:
+        InputError: no constant step explains the motion.
+    """
+    moves = np.concatenate([np.diff(episode.pose, axis=0) for episode in episodes])
+    told = np.concatenate([episode.action for episode in episodes])
+    sizes = {
+        name: np.array([metres] * 3 + [np.radians(degrees)] * 3 + [jaw])
+        for name, (metres, degrees, jaw) in STEPS.items()
+    }
+    wrong = {name: _unexplained(moves, told, size) for name, size in sizes.items()}
+    best = min(wrong, key=lambda name: wrong[name])
+    if wrong[best] <= len(told) // 2:
+        return best, wrong[best]
+    own = _fitted(moves, told)
+    disagreeing = _unexplained(moves, told, own)
+    larger = [name for name, size in sizes.items() if (own[:6] <= size[:6] * (1.0 + AGREEMENT)).all()]
+    if disagreeing > len(told) // 2 or not larger:
+        raise InputError(
+            f"No step size explains the motion: {wrong[best]} of {len(told)} steps differ from action × step "
+            f"even for '{best}'; is this a recording of SurgicAI?"
+        )
+    return larger[0], disagreeing
+
+
+def _unexplained(moves: np.ndarray, actions: np.ndarray, size: np.ndarray) -> int:
+    """Return how many moves (N, 7) are not action × size (7,)."""
+    return int((np.abs(moves / size - actions) > AGREEMENT).any(axis=1).sum())
+
+
+def _fitted(moves: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Return the step size (7,) of a motion: the median of move over action, for translation and for rotation."""
+    size = np.full(7, STEPS["paper"][2])
+    for part in (slice(0, 3), slice(3, 6)):
+        told = np.abs(actions[:, part]) > AGREEMENT
+        size[part] = (
+            np.median((moves[:, part] / np.where(told, actions[:, part], 1.0))[told]) if told.any() else np.inf
+        )
+    return np.maximum(size, 1e-9)

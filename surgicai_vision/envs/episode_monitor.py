@@ -1,0 +1,154 @@
+"""Gauge: what one episode does to needle and tissue, read from the measured state after every control step.
+
+A `Gauge` only looks: neither the env's state nor its physics know of it, so an episode is the same with and without.
+
+* Where the needle's tip goes through the stitch's planes: `entry_error` and `exit_error`, the distance of that point
+  from the hole's centre in the hole's plane [m]; NaN where the tip did not go through in this episode. The openings
+  are squares of `holes.OPENING`, so an error is at most their half diagonal, 2.7 mm. A tip that goes back and through
+  again counts anew.
+* `wrong_hole`: the tip went through an opening of another stitch, or through this exit from outside, and has not left
+  through the right exit since.
+* `slip`, `turn`: the needle's largest shift [m] and turn [rad] in the active jaws since they took it.
+* `tissue_force`: largest net force [N] of needle and instruments (not of the thread) on the phantom, as a force plate
+  under it would show. Sampled when a control step ends, at 50 Hz: a shorter blow can be missed.
+"""
+
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import names
+from surgicai_vision.envs import randomisation
+from surgicai_vision.envs.base import SuturingEnv
+from surgicai_vision.envs.hole_crossing import JUMP
+from surgicai_vision.scene import needle
+from surgicai_vision.scene.holes import OPENING, PAIRS, Hole
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+Point = tuple[float, float, float]
+
+
+class Gauge:
+    """What the present episode of `env` has done; see the module's docstring.
+
+    Args:
+        env: the env to look at. `begin` after each of its resets, `look` after each of its steps.
+    """
+
+    def __init__(self, env: SuturingEnv):
+        self._env = env
+        self._plate = Plate(env.model)
+        self._layout = PAIRS[env.scene.config.layout]
+        self._chosen = env.scene.config.hole_pair - 1
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the last episode."""
+        self.entry_error = self.exit_error = math.nan
+        self.slip = self.turn = self.tissue_force = 0.0
+        self.wrong_hole = False
+
+    def begin(self) -> None:
+        """Start watching; the env has just been reset."""
+        self.forget()
+        simulation = self._env.simulation
+        self._pairs = [randomisation.shifted(pair, simulation.draws) for pair in self._layout]
+        self._through = simulation.memory.passed >= 1.0
+        self._tip = simulation.needle_point(needle.TIP_ANGLE)
+
+    def look(self, info: dict[str, Any]) -> None:
+        """Read the state that a step ended in; `info` is that step's."""
+        simulation = self._env.simulation
+        slip, turn = info["needle_slip"]
+        self.slip, self.turn = max(self.slip, float(slip)), max(self.turn, float(turn))
+        self.tissue_force = max(self.tissue_force, self._plate.force(simulation.data))
+        before, self._tip = self._tip, simulation.needle_point(needle.TIP_ANGLE)
+        if math.dist(before, self._tip) <= JUMP:
+            self._watch(before, self._tip)
+
+    def held(self) -> bool:
+        """Say whether either arm holds the needle now."""
+        return any(self._env.simulation.holds(arm) for arm in names.ARMS)
+
+    def _watch(self, before: Point, now: Point) -> None:
+        """Note a passage of the tip through the plane of any hole, inside its opening."""
+        pair = self._pairs[self._chosen]
+        entering = crossing(before, now, pair.entry, inward=True)
+        leaving = crossing(before, now, pair.exit, inward=False)
+        if entering is not None:
+            self.entry_error, self._through = entering, True
+        elif leaving is not None and self._through:
+            self.exit_error, self.wrong_hole = leaving, False
+        elif crossing(before, now, pair.entry, inward=False) is not None:
+            self._through = False
+        elif not self._through and crossing(before, now, pair.exit, inward=True) is not None:
+            self.wrong_hole = True
+        for index, other in enumerate(self._pairs):
+            if index != self._chosen:
+                holes = (other.entry, other.exit)
+                self.wrong_hole |= any(crossing(before, now, hole, inward=True) is not None for hole in holes)
+
+
+def crossing(before: Point, now: Point, hole: Hole, *, inward: bool) -> float | None:
+    """Return how far from the hole's centre [m] the way from `before` to `now` crosses its plane, or None.
+
+    None as well where it crosses outside the opening or in the other direction.
+    """
+    cosine, sine = math.cos(hole.tilt), math.sin(hole.tilt)
+    x, _, z = hole.centre
+    start, end = sine * (before[0] - x) + cosine * (before[2] - z), sine * (now[0] - x) + cosine * (now[2] - z)
+    if not (start > 0.0 >= end if inward else start <= 0.0 < end):
+        return None
+    share = start / (start - end)
+    dx, dy, dz = (b + share * (n - b) - c for b, n, c in zip(before, now, hole.centre, strict=True))
+    up = cosine * dx - sine * dz
+    return math.hypot(up, dy) if abs(up) < OPENING / 2 and abs(dy) < OPENING / 2 else None
+
+
+class Plate:
+    """A force plate under the phantom: what needle and instruments press it with.
+
+    Contact forces are not part of a state that ends with MuJoCo's position stage, and computing them in place would
+    change the state's warm start. They are computed on data of the plate's own.
+
+    Args:
+        model: the env's model, its own copy where the env has one.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        self._model, self._scratch = model, mujoco.MjData(model)
+        self._state = np.empty(mujoco.mj_stateSize(model, STATE))
+        phantom, needle_id = model.body("phantom").id, model.body("needle").id
+        of_geom = model.geom_bodyid
+        self._tissue = of_geom == phantom
+        # The thread hangs on the needle and is not meant; every other moving body is part of an instrument.
+        thread = (model.body_rootid[of_geom] == needle_id) & (of_geom != needle_id)
+        self._presses = (model.body_weldid[of_geom] != 0) & ~thread
+
+    def force(self, data: mujoco.MjData) -> float:
+        """Return the size of the net force on the tissue [N]."""
+        if not self._touching(data).any():
+            return 0.0
+        mujoco.mj_getState(self._model, data, self._state, STATE)
+        mujoco.mj_setState(self._model, self._scratch, self._state, STATE)
+        mujoco.mj_forward(self._model, self._scratch)
+        return float(np.linalg.norm(self._net(self._scratch)))
+
+    def _touching(self, data: mujoco.MjData) -> NDArray[np.bool_]:
+        """Return which contacts are of the tissue with the needle or an instrument, (contacts,)."""
+        one, other = data.contact.geom[:, 0], data.contact.geom[:, 1]
+        return (self._tissue[one] & self._presses[other]) | (self._tissue[other] & self._presses[one])
+
+    def _net(self, data: mujoco.MjData) -> NDArray[np.float64]:
+        """Return the net force in world (3,) [N]."""
+        net, wrench = np.zeros(3), np.empty(6)
+        for index in np.flatnonzero(self._touching(data)):
+            contact = data.contact[int(index)]
+            mujoco.mj_contactForce(self._model, data, int(index), wrench)
+            sign = 1.0 if self._tissue[contact.geom[1]] else -1.0  # MuJoCo's force is that on the second geom
+            net += sign * (contact.frame.reshape(3, 3).T @ wrench[:3])
+        return net

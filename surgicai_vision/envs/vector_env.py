@@ -1,0 +1,285 @@
+"""Vectorised: many envs in a few worker processes.
+
+    gymnasium.make_vec("surgicai_vision/Insert-v0", 16, workers=2)
+
+gymnasium's own `async` mode gives each env a process and a message a step; in state mode the message costs as much
+as the step, so two workers are no faster than one. Here a worker steps its share of the envs by a `SyncVectorEnv`
+and answers once for all of them; observations come back through shared memory. Trajectories, infos and autoreset are
+those of `SyncVectorEnv`, whatever the number of workers: `benchmarks/speed.py --only workers` measures it.
+"""
+
+import contextlib
+import itertools
+import multiprocessing
+import traceback
+from copy import deepcopy
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from surgicai_vision.core.errors import InputError, SurgicaiError
+
+Tree = Any
+"""Arrays, or dicts of trees."""
+Step = tuple[Tree, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+PATIENCE = 10.0
+"""How long a worker may take to end before it is killed [s]."""
+
+
+def make_vector(
+    num_envs: int = 1,
+    workers: int = 0,
+    autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    **arguments: Any,
+) -> VectorEnv:
+    """Return a vector env; the vector entry point of the gymnasium ids.
+
+    Args:
+        num_envs: number of envs.
+        workers: worker processes, at most as many as envs; 0 steps all envs in this process.
+        autoreset_mode: gymnasium's: "NextStep" (default), "SameStep" or "Disabled".
+        **arguments: what `envs.make_task` takes.
+    """
+    if num_envs < 1 or workers < 0:
+        raise InputError(f"num_envs is {num_envs}, workers is {workers}; allowed: at least 1, at least 0.")
+    mode = AutoresetMode(autoreset_mode)
+    if workers:
+        return SuturingVectorEnv(num_envs, min(workers, num_envs), mode, arguments)
+    return SyncVectorEnv([lambda: _make(arguments)] * num_envs, autoreset_mode=mode)
+
+
+class SuturingVectorEnv(VectorEnv):
+    """Envs of one task in worker processes; see `make_vector` for the arguments.
+
+    Processes are spawned, so a script that makes one needs the usual `if __name__ == "__main__":`.
+    """
+
+    def __init__(self, num_envs: int, workers: int, mode: AutoresetMode, arguments: dict[str, Any]):
+        self._workers: list[tuple[multiprocessing.process.BaseProcess, Connection]] = []
+        self.num_envs = num_envs
+        first = _make(arguments)
+        self.single_observation_space, self.single_action_space = first.observation_space, first.action_space
+        self.metadata, self.render_mode = dict(first.metadata) | {"autoreset_mode": mode}, first.render_mode
+        first.close()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        context = multiprocessing.get_context("spawn")  # a GL context must be made in the process that uses it
+        self._memory = _reserve(self.observation_space, context)
+        self._seen = _view(self.observation_space, self._memory)
+        edges = [num_envs * index // workers for index in range(workers + 1)]
+        self._shares = [slice(start, end) for start, end in itertools.pairwise(edges)]
+        for share in self._shares:
+            ours, theirs = context.Pipe()
+            job = (theirs, share, arguments, mode, self.observation_space, self._memory)
+            process = context.Process(target=_work, args=job, daemon=True)
+            process.start()
+            theirs.close()
+            self._workers.append((process, ours))
+        self._ask_all("ready", [()] * workers)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Tree, dict[str, Any]]:
+        """Reset all envs, or those of `options["reset_mask"]`; an int seeds them seed, seed + 1, …"""
+        self._check_open()
+        seeds = [None if seed is None else seed + index for index in range(self.num_envs)] if not isinstance(
+            seed, list | tuple
+        ) else list(seed)  # fmt: skip
+        if len(seeds) != self.num_envs:
+            raise InputError(f"seed holds {len(seeds)} seeds; this vector env has {self.num_envs} envs.")
+        mask = (options or {}).get("reset_mask")
+        chosen = []
+        for share in self._shares:
+            part = dict(options) if options else None
+            if part is not None and mask is not None:
+                part["reset_mask"] = np.asarray(mask)[share]
+            chosen.append((seeds[share], part))
+        infos = self._ask_all("reset", chosen)
+        return deepcopy(self._seen), self._merge(infos)
+
+    def step(self, actions: NDArray[np.float32]) -> Step:
+        """Step all envs; actions are (num_envs, 7)."""
+        self._check_open()
+        if np.shape(actions) != self.action_space.shape:
+            raise InputError(
+                f"actions has shape {np.shape(actions)}; this vector env needs {self.action_space.shape}."
+            )
+        actions = np.asarray(actions)
+        answers = self._ask_all("step", [(actions[share],) for share in self._shares])
+        rewards, terminated, truncated = (np.concatenate([answer[index] for answer in answers]) for index in range(3))
+        return deepcopy(self._seen), rewards, terminated, truncated, self._merge([answer[3] for answer in answers])
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Return an attribute of each env, or what its method returns."""
+        self._check_open()
+        return tuple(
+            value for part in self._ask_all("call", [(name, args, kwargs)] * len(self._shares)) for value in part
+        )
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute of each env."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of each env, one value for all or a list of as many."""
+        self._check_open()
+        rows = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
+        if len(rows) != self.num_envs:
+            raise InputError(f"values holds {len(rows)} values; this vector env has {self.num_envs} envs.")
+        self._ask_all("set_attr", [(name, rows[share]) for share in self._shares])
+
+    def render(self) -> tuple[Any, ...]:
+        """Return each env's picture."""
+        return self.call("render")
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End the workers."""
+        for process, connection in self._workers:
+            with contextlib.suppress(OSError):  # it may have ended already
+                connection.send(("close", ()))
+            process.join(PATIENCE)
+            if process.is_alive():
+                process.kill()
+                process.join()
+            connection.close()
+        self._workers = []
+
+    def _check_open(self) -> None:
+        if self.closed or not self._workers:
+            raise InputError("The vector env is closed; make a new one.")
+
+    def _ask_all(self, what: str, arguments: list[Any]) -> list[Any]:
+        """Send each worker its part, then collect the answers; a worker's error ends all."""
+        try:
+            for (_, connection), part in zip(self._workers, arguments, strict=True):
+                connection.send((what, part))
+            answers = [connection.recv() for _, connection in self._workers]
+        except (EOFError, OSError) as error:
+            codes = [process.exitcode for process, _ in self._workers]
+            self.close()
+            raise SurgicaiError(f"A worker of the vector env died (exit codes {codes}); make a new one.") from error
+        for answer in answers:
+            if isinstance(answer, _Failure):
+                self.close()
+                raise answer.error from RuntimeError(answer.trace)
+        return answers
+
+    def _merge(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
+        """Return the workers' infos as one, in the envs' order."""
+        return _merged(infos, [share.stop - share.start for share in self._shares])
+
+
+class _Failure:
+    """An error in a worker, and where it happened there."""
+
+    def __init__(self, error: Exception):
+        self.error, self.trace = error, traceback.format_exc()
+
+
+def _make(arguments: dict[str, Any]) -> Any:
+    from surgicai_vision.envs import make_task
+
+    return make_task(**arguments)
+
+
+def _work(
+    connection: Connection,
+    share: slice,
+    arguments: dict[str, Any],
+    mode: AutoresetMode,
+    space: spaces.Space,
+    memory: Tree,
+) -> None:
+    """Serve one share of the envs until told to close, or until the other side is gone."""
+    vector, seen = None, _view(space, memory)
+    try:
+        while True:
+            what, part = connection.recv()
+            if what == "close":
+                break
+            try:
+                if vector is None:
+                    makers = [lambda: _make(arguments)] * (share.stop - share.start)
+                    vector = SyncVectorEnv(makers, copy=False, autoreset_mode=mode)
+                answer = _answer(vector, what, part, seen, share)
+            except Exception as error:
+                answer = _Failure(error)
+            connection.send(answer)
+    except (EOFError, OSError, KeyboardInterrupt):
+        pass
+    finally:
+        if vector is not None:
+            vector.close()
+
+
+def _answer(vector: SyncVectorEnv, what: str, part: Any, seen: Tree, share: slice) -> Any:
+    """Do what is asked; observations go to shared memory."""
+    if what == "step":
+        observation, *rest = vector.step(*part)
+        _write(seen, share, observation)
+        return rest
+    if what == "reset":
+        seeds, options = part
+        if options is not None and "reset_mask" in options and not options["reset_mask"].any():
+            return {}
+        observation, info = vector.reset(seed=seeds, options=options)
+        _write(seen, share, observation)
+        return info
+    if what == "call":
+        name, args, kwargs = part
+        return vector.call(name, *args, **kwargs)
+    if what == "set_attr":
+        vector.set_attr(*part)
+    return None
+
+
+# -- trees of arrays --------------------------------------------------------------------------------------------------
+
+
+def _reserve(space: spaces.Space, context: Any) -> Tree:
+    """Return shared memory for a batched space."""
+    if isinstance(space, spaces.Dict):
+        return {key: _reserve(part, context) for key, part in space.spaces.items()}
+    assert space.shape is not None and space.dtype is not None
+    return context.RawArray("b", int(np.prod(space.shape)) * space.dtype.itemsize)
+
+
+def _view(space: spaces.Space, memory: Tree) -> Tree:
+    """Return the arrays that lie in shared memory."""
+    if isinstance(space, spaces.Dict):
+        return {key: _view(part, memory[key]) for key, part in space.spaces.items()}
+    return np.frombuffer(memory, dtype=space.dtype).reshape(space.shape)
+
+
+def _write(seen: Tree, share: slice, observation: Tree) -> None:
+    if isinstance(seen, dict):
+        for key, part in seen.items():
+            _write(part, share, observation[key])
+    else:
+        seen[share] = observation
+
+
+def _merged(parts: list[dict[str, Any]], sizes: list[int]) -> dict[str, Any]:
+    """Return dicts of arrays as one, rows of absent keys filled as gymnasium does."""
+    if len(parts) == 1:
+        return parts[0]
+    merged: dict[str, Any] = {}
+    for key in dict.fromkeys(itertools.chain.from_iterable(parts)):
+        values: list[Any] = [part.get(key) for part in parts]
+        known = next(value for value in values if value is not None)
+        if isinstance(known, dict):
+            merged[key] = _merged([value or {} for value in values], sizes)
+            continue
+        if any(value is None for value in values):
+            empty = None if known.dtype == object else 0
+            values = [
+                np.full((size, *known.shape[1:]), empty, known.dtype) if value is None else value
+                for value, size in zip(values, sizes, strict=True)
+            ]
+        merged[key] = np.concatenate(values)
+    return merged

@@ -1,0 +1,1 @@
+"""Evaluation: policies on held-out starts, counted from the measured state."""

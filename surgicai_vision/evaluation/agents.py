@@ -1,0 +1,271 @@
+"""Agents: what acts in an evaluation. The expert, two baselines, and a policy with its frozen encoder."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import clock
+from surgicai_vision.core.errors import UnreachablePose
+
+
+@final
+class ExpertAgent:
+    """The scripted expert: reads the env's state, needs no pictures."""
+
+    name = "expert"
+    cameras: tuple[str, ...] = ()
+    image_size = 224
+
+    def __init__(self) -> None:
+        self._experts: dict[int, Any] = {}
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Make an expert for the slot's episode."""
+        from surgicai_vision.demos.expert import Expert
+
+        self._experts[slot] = Expert(env)
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the experts' actions (n, 7); not a number where the expert knows no way on."""
+        actions = np.full((len(slots), 7), np.nan, np.float32)
+        for row, slot in enumerate(slots):
+            try:
+                actions[row] = self._experts[slot].action()
+            except UnreachablePose:
+                continue
+        return actions
+
+
+@final
+class RandomAgent:
+    """Uniform actions, drawn from the episode's own seed."""
+
+    name = "random"
+    cameras: tuple[str, ...] = ()
+    image_size = 224
+
+    def __init__(self) -> None:
+        self._generators: dict[int, np.random.Generator] = {}
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Seed the slot's generator."""
+        self._generators[slot] = np.random.default_rng(seed)
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return actions (n, 7) in [-1, 1]."""
+        return np.stack([self._generators[slot].uniform(-1, 1, 7).astype(np.float32) for slot in slots])
+
+
+@final
+class ZeroAgent:
+    """Zero actions."""
+
+    name = "zero"
+    cameras: tuple[str, ...] = ()
+    image_size = 224
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return zeros (n, 7)."""
+        return np.zeros((len(slots), 7), np.float32)
+
+
+@final
+class ReplayAgent:
+    """Blind replay: the same actions in every episode, then none. What it reaches needs no seeing.
+
+    Args:
+        actions: (T, 7), one for each control step.
+    """
+
+    name = "replay"
+    cameras: tuple[str, ...] = ()
+    image_size = 224
+
+    def __init__(self, actions: NDArray[np.float32]):
+        self._actions = np.concatenate([actions, np.zeros((1, 7), np.float32)])
+        self._steps: dict[int, int] = {}
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Start from the first action."""
+        self._steps[slot] = 0
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the actions of the slots' steps (n, 7)."""
+        steps = [min(self._steps[slot], len(self._actions) - 1) for slot in slots]
+        self._steps.update({slot: self._steps[slot] + 1 for slot in slots})
+        return self._actions[steps]
+
+
+def mean_demonstration(action: NDArray[np.float32], episode_index: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return the mean action of each control step (T, 7) over the demonstrations that still run then.
+
+    Args:
+        action: (N, 7) actions of all frames.
+        episode_index: (N,) their episodes.
+    """
+    episodes = [action[episode_index == episode] for episode in np.unique(episode_index)]
+    longest = max(map(len, episodes))
+    steps = [np.mean([e[step] for e in episodes if len(e) > step], axis=0) for step in range(longest)]
+    return np.stack(steps).astype(np.float32)
+
+
+VECTORS: Mapping[str, Callable[[Any], NDArray[np.float32]]] = MappingProxyType(
+    {
+        names.STATE: lambda env: env.agent_pos(),
+        names.CLOCKED_STATE: lambda env: env.agent_pos(),  # the agent itself adds the clock
+        names.BOTH_ARMS: lambda env: env.both_arms(),
+        names.PRIVILEGED_STATE: lambda env: env.state_vector(),
+    }
+)
+"""What a policy may be fed beside features: dataset key → how the env says it."""
+
+BASELINES = {agent.name: agent for agent in (ExpertAgent, RandomAgent, ZeroAgent)}
+"""Name → agent that needs no checkpoint."""
+
+
+Shared = dict[tuple[str, tuple[str, ...]], dict[int, NDArray[np.float32]]]
+"""(encoder's fingerprint, views) → id of an observation → its features."""
+
+
+@final
+class PolicyAgent:
+    """A trained policy; sees the pictures of its views and the measured pose of its tip, nothing else.
+
+    Args:
+        name: how tables call it.
+        policy: has `act(features (B, F) or None, agent_pos (B, 7)) -> (B, 7)`.
+        encoder: frames (B, H, W, 3) → features (B, dim), or None for a policy without pictures.
+        views: the policy's views, in the order of its features.
+        image_size: height and width the policy was trained on [px].
+        vector: what it is fed beside its features, a key of `VECTORS`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        policy: Any,
+        encoder: Any,
+        views: tuple[str, ...],
+        image_size: int,
+        vector: str = names.STATE,
+    ):
+        self.name, self.views, self.image_size = name, views, image_size
+        self.cameras = tuple(dict.fromkeys(map(names.camera_of, views)))
+        self.depth = any(view in names.DEPTH_VIEWS for view in views)
+        self._policy, self._encoder, self._vector = policy, encoder, VECTORS[vector]
+        self._clocked = vector == names.CLOCKED_STATE
+        self._ticks: dict[int, int] = {}
+        self._shared: Shared | None = None
+
+    def share(self, features: "Shared") -> None:
+        """Look features up in a table that agents share, and put new ones there; its owner empties it each step."""
+        self._shared = features
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Start the slot's clock; the policy has no other memory."""
+        self.restart(slot)
+
+    def restart(self, slot: int) -> None:
+        """Start the slot's clock anew: its subtask begins."""
+        self._ticks[slot] = 0
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the policy's actions (n, 7)."""
+        ticks = [self._ticks[slot] for slot in slots]
+        self._ticks.update({slot: tick + 1 for slot, tick in zip(slots, ticks, strict=True)})
+        return self.answer(envs, observations, ticks)
+
+    def answer(
+        self, envs: Sequence[Any], observations: Sequence[Any], ticks: Sequence[int] | None = None
+    ) -> NDArray[np.float32]:
+        """Return the policy's answers (n, …): actions, or a high-level policy's logits.
+
+        Args:
+            envs: the envs, for proprioception.
+            observations: their observations.
+            ticks: control steps since each env's subtask began, for a policy with a clock.
+        """
+        with one_thread():
+            vectors = np.stack([self._vector(env) for env in envs])
+            if self._clocked and ticks is not None:
+                vectors = np.concatenate([vectors, clock(np.array(ticks))], axis=1, dtype=np.float32)
+            return np.asarray(self._policy.act(self._features(observations), vectors), np.float32)
+
+    def _features(self, observations: Sequence[Any]) -> NDArray[np.float32] | None:
+        """Encode all views of all slots in one call, (n, views · dim): an encoder computes whole batches."""
+        if not self.cameras:
+            return None
+        if self._shared is None:
+            return self._encode(observations)
+        known = self._shared.setdefault((self._encoder.fingerprint, self.views), {})
+        new = [observation for observation in observations if id(observation) not in known]
+        if new:
+            known.update(zip(map(id, new), self._encode(new), strict=True))
+        return np.stack([known[id(observation)] for observation in observations])
+
+    def _encode(self, observations: Sequence[Any]) -> NDArray[np.float32]:
+        frames = np.stack([_frame(o, view) for o in observations for view in self.views])
+        return np.asarray(self._encoder(frames), np.float32).reshape(len(observations), -1)
+
+
+def _frame(observation: Any, view: str) -> NDArray[np.uint8]:
+    """Return what a policy sees of a view, (H, W, 3)."""
+    if view in names.DEPTH_VIEWS:
+        from surgicai_vision.dataset.codecs import grey
+
+        return grey(observation["depth"][names.camera_of(view)])
+    frame: NDArray[np.uint8] = observation["pixels"][view]
+    return frame
+
+
+@final
+class NoisyAgent:
+    """An agent with uniform noise on its translations, as the released code's evaluation had.
+
+    Args:
+        agent: whose actions.
+        noise: half width of the noise, in actions.
+    """
+
+    def __init__(self, agent: Any, noise: float):
+        self.name, self.cameras, self.image_size = agent.name, agent.cameras, agent.image_size
+        self.depth = getattr(agent, "depth", False)
+        self._agent, self._noise = agent, noise
+        self._generators: dict[int, np.random.Generator] = {}
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Seed the slot's noise."""
+        self._agent.begin(slot, env, seed)
+        self._generators[slot] = np.random.default_rng((seed, 1))
+
+    def share(self, features: "Shared") -> None:
+        """Share features: see `PolicyAgent.share`."""
+        self._agent.share(features)
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the agent's actions (n, 7), their translations off by up to the noise."""
+        actions = np.array(self._agent.act(slots, envs, observations), np.float32)
+        for row, slot in enumerate(slots):
+            actions[row, :3] += self._generators[slot].uniform(-self._noise, self._noise, 3)
+        return actions
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute with one thread: processes share the cores, and sums keep their order."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,272 @@
+"""LeRobot's policies in our evaluation: a checkpoint of `lerobot-train` becomes the subject of `evaluate`.
+
+Interface:
+
+* `find(folder) -> Path | None`: the folder with config.json and model.safetensors, looked for in a training's
+  output, in one of its checkpoints, or in `pretrained_model` itself.
+* `subject(folder, task, weights) -> subjects.Subject`.
+
+The policy runs through LeRobot's own pipeline, as in `lerobot-eval`. So that a result depends neither on the
+batch nor on the processes, every slot has a policy of its own (sharing weights) with its own random numbers,
+drawn from the episode's seed; a policy that declares itself `memoryless` gets all slots in one batch. Importing
+LeRobot takes ten seconds and happens in the worker alone.
+"""
+
+import contextlib
+import copy
+import dataclasses
+import functools
+import itertools
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, from_mapping
+from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
+from surgicai_vision.core.files import read_json, sha256_file
+from surgicai_vision.evaluation.agents import one_thread
+from surgicai_vision.evaluation.policy_spec import Subject
+
+CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
+PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")
+"""Where a checkpoint lies in a folder the user names."""
+ENV_TYPE = "surgicai"
+VISUAL = "VISUAL"
+
+
+def find(folder: Path) -> Path | None:
+    """Return the folder of LeRobot's checkpoint in `folder`, or None where there is none."""
+    for place in PLACES:
+        candidate = folder / place
+        if (candidate / CONFIG).is_file() and (candidate / WEIGHTS).is_file():
+            return candidate
+    return None
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the policy sees.
+
+    Attributes:
+        cameras: views.
+        image_size: height and width of their pictures [px].
+        encoder: encoder whose features it sees in place of pictures; None for pictures.
+        sha256: hash of that encoder's weights; empty where unknown.
+    """
+
+    cameras: tuple[str, ...]
+    image_size: int
+    encoder: str | None = None
+    sha256: str = ""
+
+
+def subject(folder: Path, task: str | None = None, weights: str | None = None) -> Subject:
+    """Return the subject of a checkpoint folder of `find`.
+
+    Args:
+        folder: holds config.json and model.safetensors.
+        task: the task, where the checkpoint does not say it.
+        weights: file with the encoder's pretrained weights.
+
+    Raises:
+        BadFile: a checkpoint that is damaged.
+        InputError: a policy that sees what our envs do not show.
+    """
+    policy = _table(folder / CONFIG)
+    training = _table(folder / TRAINING) if (folder / TRAINING).is_file() else {}
+    config, sight = _circumstances(training, folder, task, policy)
+    encoder, views = sight.encoder or policy.get("encoder"), "+".join(sight.cameras) or "proprioception"
+    name = "-".join(part for part in (policy["type"], encoder, views) if part)
+    text = names.TASK_TEXTS[config.task]
+    about = {
+        "checkpoint": {"policy_sha256": sha256_file(folder / WEIGHTS), "policy": policy["type"]},
+        "folder": str(folder),
+        "views": list(sight.cameras),
+        "encoder": encoder or "own",
+    }
+    return Subject(name, config, functools.partial(LeRobotAgent, name, folder, sight, weights, text), about)
+
+
+def _circumstances(
+    training: Mapping[str, Any], folder: Path, task: str | None, policy: Mapping[str, Any]
+) -> tuple[TaskConfig, Sight]:
+    """Return the task the policy was trained for and what it sees, from its env, its dataset or `task`."""
+    env, root = training.get("env") or {}, (training.get("dataset") or {}).get("root")
+    features: Mapping[str, Any] = {}
+    if env.get("type") == ENV_TYPE:
+        fields = {field.name: env[field.name] for field in dataclasses.fields(TaskConfig) if field.name in env}
+        config = from_mapping(TaskConfig, fields, str(folder / TRAINING))
+        if env.get("encoder"):
+            views, sha256 = env["cameras"], env.get("encoder_sha256", "")
+            features = {"encoder": env["encoder"], "views": views, "weights_sha256": sha256, "size": env["image_size"]}
+    elif root and (Path(root) / names.META_FILE).is_file():
+        meta = read_json(Path(root) / names.META_FILE)
+        config = from_mapping(TaskConfig, meta["task_config"], str(Path(root) / names.META_FILE))
+        features = {**meta["features"], "size": meta["image_size"]} if meta.get("features") else {}
+    elif task:
+        config = TaskConfig(task=task)
+    else:
+        raise InputError(f"{folder} does not say what it was trained for; give --task.")
+    return config, _sight(folder, policy.get("input_features") or {}, features)
+
+
+def _sight(folder: Path, inputs: Mapping[str, Any], features: Mapping[str, Any]) -> Sight:
+    """Return what a policy with these inputs sees."""
+    if names.ENVIRONMENT_STATE in inputs:
+        if not features:
+            raise InputError(
+                f"{folder} sees {names.ENVIRONMENT_STATE}, and neither its env nor its dataset says of which encoder."
+            )
+        return Sight(tuple(features["views"]), features["size"], features["encoder"], features["weights_sha256"])
+    shapes = {key: value["shape"] for key, value in inputs.items() if value["type"] == VISUAL}
+    known = {names.image_key(view): view for view in names.CAMERAS}
+    for key in shapes:
+        check_name(f"picture of {folder}", key, known)
+    sizes = {tuple(shape[1:]) for shape in shapes.values()}
+    if len(sizes) > 1 or any(height != width for height, width in sizes):
+        raise InputError(f"{folder} sees pictures of {sorted(sizes)}; our envs show square ones of one size.")
+    return Sight(tuple(known[key] for key in shapes), next(iter(sizes))[0] if sizes else 224)
+
+
+def _table(path: Path) -> dict[str, Any]:
+    """Return a JSON table."""
+    content = read_json(path)
+    if not isinstance(content, dict) or (path.name == CONFIG and not content.get("type")):
+        raise BadFile(f"{path} is no configuration of LeRobot.")
+    return content
+
+
+@final
+class LeRobotAgent:
+    """A policy of LeRobot.
+
+    Args:
+        name: how tables call it.
+        folder: its checkpoint.
+        sight: what it sees.
+        weights: file with the encoder's pretrained weights.
+        text: the task in words, as its dataset says it; empty for the env's own.
+    """
+
+    def __init__(self, name: str, folder: Path, sight: Sight, weights: str | None = None, text: str = ""):
+        self.name, self.cameras, self.image_size = name, sight.cameras, sight.image_size
+        self._policy, self._before, self._after = _load(folder, weights)
+        self._text = text
+        self._together = bool(getattr(self._policy, "memoryless", False))
+        self._encoder = _encoder(sight, weights) if sight.encoder else None
+        device = str(next(self._policy.parameters()).device)
+        self._devices = ("cpu",) if device == "cpu" else ("cpu", device)
+        self._slots: dict[int, tuple[Any, dict[str, Any]]] = {}
+
+    def begin(self, slot: int, env: Any, seed: int) -> None:
+        """Give the slot a policy that remembers nothing, and the random numbers of its seed."""
+        import torch
+
+        policy = self._policy
+        if not self._together:
+            tensors = itertools.chain(policy.parameters(), policy.buffers())
+            policy = copy.deepcopy(policy, {id(tensor): tensor for tensor in tensors})
+        policy.reset()
+        states = {device: torch.Generator(device).manual_seed(seed).get_state() for device in self._devices}
+        self._slots[slot] = policy, states
+
+    def restart(self, slot: int) -> None:
+        """Forget what the slot's policy has planned: a chain begins the subtask anew."""
+        self._slots[slot][0].reset()
+
+    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Return the policy's actions (n, 7)."""
+        import torch
+
+        cuda = [device for device in self._devices if device != "cpu"]
+        with one_thread(), torch.inference_mode(), torch.random.fork_rng(devices=cuda):
+            if self._together:
+                return self._act(self._policy, envs, observations)
+            actions = []
+            for slot, env, observation in zip(slots, envs, observations, strict=True):
+                policy, states = self._slots[slot]
+                for device, state in states.items():
+                    _set_random(device, state)
+                actions.append(self._act(policy, [env], [observation]))
+                self._slots[slot] = policy, {device: _random(device) for device in states}
+            return np.concatenate(actions)
+
+    def _act(self, policy: Any, envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+        """Ask one policy for the actions of a batch, through LeRobot's pipeline."""
+        import torch
+        from lerobot.envs.utils import preprocess_observation
+
+        # Asked of the env: in a chain another arm may have become active since it was observed.
+        raw: dict[str, Any] = {"agent_pos": np.stack([env.agent_pos() for env in envs])}
+        if self._encoder is None:
+            raw["pixels"] = {view: np.stack([o["pixels"][view] for o in observations]) for view in self.cameras}
+        else:
+            views = [self._encoder(np.stack([o["pixels"][view] for o in observations])) for view in self.cameras]
+            raw["environment_state"] = np.concatenate(views, axis=1)
+        batch = {**preprocess_observation(raw), "task": [self._text or env.task_description for env in envs]}
+        action = self._after(policy.select_action(self._before(batch)))
+        return action.to("cpu", torch.float32).numpy()
+
+
+def _random(device: str) -> Any:
+    """Return the state of a device's random numbers."""
+    import torch
+
+    return torch.get_rng_state() if device == "cpu" else torch.cuda.get_rng_state(device)
+
+
+def _set_random(device: str, state: Any) -> None:
+    """Put a device's random numbers into a state."""
+    import torch
+
+    if device == "cpu":
+        torch.set_rng_state(state)
+    else:
+        torch.cuda.set_rng_state(state, device)
+
+
+def _load(folder: Path, weights: str | None) -> tuple[Any, Any, Any]:
+    """Return policy, pre- and post-processor; plug-ins are found as LeRobot's own commands find them."""
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from surgicai_vision.features import encoders
+
+    register_third_party_plugins()
+    try:
+        config = PreTrainedConfig.from_pretrained(folder)
+        # The checkpoint holds the backbone; LeRobot would download it first, only to overwrite it.
+        if getattr(config, "pretrained_backbone_weights", None):
+            config.pretrained_backbone_weights = None  # type: ignore[attr-defined]
+        own = encoders.weights_of(str(getattr(config, "encoder", None)), weights)
+        if own and hasattr(config, "encoder_weights"):
+            config.encoder_weights = str(own)
+        with contextlib.redirect_stdout(sys.stderr):  # LeRobot prints; our standard output is the result
+            policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+        overrides = {"device_processor": {"device": config.device}}
+        before, after = make_pre_post_processors(config, str(folder), preprocessor_overrides=overrides)
+    except SurgicaiError:
+        raise
+    except Exception as error:
+        raise BadFile(f"LeRobot cannot load {folder} ({(str(error).splitlines() or [''])[0]}).") from error
+    return policy.eval(), before, after
+
+
+def _encoder(sight: Sight, weights: str | None) -> Any:
+    """Load the encoder whose features the policy sees, verified."""
+    from surgicai_vision.features import encoders
+
+    encoder = encoders.load_encoder(str(sight.encoder), weights)
+    if sight.sha256 and encoder.weights_sha256 != sight.sha256:
+        raise InputError(
+            f"The policy was trained on encoder '{sight.encoder}' with weights sha256 {sight.sha256}, got "
+            f"{encoder.weights_sha256}; hand over the same with --weights."
+        )
+    return encoder

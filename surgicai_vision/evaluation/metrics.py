@@ -1,0 +1,140 @@
+"""Rows: what is kept of one episode, and the summary of many. `docs/evaluation.md` explains every column.
+
+All lengths, angles and forces are read from the measured physical state, never from a command.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from surgicai_vision.core import names
+from surgicai_vision.evaluation.statistics import clopper_pearson, mean_and_std
+
+KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
+"""Kinds of failure, see `failure_kind`."""
+
+ON_SUCCESSES = (("trajectory_length_mm", "trajectory_length_mm"), ("time_steps", "steps"))
+"""Key of a summary → column it averages over the successes."""
+MEASURED = (
+    "d_trans_mm", "d_angle_deg", "entry_mm", "exit_mm", "slip_mm", "slip_deg", "tissue_force_n",
+)  # fmt: skip
+"""Columns a summary averages over all episodes where they were measured."""
+
+
+@dataclass(frozen=True)
+class EpisodeRow:
+    """One episode.
+
+    Attributes:
+        task: one of `names.TASKS`.
+        policy: how tables call who acted.
+        seed: seed of the start.
+        success: whether the task succeeded; never with an error.
+        steps: control steps of 20 ms taken.
+        trajectory_length_mm: path of the measured active tip, Σ‖Δxyz‖ [mm].
+        d_trans_mm: last distance to the goal [mm]; NaN where nothing was measured.
+        d_angle_deg: last angle to the goal [deg].
+        contact: whether the active jaws felt the needle at the end.
+        error: what broke the episode off, or "".
+        grasp: grasp level of the scene.
+        failure: "" for a success, else one of `KINDS`.
+        stages: subtasks that succeeded in their order, of the whole procedure; 1 for a subtask's own success.
+        entry_mm: where the tip went through the entry, from the hole's centre [mm]; NaN where it did not.
+        exit_mm: the same at the exit.
+        slip_mm: the needle's largest shift in the active jaws since they took it [mm].
+        slip_deg: its largest turn [deg].
+        tissue_force_n: largest net force of needle and instruments on the tissue [N].
+    """
+
+    task: str
+    policy: str
+    seed: int
+    success: bool
+    steps: int
+    trajectory_length_mm: float
+    d_trans_mm: float
+    d_angle_deg: float
+    contact: bool
+    error: str
+    grasp: str
+    failure: str
+    stages: int = 0
+    entry_mm: float = math.nan
+    exit_mm: float = math.nan
+    slip_mm: float = 0.0
+    slip_deg: float = 0.0
+    tissue_force_n: float = 0.0
+
+
+def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, held: bool) -> str:
+    """Name why an episode failed: the first that holds.
+
+    Args:
+        error: what broke the episode off, or "".
+        diverged: the physics broke it off: "physics"; any other error: "error".
+        touched: whether the active jaws ever felt the needle; if not: "missed".
+        wrong_hole: the needle went through another opening than the stitch's, and stayed wrong: "wrong_hole".
+        held: whether either arm held the needle at the end: "time" if one did, else "dropped".
+    """
+    if error:
+        return "physics" if diverged else "error"
+    if not touched:
+        return "missed"
+    if wrong_hole:
+        return "wrong_hole"
+    return "time" if held else "dropped"
+
+
+def summary(rows: Sequence[EpisodeRow]) -> dict[str, Any]:
+    """Return the counts of one policy on one task.
+
+    Trajectory length and steps are those of successful episodes; what was measured is averaged over all episodes that
+    have it ("n" of them).
+    """
+    first, successes = rows[0], [row for row in rows if row.success]
+    failures = [row.failure for row in rows if not row.success]
+    return {
+        "task": first.task,
+        "policy": first.policy,
+        "episodes": len(rows),
+        "successes": len(successes),
+        "success_rate": len(successes) / len(rows),
+        "ci95": list(clopper_pearson(len(successes), len(rows))),
+        **{key: mean_and_std(_finite(successes, column)) for key, column in ON_SUCCESSES},
+        **{column: _spread(_finite(rows, column)) for column in MEASURED},
+        "grasp": first.grasp,
+        "errors": sum(1 for row in rows if row.error),
+        "failures": {kind: failures.count(kind) for kind in KINDS if kind in failures},
+        "first_seed": min(row.seed for row in rows),
+        **({"reached": _reached(rows), "survival": survival(rows)} if first.task == names.SUTURE else {}),
+    }
+
+
+def survival(rows: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
+    """Return for each subtask how many episodes finished it and all before it: k of n, with the exact interval."""
+    stages = []
+    for subtask, k in _reached(rows).items():
+        low, high = clopper_pearson(k, len(rows))
+        stages.append({"subtask": subtask, "k": k, "n": len(rows), "low": low, "high": high})
+    return stages
+
+
+def _reached(rows: Sequence[EpisodeRow]) -> dict[str, int]:
+    """Return how many episodes finished each subtask and all before it."""
+    return {subtask: sum(row.stages > index for row in rows) for index, subtask in enumerate(names.SUBTASKS)}
+
+
+def _finite(rows: Sequence[EpisodeRow], column: str) -> list[float]:
+    values = [float(getattr(row, column)) for row in rows]
+    return [value for value in values if math.isfinite(value)]
+
+
+def _spread(values: list[float]) -> dict[str, float | None]:
+    return {**mean_and_std(values), "n": len(values)}
+
+
+def as_table(rows: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
+    """Return rows as plain data."""
+    return [dataclasses.asdict(row) for row in rows]

@@ -1,0 +1,1 @@
+"""Experiments: runs, sweeps of runs, DAgger and the quickstart."""

@@ -1,0 +1,73 @@
+"""DAgger (Ross et al. 2011): a learner drives, the expert says at each of its states what it would have done.
+
+    learner = learner_of(Path("outputs/train/grasp-…"), config)
+    record(config, episodes=350, source="search", learner=learner, out=Path("demos"))
+
+An episode is the learner's until a step drawn uniformly from its limit, then the expert's, who mends what it finds;
+kept is, as ever, what succeeds. Rendered together with the demonstrations the learner was trained on, they train the
+next one (`render-demos --demos A,B`).
+"""
+
+import atexit
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from surgicai_vision.core.config import TaskConfig, from_mapping
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.demos.record import Learner, record_into
+from surgicai_vision.evaluation.policy_spec import checkpoint_subject
+from surgicai_vision.evaluation.rollout import Agent, env_of
+
+
+@final
+class Wheel:
+    """A driver: an agent until a step of each episode that is drawn by chance."""
+
+    def __init__(self, agent: Agent):
+        self._agent = agent
+        self._left = 0
+
+    def begin(self, env: Any, seed: int, rng: np.random.Generator) -> None:
+        """Draw the step at which the expert takes over."""
+        self._agent.begin(0, env, seed)
+        self._left = int(rng.integers(0, env.config.max_steps, endpoint=True))
+
+    def action(self, env: Any, observation: Any) -> np.ndarray | None:
+        """Return the agent's action (7,) in [-1, 1], or None once the expert has taken over."""
+        if not self._left:
+            return None
+        self._left -= 1
+        action = np.asarray(self._agent.act([0], [env], [observation])[0])
+        return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+
+def learner_of(folder: Path, config: TaskConfig) -> Learner:
+    """Return the learner in a checkpoint folder.
+
+    Raises:
+        BadFile: no checkpoint folder.
+        InputError: a policy of another task, or one that does not act.
+        MissingWeights: the encoder's weights are not at hand.
+    """
+    subject = checkpoint_subject(folder)
+    if subject.config.task != config.task:
+        raise InputError(f"{folder} was trained for '{subject.config.task}'; '{config.task}' is to be recorded.")
+    return Learner(folder, str(subject.about["checkpoint"]["policy_sha256"]))
+
+
+def record_driven(folder: Path, task: Mapping[str, Any], learner: str, **how: Any) -> None:
+    """Job "drive-episode": as "record-episode", with a learner that drives."""
+    env, wheel = _driven(from_mapping(TaskConfig, task), learner)
+    record_into(folder, env, driver=wheel, **how)
+
+
+@functools.lru_cache(maxsize=1)
+def _driven(config: TaskConfig, learner: str) -> tuple[Any, Wheel]:
+    """Return this process's environment with what the learner sees, and the learner."""
+    atexit.register(_driven.cache_clear)  # the GL context must go before the interpreter does
+    agent = checkpoint_subject(Path(learner)).make_agent()
+    return env_of(agent, config), Wheel(agent)

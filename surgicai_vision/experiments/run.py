@@ -1,0 +1,199 @@
+"""Cells: one policy from features to counted successes. A quickstart is a list of cells, a sweep a grid.
+
+Every step leaves a whole folder and skips the one that is there, so running again continues.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import DEVIATIONS, Deviations, read_changes
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.progress import Stage
+from surgicai_vision.evaluation.policy_spec import policy_name
+
+OWN = "own"
+"""Stands for an encoder: a network of the policy's own, trained with it on the pictures."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What is trained and evaluated.
+
+    Attributes:
+        task: one of `names.TASKS`.
+        encoder: encoder's name; `OWN` for a policy that trains a network of its own on the pictures; None for a policy
+            without pictures.
+        view: its views, in the order of the features; empty without pictures.
+        seed: training seed.
+        policy: policy's name.
+        recipe: its recipe: a name, or the path of a YAML file.
+        pool: what is taken from the encoder.
+        privileged: see the goal in place of all else: the ceiling.
+        epochs: passes over the training frames; None takes the recipe's.
+        deviations: switches of `config.Deviations` that are on; None takes the recipe's.
+        change: keys of the recipe and their values, `config.read_changes`'s texts.
+        demonstrations: train on the first so many demonstrations; None takes all.
+        chain: how subtasks end, where this is a high-level policy over a policy a subtask (`chain.TERMINATIONS`).
+        swap: the subtask of such a chain that the expert does.
+    """
+
+    task: str
+    encoder: str | None
+    view: tuple[str, ...]
+    seed: int = 0
+    policy: str = "bc"
+    recipe: str = "paper"
+    pool: str = "global"
+    privileged: bool = False
+    epochs: int | None = None
+    deviations: tuple[str, ...] | None = None
+    change: tuple[str, ...] = ()
+    demonstrations: int | None = None
+    chain: str | None = None
+    swap: str | None = None
+
+    def __post_init__(self) -> None:
+        check_name("task", self.task, names.TASKS)
+        if self.chain and any(view in names.DEPTH_VIEWS for view in self.view):
+            raise InputError(f"A chain sees no depth views ({', '.join(self.view)}); give views in colour.")
+        if self.swap:
+            check_name("subtask", self.swap, names.SUBTASKS)
+        for view in self.view:
+            check_name("view", view, names.VIEWS)
+        if (self.encoder is None) != (not self.view):
+            raise InputError(f"encoder '{self.encoder}' with views {list(self.view)}; give both or neither.")
+        for switch in self.deviations or ():
+            check_name("deviation", switch, DEVIATIONS)
+
+    @property
+    def name(self) -> str:
+        """How tables and folders call the policy."""
+        name = policy_name(self.encoder, self.view, self.pool, self.privileged, self.policy, self.recipe_label)
+        chain = f"chain-{self.chain}-" if self.chain else ""
+        return f"{chain}{name}" + (f"-swap-{self.swap}" if self.swap else "")
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """Keys that replace the recipe's."""
+        changes: dict[str, Any] = read_changes(self.change) | ({"privileged": True} if self.privileged else {})
+        if self.epochs is not None:
+            changes["epochs"] = self.epochs
+        if self.deviations is not None:
+            changes["deviations"] = dict.fromkeys(self.deviations, True)
+        return changes
+
+    @property
+    def recipe_label(self) -> str:
+        """The recipe's name and what is changed in it."""
+        counts = ((self.epochs, "epochs"), (self.demonstrations, "demos"))
+        changed = tuple(f"{count}{unit}" for count, unit in counts if count is not None)
+        switches = ("none",) if self.deviations == () else self.deviations or ()
+        return "+".join((Path(self.recipe).stem, *switches, *self.change, *changed))
+
+
+def train_cell(
+    cell: Cell,
+    dataset: Any,
+    out: Path,
+    stage: Stage,
+    weights: str | None = None,
+    *,
+    accept_licence: bool = False,
+    start: Path | None = None,
+    subtask: str | None = None,
+    save_every: int = 0,
+    log: Callable[[int, dict[str, float]], None] | None = None,
+) -> None:
+    """Encode the cell's views (from the cache where they are at hand) and train its policy into `out`.
+
+    Args:
+        cell: what to train.
+        dataset: an opened dataset of the cell's task.
+        out: checkpoint folder; one of the same training is continued, or left as it is.
+        stage: shows progress.
+        weights: file with the encoder's pretrained weights.
+        accept_licence: accept weights under a non-commercial licence.
+        start: checkpoint folder to start from (fine-tuning).
+        subtask: train on this subtask's frames of the dataset's whole procedures.
+        save_every: also keep a checkpoint every so many epochs.
+        log: called with (epoch, losses by name).
+    """
+    from surgicai_vision.dataset.first_episodes import first_episodes
+    from surgicai_vision.dataset.stride import thinned
+    from surgicai_vision.dataset.subtask_frames import subtask_of
+    from surgicai_vision.training import policies
+    from surgicai_vision.training.train import train
+
+    recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
+    dataset = thinned(dataset, recipe.every)
+    begin = policies.load_policy(start) if start else None
+    features, beside = _encode(cell, dataset, recipe, stage, weights, accept_licence)
+    parts: tuple[tuple[Any, Callable[..., Any]], ...] = ((cell.demonstrations, first_episodes), (subtask, subtask_of))
+    for which, take in parts:
+        if which is not None:
+            dataset = take(dataset, which)
+            features = [entry.part(dataset.rows, dataset.fingerprint) for entry in features]
+    with stage(f"policy: {cell.name}", "epochs") as progress:
+        plugin = policies.policy_plugin(cell.policy)
+        train(
+            dataset, features, plugin, recipe, seed=cell.seed, out=out, progress=progress,
+            recipe_name=cell.recipe_label, start=begin, save_every=save_every, log=log, beside=beside,
+        )  # fmt: skip
+
+
+def encode_cell(
+    cell: Cell, dataset: Any, stage: Stage, weights: str | None = None, *, accept_licence: bool = False
+) -> tuple[list[Any], dict[str, bytes]]:
+    """Encode the cell's views, all frames that its recipe takes, or find them in the cache.
+
+    Returns:
+        The features of each view, and what of the encoder the checkpoint has to keep.
+    """
+    from surgicai_vision.dataset.stride import thinned
+    from surgicai_vision.training import policies
+
+    recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
+    return _encode(cell, thinned(dataset, recipe.every), recipe, stage, weights, accept_licence)
+
+
+def _encode(
+    cell: Cell, dataset: Any, recipe: Any, stage: Stage, weights: str | None, accept_licence: bool
+) -> tuple[list[Any], dict[str, bytes]]:
+    """Encode the cell's views, all frames of `dataset`."""
+    if not cell.encoder:
+        return [], {}
+    from surgicai_vision.features.cache import encode
+
+    encoder, beside = _encoder(cell, recipe.deviations, dataset, stage, weights, accept_licence)
+    features = []
+    for view in cell.view:
+        with stage(f"features: {cell.encoder}, {view}", "frames") as progress:
+            features.append(encode(dataset, view, encoder, progress=progress))
+    return features, beside
+
+
+def _encoder(
+    cell: Cell, deviations: Deviations, dataset: Any, stage: Stage, weights: str | None, accept_licence: bool
+) -> tuple[Any, dict[str, bytes]]:
+    """Load the cell's encoder; return it with what of it the checkpoint has to keep."""
+    from surgicai_vision.features import encoders
+
+    load = functools.partial(encoders.load_encoder, str(cell.encoder), weights, cell.pool, accept_licence)
+    if deviations == Deviations():
+        return load(), {}
+    encoder = load(deviations)
+    if not deviations.batch_norm_drift:
+        return encoder, {}
+    from surgicai_vision.training.checkpoint import ENCODER_STATISTICS
+    from surgicai_vision.training.reproduction import drift
+
+    with stage(f"drift: {cell.encoder}", "steps") as progress:
+        path = drift(
+            dataset, cell.view, encoder, weights=weights, accept_licence=accept_licence, seed=cell.seed,
+            progress=progress,
+        )  # fmt: skip
+    return load(deviations, path), {ENCODER_STATISTICS: path.read_bytes()}

@@ -1,0 +1,115 @@
+"""LeRobot's policies as cells: `lerobot-train` in a process of its own, on pictures or on exported features.
+
+Its checkpoint is evaluated as `surgicai-vision evaluate` does. LeRobot is not imported here.
+"""
+
+import ctypes
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.experiments.run import OWN, Cell
+from surgicai_vision.features import encoders
+
+LEROBOT_POLICIES = ("act", "diffusion")
+OPTIONS = {
+    "diffusion": (
+        "--policy.use_group_norm=true",
+        "--policy.noise_scheduler_type=DDIM",
+        "--policy.num_inference_steps=10",
+    )
+}
+"""What a policy needs besides: to start its backbone from random weights, and ten steps of denoising in the place of
+a hundred, which take minutes an episode on a core."""
+SCRATCH = "export"
+PARENT_DEATH = 1
+"""prctl's PR_SET_PDEATHSIG: the child ends with its parent."""
+
+
+def train_lerobot(cell: Cell, dataset: Any, out: Path, *, steps: int, batch: int, accept_licence: bool) -> None:
+    """Train a policy of LeRobot into `out`, as `lerobot-train` writes it.
+
+    Args:
+        cell: its policy, encoder (`OWN` or frozen features), views, seed and number of demonstrations.
+        dataset: an opened dataset of the cell's task.
+        out: folder to make.
+        steps: updates.
+        batch: batch size.
+        accept_licence: accept weights under a non-commercial licence.
+
+    Raises:
+        SurgicaiError: LeRobot failed; the message ends with the last of what it said.
+    """
+    if dataset.fps != names.FPS:
+        raise InputError(f"{dataset.path} holds {dataset.fps} frames a second; {cell.policy} needs {names.FPS}.")
+    root = dataset.path
+    if cell.encoder != OWN:
+        root = out.with_name(SCRATCH)
+        _export(cell, dataset, root, accept_licence)
+    command = [sys.executable, "-m", "lerobot.scripts.lerobot_train", *_arguments(cell, dataset, root, out)]
+    command += [f"--steps={steps}", f"--batch_size={batch}", f"--save_freq={steps}"]
+    done = subprocess.run(command, capture_output=True, text=True, env=_environment(), preexec_fn=_end_with_parent)
+    if done.returncode:
+        raise SurgicaiError(f"lerobot-train failed for {cell.name}:\n{done.stderr[-2000:]}")
+
+
+def _export(cell: Cell, dataset: Any, root: Path, accept_licence: bool) -> None:
+    """Write a dataset with the cell's features in place of pictures."""
+    from surgicai_vision.dataset.feature_export import export_features
+    from surgicai_vision.features.cache import encode
+
+    encoder = encoders.load_encoder(str(cell.encoder), None, cell.pool, accept_licence)
+    rows = [encode(dataset, view, encoder).rows for view in cell.view]
+    about = {
+        "encoder": cell.encoder,
+        "views": list(cell.view),
+        "weights_sha256": encoder.weights_sha256,
+        "encoder_fingerprint": encoder.fingerprint,
+    }
+    shutil.rmtree(root, ignore_errors=True)
+    export_features(dataset, rows, about, root)
+
+
+def _arguments(cell: Cell, dataset: Any, root: Path, out: Path) -> list[str]:
+    """Return the options of `lerobot-train` that say what is trained on what."""
+    arguments = [
+        f"--dataset.repo_id=local/{cell.task}",
+        f"--dataset.root={root}",
+        "--env.type=surgicai",
+        f"--env.dataset={root}",
+        f"--policy.type={cell.policy}",
+        "--policy.pretrained_backbone_weights=null",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        "--env_eval_freq=0",
+        "--num_workers=0",
+        f"--seed={cell.seed}",
+        f"--output_dir={out}",
+        *OPTIONS.get(cell.policy, ()),
+    ]
+    if cell.demonstrations is not None:
+        arguments.append(f"--dataset.episodes={list(range(cell.demonstrations))}")
+    if cell.encoder == OWN:
+        side = dataset.image_size
+        seen = {names.image_key(view): {"type": "VISUAL", "shape": [3, side, side]} for view in cell.view}
+        inputs = {**seen, names.STATE: {"type": "STATE", "shape": [len(names.STATE_NAMES)]}}
+        arguments.append(f"--policy.input_features={json.dumps(inputs)}")
+        arguments.append(f"--env.cameras={json.dumps(list(cell.view))}")
+    return arguments
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "HF_HUB_OFFLINE": "1", "HF_DATASETS_DISABLE_PROGRESS_BARS": "1", "WANDB_MODE": "disabled"}
+
+
+def _end_with_parent() -> None:
+    """Be killed when the worker is (Linux alone has this; elsewhere the training runs to its end)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PARENT_DEATH, signal.SIGKILL)

@@ -1,0 +1,1 @@
+"""Features: frozen encoders, the cache of what they computed, and a linear probe of it."""

@@ -1,0 +1,297 @@
+"""Frames → cached frozen features.
+
+Interface:
+
+* `encode(dataset, view, encoder, cache_root, progress) -> Features`: encode one view of a dataset once.
+* `Features`: the rows as a read-only float16 memory map, aligned with the dataset's frame index.
+* `default_cache_root()`, `list_cache(root)`, `prune_cache(root, keep_datasets)`.
+
+An entry is addressed by its content: the dataset's fingerprint, the view, and the encoder's fingerprint
+(weights, preprocessing, pool, compute type). So encoding twice does nothing, and a changed dataset or
+weights file never meets an old entry. Layout of `<cache root>/features/<key>/`:
+
+    features.npy    (N, dim) float16, allocated whole at the start
+    progress.json   rows already on disk; written after each chunk
+    manifest.json   what was encoded; written last, its presence makes the entry complete
+    lock            held while a process writes
+
+A process killed at any moment leaves `progress.json` behind its rows, and the next call goes on there.
+"""
+
+import fcntl
+import shutil
+from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from surgicai_vision import __version__
+from surgicai_vision.core.config import digest, to_mapping
+from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, UnknownName
+from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, read_json, write_json
+
+FORMAT = 1
+CHUNK = 256  # frames per progress step: 38 MB of pictures at 224 × 224
+MANIFEST, PROGRESS, ROWS = "manifest.json", "progress.json", "features.npy"
+
+Progress = Callable[[int, int], None]
+"""Called with (frames done, frames in all)."""
+
+
+class FrameSource(Protocol):
+    """The part of a dataset that encoding reads."""
+
+    views: tuple[str, ...]
+    fingerprint: str
+    length: int
+
+    def frames(self, view: str, start: int, stop: int) -> np.ndarray:
+        """Return frames start..stop of a view, (n, H, W, 3) uint8 RGB."""
+
+
+class FrameEncoder(Protocol):
+    """The part of an encoder that encoding uses; `encoders.base.Encoder` has it."""
+
+    card: Any
+    pool: str
+    dim: int
+    shape: tuple[int, ...]
+    fingerprint: str
+    weights_sha256: str
+
+    def __call__(self, frames: np.ndarray) -> np.ndarray:
+        """Return (B, dim) float32 features of (B, H, W, 3) uint8 RGB frames."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of one view of one dataset, complete and read-only.
+
+    Attributes:
+        folder: the cache entry.
+        manifest: what was encoded and by what.
+        rows: (N, dim) float16 memory map; row i belongs to frame i of the dataset.
+        encoded: frames encoded by the call that returned this; 0 when all were at hand.
+    """
+
+    folder: Path
+    manifest: dict[str, Any]
+    rows: np.ndarray
+    encoded: int = 0
+
+    @property
+    def view(self) -> str:
+        """The camera the pictures came from."""
+        return self.manifest["view"]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one feature before it was flattened: (dim,), (C, h, w) or (N, C)."""
+        return tuple(self.manifest["shape"])
+
+    @property
+    def dim(self) -> int:
+        """Length of one row."""
+        return self.rows.shape[1]
+
+    def part(self, rows: Any, dataset: str) -> "Features":
+        """Return some rows, a slice or (n,) indices, as the features of that part, whose fingerprint is `dataset`."""
+        taken = self.rows[rows]
+        return replace(self, manifest={**self.manifest, "length": len(taken), "dataset": dataset}, rows=taken)
+
+
+default_cache_root = cache_root
+
+
+def entry_key(dataset: FrameSource, view: str, encoder: FrameEncoder) -> str:
+    """Return the address of an entry: a hash of everything its rows depend on."""
+    return digest(
+        {
+            "format": FORMAT,
+            "dataset": dataset.fingerprint,
+            "view": view,
+            "encoder": encoder.fingerprint,
+            "dtype": "float16",
+        }
+    )
+
+
+def encode(
+    dataset: FrameSource,
+    view: str,
+    encoder: FrameEncoder,
+    cache_root: Path | None = None,
+    progress: Progress | None = None,
+) -> Features:
+    """Encode one view of a dataset, or return what was encoded before.
+
+    Args:
+        dataset: an opened dataset.
+        view: one of its views.
+        encoder: a frozen encoder.
+        cache_root: folder of the cache; `default_cache_root()` by default.
+        progress: called with (frames done, frames in all) after each chunk.
+
+    Raises:
+        UnknownName: a view the dataset does not have.
+        InputError: a cache folder that cannot be written.
+        SurgicaiError: a feature that is not finite.
+    """
+    sights = getattr(dataset, "sights", dataset.views)
+    if view not in sights:
+        raise UnknownName("view of this dataset", view, sights)
+    if not dataset.length:
+        raise InputError("The dataset holds no frames; record and render some first.")
+    folder = (cache_root or default_cache_root()) / "features" / entry_key(dataset, view, encoder)
+    if (folder / MANIFEST).exists():
+        return open_entry(folder, dataset.length)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"The feature cache {folder} cannot be made ({error.strerror}); set ${CACHE_VARIABLE} to another folder."
+        ) from None
+    with _locked(folder):
+        if (folder / MANIFEST).exists():  # another process finished it while we waited
+            return open_entry(folder, dataset.length)
+        encoded = _fill(folder, dataset, view, encoder, progress)
+        write_json(folder / MANIFEST, _manifest(dataset, view, encoder))
+        (folder / PROGRESS).unlink(missing_ok=True)
+    return open_entry(folder, dataset.length, encoded)
+
+
+def open_entry(folder: Path, length: int | None = None, encoded: int = 0) -> Features:
+    """Open a complete entry; `BadFile` where it is damaged."""
+    manifest = read_json(folder / MANIFEST)
+    try:
+        rows = np.load(folder / ROWS, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise BadFile(f"The cache entry {folder} is damaged ({error}); delete that folder.") from None
+    wanted = (manifest["length"] if length is None else length, manifest["dim"])
+    if rows.shape != wanted or rows.dtype != np.float16:
+        raise BadFile(f"The cache entry {folder} holds {rows.shape}, expected {wanted}; delete that folder.")
+    return Features(folder, manifest, rows, encoded)
+
+
+def _manifest(dataset: FrameSource, view: str, encoder: FrameEncoder) -> dict[str, Any]:
+    """Describe the entry."""
+    return {
+        "format": FORMAT,
+        "dataset": dataset.fingerprint,
+        "view": view,
+        "encoder": encoder.card.name,
+        "card": to_mapping(encoder.card),
+        "encoder_fingerprint": encoder.fingerprint,
+        "weights_sha256": encoder.weights_sha256,
+        "pool": encoder.pool,
+        "shape": list(encoder.shape),
+        "length": dataset.length,
+        "dim": encoder.dim,
+        "dtype": "float16",
+        "code_version": __version__,
+    }
+
+
+def _fill(folder: Path, dataset: FrameSource, view: str, encoder: FrameEncoder, progress: Progress | None) -> int:
+    """Encode what is missing; return how many frames that was."""
+    rows, start = _allocated(folder, (dataset.length, encoder.dim))
+    if progress:
+        progress(start, dataset.length)
+    done = start
+    for stop, frames in _chunks(dataset, view, start):
+        with np.errstate(over="ignore"):
+            features = encoder(frames).astype(np.float16)
+        if not np.isfinite(features).all():
+            raise SurgicaiError(
+                f"Encoder '{encoder.card.name}' gave features that are not finite in float16 for view '{view}'."
+            )
+        rows[done:stop] = features
+        rows.flush()
+        write_json(folder / PROGRESS, {"rows": stop})
+        done = stop
+        if progress:
+            progress(done, dataset.length)
+    return done - start
+
+
+def _allocated(folder: Path, shape: tuple[int, int]) -> tuple[np.memmap, int]:
+    """Open the rows for writing; return them with the number of rows already there."""
+    path = folder / ROWS
+    try:
+        rows = np.lib.format.open_memmap(path, mode="r+")
+        done = int(read_json(folder / PROGRESS)["rows"])
+        if rows.shape == shape and rows.dtype == np.float16 and 0 <= done <= shape[0]:
+            return rows, done
+    except (OSError, ValueError, KeyError, TypeError, BadFile):
+        pass  # nothing there yet, or torn: start over
+    (folder / PROGRESS).unlink(missing_ok=True)
+    return np.lib.format.open_memmap(path, mode="w+", dtype=np.float16, shape=shape), 0
+
+
+def _chunks(dataset: FrameSource, view: str, start: int) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield (stop, frames) chunk by chunk; the next chunk is decoded while this one is encoded."""
+    starts = range(start, dataset.length, CHUNK)
+    if not starts:
+        return
+    with ThreadPoolExecutor(1) as reader:
+
+        def read(at: int) -> np.ndarray:
+            return dataset.frames(view, at, min(at + CHUNK, dataset.length))
+
+        pending = reader.submit(read, starts[0])
+        for at in starts:
+            frames = pending.result()
+            if at + CHUNK < dataset.length:
+                pending = reader.submit(read, at + CHUNK)
+            yield min(at + CHUNK, dataset.length), frames
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the entry's lock; a second process waits here and then finds the entry complete."""
+    with open(folder / "lock", "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+@dataclass(frozen=True)
+class CacheEntry:
+    """One entry of the cache as `list_cache` shows it: its folder, size [bytes] and manifest (None: unfinished)."""
+
+    folder: Path
+    size: int
+    manifest: dict[str, Any] | None
+
+
+def list_cache(root: Path | None = None) -> list[CacheEntry]:
+    """List every entry, unfinished ones included."""
+    folder = (root or default_cache_root()) / "features"
+    entries = []
+    for entry in sorted(folder.iterdir()) if folder.is_dir() else []:
+        size = sum(file.stat().st_blocks * 512 for file in entry.iterdir())
+        manifest = read_json(entry / MANIFEST) if (entry / MANIFEST).exists() else None
+        entries.append(CacheEntry(entry, size, manifest))
+    return entries
+
+
+def prune_cache(root: Path | None = None, keep_datasets: Collection[str] = ()) -> list[CacheEntry]:
+    """Delete unfinished entries and those of datasets not in `keep_datasets` (fingerprints); return them.
+
+    An entry that a process is writing now is left alone.
+    """
+    removed = []
+    for entry in list_cache(root):
+        if entry.manifest is not None and entry.manifest["dataset"] in keep_datasets:
+            continue
+        with open(entry.folder / "lock", "w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            shutil.rmtree(entry.folder)
+        removed.append(entry)
+    return removed

@@ -1,0 +1,246 @@
+"""Probe before rollout: what of the needle's pose can be read linearly from an encoder's features.
+
+`probe(dataset, features, seed=…, progress=…) -> Probe`: ridge regression in closed form from the features to the
+position of the needle's tip and to its orientation, judged on episodes it was not fitted on.
+
+Every episode is held out once (`FOLDS` folds of whole episodes). Each penalty is chosen on the other episodes alone,
+by cross-validation over folds of whole episodes among them. At most `FRAMES` frames are used, evenly spread over every
+episode: neighbouring frames say nearly the same. An orientation is fitted as two columns of its matrix and put back
+among the rotations (Gram–Schmidt). An episode's error is the median over its frames; reported is the median over
+episodes, with a percentile bootstrap over episodes. `chance` is the error of the mean pose of the episodes fitted on:
+what needs no seeing.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.features.cache import Features
+from surgicai_vision.scene.needle import TIP_ANGLE, point
+from surgicai_vision.scene.rotations import quaternion_to_matrix
+
+FOLDS = 5
+FRAMES = 1000
+FEWEST = 5  # episodes: fewer leave no episodes to choose a penalty on
+PENALTIES = np.logspace(-7, 2, 28)
+"""Tried penalties, as shares of the features' total variance."""
+SMALLEST_STD = 1e-6  # a feature that varies less is constant
+RESAMPLES = 10_000
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+"""Called with (folds done, folds in all)."""
+
+
+class ProbedData(Protocol):
+    """The part of a dataset that probing reads."""
+
+    fingerprint: str
+    length: int
+    episode_index: np.ndarray
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return the columns by key; (N, 7) `names.NEEDLE_POSE` among them."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One error: its median over episodes, the 95 % interval of that, and what the mean pose would err."""
+
+    median: float
+    low: float
+    high: float
+    chance: float
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a probe found.
+
+    Attributes:
+        tip: error of the tip's position in the world [mm].
+        angle: angle between the needle's orientation and the one read [deg].
+        n: episodes.
+        frames: frames used.
+        tip_of_episode: (n,) median error of each episode [mm].
+        angle_of_episode: (n,) the same [deg].
+    """
+
+    tip: Measure
+    angle: Measure
+    n: int
+    frames: int
+    tip_of_episode: tuple[float, ...]
+    angle_of_episode: tuple[float, ...]
+
+    def row(self) -> dict[str, Any]:
+        """Return it as a row of `probe.json`."""
+        row: dict[str, Any] = {"n": self.n, "frames": self.frames}
+        for name, unit, measure in (("tip", "mm", self.tip), ("angle", "deg", self.angle)):
+            row[f"{name}_{unit}"] = measure.median
+            row |= {f"{name}_{unit}_{key}": getattr(measure, key) for key in ("low", "high", "chance")}
+        return row
+
+
+def probe(
+    dataset: ProbedData, features: Sequence[Features], *, seed: int = 0, progress: Progress | None = None
+) -> Probe:
+    """Probe the features of one or several views side by side.
+
+    Args:
+        dataset: an opened dataset.
+        features: one entry of the cache per view.
+        seed: of the folds and of the bootstrap.
+        progress: called with (folds done, folds in all).
+
+    Raises:
+        UnknownName: a dataset without the needle's pose.
+        InputError: fewer than `FEWEST` episodes, a pose that is not finite, or features of another dataset.
+    """
+    pose = _pose(dataset)
+    if not features:
+        raise InputError("A probe needs the features of at least one view.")
+    for entry in features:
+        if entry.manifest["dataset"] != dataset.fingerprint or len(entry.rows) != dataset.length:
+            raise InputError(f"The features of view '{entry.view}' are of another dataset; encode this one.")
+    index = np.asarray(dataset.episode_index)
+    rows = spread(index, FRAMES)
+    seen = np.concatenate([np.asarray(entry.rows[rows], np.float64) for entry in features], axis=1)
+    position, rotation = _targets(pose[rows])
+    folds = _folds(index[rows], FOLDS, np.random.default_rng(seed))
+    tip, angle = np.empty((2, len(rows))), np.empty((2, len(rows)))
+    for done, fold in enumerate(np.unique(folds)):
+        held = folds == fold
+        reader = _Reader(seen[~held], seen[held], folds[~held])
+        for at, answer in enumerate((reader.answer, reader.mean)):
+            tip[at, held] = 1e3 * np.linalg.norm(answer(position[~held]) - position[held], axis=1)
+            angle[at, held] = _angles(answer(rotation[~held]), rotation[held])
+        if progress:
+            progress(done + 1, len(np.unique(folds)))
+    generator = np.random.default_rng((seed, 1))
+    measures = [_measure(errors, index[rows], generator) for errors in (tip, angle)]
+    (tip_measure, tips), (angle_measure, angles) = measures
+    return Probe(tip_measure, angle_measure, len(tips), len(rows), tuple(tips.tolist()), tuple(angles.tolist()))
+
+
+def spread(episode_index: np.ndarray, frames: int) -> NDArray[np.int64]:
+    """Return at most `frames` row numbers, equally many from every episode (all of a shorter one), evenly spread."""
+    episodes = np.unique(episode_index)
+    each = max(1, frames // len(episodes))
+    chosen = []
+    for episode in episodes:
+        rows = np.flatnonzero(episode_index == episode)
+        places = np.linspace(0, len(rows) - 1, min(each, len(rows))).round().astype(int)
+        chosen.append(rows[places])
+    return np.concatenate(chosen)
+
+
+def _pose(dataset: ProbedData) -> Array:
+    """Return the needle's pose, (N, 7); refuse a dataset that cannot be probed."""
+    columns = dataset.columns()
+    if names.NEEDLE_POSE not in columns:
+        raise UnknownName("column", names.NEEDLE_POSE, columns)
+    pose = np.asarray(columns[names.NEEDLE_POSE], np.float64)
+    episodes = len(np.unique(dataset.episode_index))
+    if episodes < FEWEST:
+        raise InputError(f"The dataset has {episodes} episodes; a probe needs at least {FEWEST}.")
+    if not np.isfinite(pose).all():
+        raise InputError(f"Column '{names.NEEDLE_POSE}' of the dataset holds values that are not finite.")
+    return pose
+
+
+def _targets(pose: Array) -> tuple[Array, Array]:
+    """Return the tip's position in the world (n, 3) [m] and two columns of the orientation (n, 6)."""
+    matrices = np.stack([quaternion_to_matrix(quaternion) for quaternion in pose[:, 3:]])
+    tip = pose[:, :3] + matrices @ point(TIP_ANGLE)
+    return tip, matrices[:, :, :2].transpose(0, 2, 1).reshape(len(pose), 6)
+
+
+def _angles(answers: Array, wanted: Array) -> Array:
+    """Return the angles between two tables of orientations (n, 6) [deg]."""
+    products = np.einsum("nij,nij->n", _matrices(answers), _matrices(wanted))
+    return np.degrees(np.arccos(np.clip((products - 1) / 2, -1, 1)))
+
+
+def _matrices(columns: Array) -> Array:
+    """Return the rotations (n, 3, 3) nearest to two columns (n, 6), by Gram–Schmidt."""
+    x, y = columns[:, :3], columns[:, 3:]
+    x = x / np.linalg.norm(x, axis=1, keepdims=True)
+    y = y - (x * y).sum(1, keepdims=True) * x
+    y = y / np.linalg.norm(y, axis=1, keepdims=True)
+    return np.stack([x, y, np.cross(x, y)], axis=2)
+
+
+def _folds(episode: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Return the fold of each row; whole episodes, evenly many a fold."""
+    episodes, place = np.unique(episode, return_inverse=True)
+    return (generator.permutation(len(episodes)) % count)[place]
+
+
+class _Reader:
+    """Ridge regression from one table of features, in its dual form: frames are fewer than features.
+
+    Args:
+        fitted: features of the rows fitted, (n, d).
+        asked: features of the rows asked, (m, d).
+        folds: fold of each row fitted, to choose a penalty on.
+    """
+
+    def __init__(self, fitted: Array, asked: Array, folds: np.ndarray) -> None:
+        mean, std = fitted.mean(0), fitted.std(0)
+        std = np.where(std > SMALLEST_STD, std, np.inf)
+        fitted, asked = (fitted - mean) / std, (asked - mean) / std
+        gram = fitted @ fitted.T
+        self._whole = _Ridge(gram, asked @ fitted.T)
+        parts = [folds == fold for fold in np.unique(folds)]
+        self._parts = [(held, _Ridge(gram[np.ix_(~held, ~held)], gram[np.ix_(held, ~held)])) for held in parts]
+        self._asked = len(asked)
+
+    def mean(self, target: Array) -> Array:
+        """Return the answers that need no features, (m, k) for targets (n, k)."""
+        return np.broadcast_to(target.mean(0), (self._asked, target.shape[1]))
+
+    def answer(self, target: Array) -> Array:
+        """Return the answers (m, k) for targets (n, k), with the penalty that is best across the folds."""
+        errors = np.zeros(len(PENALTIES))
+        for held, ridge in self._parts:
+            for at, penalty in enumerate(PENALTIES):
+                errors[at] += ((ridge.answer(target[~held], penalty) - target[held]) ** 2).sum()
+        return self._whole.answer(target, PENALTIES[int(errors.argmin())])
+
+
+class _Ridge:
+    """One eigendecomposition, from which ridge regression with any penalty follows.
+
+    Args:
+        gram: (n, n) products of the rows fitted.
+        cross: (m, n) products of the rows asked with those fitted.
+    """
+
+    def __init__(self, gram: Array, cross: Array) -> None:
+        row = gram.mean(0)
+        centred = gram - row[None] - row[:, None] + row.mean()
+        values, self._vectors = np.linalg.eigh(centred)
+        self._values = np.maximum(values, 0.0)
+        self._scale = max(self._values.sum(), np.finfo(float).tiny)
+        self._projected = (cross - cross.mean(1, keepdims=True) - row[None] + row.mean()) @ self._vectors
+
+    def answer(self, target: Array, penalty: float) -> Array:
+        """Return the answers (m, k) for targets (n, k); `penalty` is a share of the features' total variance."""
+        mean = target.mean(0)
+        turned = self._vectors.T @ (target - mean) / (self._values + penalty * self._scale)[:, None]
+        return self._projected @ turned + mean
+
+
+def _measure(errors: Array, episode: np.ndarray, generator: np.random.Generator) -> tuple[Measure, Array]:
+    """Return the measure of (2, n) errors, read and chance, and the median error of each episode."""
+    of_episode = np.array([np.median(errors[:, episode == one], axis=1) for one in np.unique(episode)])
+    draws = generator.integers(0, len(of_episode), (RESAMPLES, len(of_episode)))
+    low, high = np.quantile(np.median(of_episode[draws, 0], axis=1), (0.025, 0.975))
+    median, chance = np.median(of_episode, axis=0)
+    return Measure(float(median), float(low), float(high), float(chance)), of_episode[:, 0]

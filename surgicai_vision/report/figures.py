@@ -1,0 +1,130 @@
+"""Show: the page's static pictures. What each view sees, a success and a failure, rollouts side by side."""
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import SurgicaiError
+from surgicai_vision.envs import contact_sheet
+from surgicai_vision.evaluation.storage import read_film
+from surgicai_vision.report.episodes import film_id
+from surgicai_vision.report.filmstrips import Choice, Reel, sight
+from surgicai_vision.report.groups import Group, best_trained
+
+SIZE = 224
+"""Height and width of the large pictures [px]."""
+
+
+def static_pictures(groups: Sequence[Group], reel: Reel) -> dict[str, Any]:
+    """Return views, a success, a failure and the side-by-side rollouts, or the reason why there are none."""
+    colours = ["#" + bytes(colour).hex() for colour in contact_sheet.PALETTE]
+    parts = [{"name": name, "colour": colour} for name, colour in zip(names.PARTS, colours, strict=True)]
+    shown = {task: [_rollout(choice, reel) for choice in choices] for task, choices in reel.compared.items()}
+    page: dict[str, Any] = {
+        "picture_size": SIZE,
+        "parts": parts,
+        "no_pictures": "",
+        "compared": [
+            {"task": task, "start": reel.compared[task][0].row["seed"], "rollouts": rollouts}
+            for task, found in shown.items()
+            if len(rollouts := [rollout for rollout in found if rollout]) > 1
+        ],
+        "films": len(reel.strips),
+        "films_wanted": reel.wanted,
+    }
+    try:
+        if reel.problem:
+            raise SurgicaiError(reel.problem.removeprefix("No pictures: "))
+        outcomes = ((True, "success"), (False, "failure"))
+        page["strips"] = [_strip(choose(groups, success=won), word) for won, word in outcomes]
+        page["views"] = _views(groups)
+    except SurgicaiError as error:
+        reason = f"No pictures: {error}"
+        page.update(views=[], strips=[{"title": "", "frames": [], "text": reason}], no_pictures=reason, compared=[])
+    return page
+
+
+def choose(groups: Sequence[Group], success: bool) -> Choice | None:
+    """Choose the episode for a film: the best trained policy's first, else another's, references last."""
+    best = best_trained(groups)
+    ordered = sorted(groups, key=lambda item: (item is not best, not item.condition.trained))
+    for item in ordered:
+        for result in item.results:
+            for row in result.rows:
+                if row["success"] == success and not row["error"]:
+                    return Choice(item, result, row)
+    return None
+
+
+def _strip(choice: Choice | None, kind: str) -> dict[str, Any]:
+    """Render the large film strip of one episode."""
+    if choice is None:
+        return {"title": f"No {kind}", "frames": [], "text": f"No episode of any policy was a {kind}."}
+    row, condition = choice.row, choice.group.condition
+    view = next(iter(condition.views), "front")
+    film = read_film(choice.result.folder, row["seed"])
+    with contact_sheet.stage(choice.result.config, SIZE) as picture:
+        frames = [
+            {"step": int(step), "data": _data(contact_sheet.jpeg(picture(state, *sight(view))))}
+            for step, state in zip(film.steps, film.states, strict=True)
+        ]
+    end = f"{row['d_trans_mm']:.1f} mm and {row['d_angle_deg']:.1f}° from the goal at the end"
+    why = "" if row["success"] else f" ({row['failure']})"
+    words = f"{condition.policy}, start {row['seed']}, seen by {view}: {kind}{why} after {row['steps']} steps; {end}."
+    return {"title": f"A {kind} in {condition.task}", "frames": frames, "text": words}
+
+
+def _rollout(choice: Choice, reel: Reel) -> dict[str, Any] | None:
+    """Return one of the rollouts from the same start, with its frames."""
+    strip = reel.strips.get(choice.identity)
+    if strip is None:
+        return None
+    frames = [
+        {"step": step, "data": f"data:image/jpeg;base64,{frame}"}
+        for step, frame in zip(strip.steps, strip.frames, strict=True)
+    ]
+    label = choice.group.label
+    success = bool(choice.row["success"])
+    return {"id": film_id(choice.identity), "label": label, "outcome": strip.outcome, "success": success,
+            "view": strip.view, "frames": frames}  # fmt: skip
+
+
+def _views(groups: Sequence[Group]) -> list[dict[str, Any]]:
+    """Render every modality of the views that were used, at the start of an episode."""
+    used = {names.camera_of(view) for item in groups for view in item.condition.views}
+    shown = [view for view in names.CAMERAS if view in (used or {"front", "back"})]
+    chosen = choose(groups, success=True) or choose(groups, success=False)
+    if chosen is None:
+        return []
+    film, start = read_film(chosen.result.folder, chosen.row["seed"]), chosen.row["seed"]
+    views = []
+    with contact_sheet.stage(chosen.result.config, SIZE) as picture:
+        for view in shown:
+            frames = {modality: picture(film.states[0], view, modality) for modality in names.MODALITIES}
+            needle = np.all(frames[names.SEGMENTATION] == contact_sheet.PALETTE[names.PARTS.index("needle")], axis=-1)
+            share = 100 * float(needle.mean())
+            views.append(
+                {
+                    "name": view,
+                    "text": f"start {start}; the needle covers {share:.2f} % of the picture. "
+                    "Depth: near is red, far is blue.",
+                    "pictures": [
+                        {"name": name.upper() if name == names.RGB else name, "data": _picture_data(frame, name)}
+                        for name, frame in frames.items()
+                    ],
+                }
+            )
+    return views
+
+
+def _picture_data(frame: contact_sheet.Picture, modality: str) -> str:
+    if modality == names.SEGMENTATION:
+        return _data(contact_sheet.png(frame), "png")
+    return _data(contact_sheet.jpeg(frame, 90))
+
+
+def _data(content: bytes, kind: str = "jpeg") -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

@@ -1,0 +1,68 @@
+"""Beside the paper: which of our conditions stands beside which number of its Table 2."""
+
+from collections.abc import Sequence
+
+from surgicai_vision.core import names
+from surgicai_vision.report import paper, text
+from surgicai_vision.report.experiment_key import Condition
+from surgicai_vision.report.groups import Group
+
+_TELLING = tuple(name for name in paper.ENCODERS if name != "random")
+_DEMONSTRATIONS = 50
+"""Of each subtask, in the released code."""
+
+
+def beside_paper(groups: Sequence[Group]) -> list[tuple[str, str, list[tuple[float | None, Group | None]]]]:
+    """Return the paper's Table 2 and ours as rows (task, encoder, [(paper's rate, our condition) for each view]).
+
+    The paper's encoders come first in each task, then ours that it has not. Rates are None where the paper has none.
+    Empty without a pretrained encoder of the paper's. Of several numbers of demonstrations the one nearest to the
+    paper's is taken.
+    """
+    known = [item for item in groups if _comparable(item.condition)]
+    if not any(item.condition.encoder in _TELLING for item in known):
+        return []
+    known.sort(key=lambda item: -abs((item.condition.demonstrations or 0) - _DEMONSTRATIONS))
+    ours = {(c.task, c.encoder, c.view): item for item in known if (c := item.condition)}
+    tasks = [task for task in names.TASKS if any(task == mine for mine, _, _ in ours)]
+    others = sorted({encoder for _, encoder, _ in ours} - set(paper.ENCODERS))
+    rows = []
+    for task in tasks:
+        for encoder in (*paper.ENCODERS, *others):
+            in_paper = paper.has(task, encoder)
+            pairs = [
+                (paper.rate(task, encoder, view) if in_paper else None, ours.get((task, encoder, view)))
+                for view in paper.VIEWS
+            ]
+            if any(rate is not None or item is not None for rate, item in pairs):
+                rows.append((task, encoder, pairs))
+    return rows
+
+
+def paper_text(task: str, encoder: str, rate: float | None) -> str:
+    """Return the paper's rate as text, or why there is none."""
+    if rate is not None:
+        return text.percent(rate)
+    return "not reported" if paper.has(task, encoder) else "not in the paper"
+
+
+def our_text(item: Group | None) -> str:
+    """Return our count and interval, or why there is none."""
+    if item is None:
+        return "not in this sweep"
+    if item.episodes:
+        return f"{item.successes}/{item.episodes} ({text.interval(item.interval)})"
+    return item.missing[0].state
+
+
+def paper_rate(condition: Condition) -> float | None:
+    """Return the paper's rate of the same task, encoder and single view, or None."""
+    if not _comparable(condition) or not paper.has(condition.task, condition.encoder):
+        return None
+    return paper.rate(condition.task, condition.encoder, condition.views[0])
+
+
+def _comparable(condition: Condition) -> bool:
+    """Whether it is what the paper's Table 2 holds: one view of the two, everything else as usual."""
+    usual = condition.trained and condition.plain and not condition.variant
+    return usual and len(condition.views) == 1 and condition.views[0] in paper.VIEWS

@@ -1,0 +1,125 @@
+"""Probing: each encoder's linear probe beside the success of the policies that see through it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from surgicai_vision.evaluation import statistics
+from surgicai_vision.report import charts, text
+from surgicai_vision.report.charts import Point, Series
+from surgicai_vision.report.curves import MOST, Chart
+from surgicai_vision.report.groups import Group
+
+FEWEST = 4
+"""Pairs below which no correlation is told."""
+ALL = "all"
+"""Stands for the task of a probe that names none."""
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Probe errors beside success: a table, a chart, and how the two go together."""
+
+    rows: tuple[dict[str, Any], ...]
+    chart: Chart | None
+    correlation: str
+
+
+def probes(found: Sequence[dict[str, Any]], groups: Sequence[Group]) -> Probes | None:
+    """Set each probe beside the success of the policies with its encoder, view, pool and task."""
+    if not found:
+        return None
+    rows = tuple(_row(probe, [item for item in groups if _matches(probe, item)]) for probe in found)
+    pairs = [row for row in rows if row["point"] is not None]
+    return Probes(rows, _chart(pairs), _correlations(pairs))
+
+
+def _row(probe: dict[str, Any], mine: Sequence[Group]) -> dict[str, Any]:
+    """Return one probe with the pooled success of its policies."""
+    k, n = sum(item.successes for item in mine), sum(item.episodes for item in mine)
+    tip, angle = (text.finite([probe.get(name)]) for name in ("tip_mm", "angle_deg"))
+    encoder, view, point = str(probe.get("encoder")), _view(probe), None
+    if n and tip:
+        low, high = statistics.clopper_pearson(k, n)
+        point = Point(tip[0], k / n, low, high, f"{view}: {tip[0]:.1f} mm, {k}/{n}")
+    return {
+        "task": probe.get("task") or ALL,
+        "encoder": encoder,
+        "view": view,
+        "tip_mm": _number(tip),
+        "tip_rest": _rest(probe, "tip_mm"),
+        "tip_sort": tip[0] if tip else "",
+        "angle_deg": _number(angle),
+        "angle_rest": _rest(probe, "angle_deg"),
+        "angle_sort": angle[0] if angle else "",
+        "n": probe.get("n", text.ABSENT),
+        "success": f"{k}/{n}" if n else text.ABSENT,
+        "rate": text.percent(k / n) if n else "",
+        "point": point,
+    }
+
+
+def _matches(probe: dict[str, Any], item: Group) -> bool:
+    condition = item.condition
+    if not (item.episodes and condition.trained and condition.plain):
+        return False
+    if probe.get("task") and probe["task"] != condition.task:
+        return False
+    pooled = condition.pool == (probe.get("pool") or "global")
+    return pooled and probe.get("encoder") == condition.encoder and _view(probe) == condition.view
+
+
+def _view(probe: dict[str, Any]) -> str:
+    view = probe.get("view") or ()
+    views = view.replace("+", ",").split(",") if isinstance(view, str) else view
+    return " + ".join(str(name).strip() for name in views)
+
+
+def _number(known: Sequence[float]) -> str:
+    return f"{known[0]:.2f}" if known else text.ABSENT
+
+
+def _rest(probe: dict[str, Any], name: str) -> str:
+    """Return interval and the mean pose's error, where the probe tells them."""
+    known = text.finite([probe.get(f"{name}_{part}") for part in ("low", "high", "chance")])
+    return f"({known[0]:.2f}–{known[1]:.2f}; {known[2]:.2f})" if len(known) == 3 else ""
+
+
+def _chart(pairs: Sequence[dict[str, Any]]) -> Chart | None:
+    """Draw success against the probe's tip error, one sign an encoder."""
+    if len(pairs) < 2 or len({row["point"].x for row in pairs}) < 2:
+        return None
+    encoders = list(dict.fromkeys(row["encoder"] for row in pairs))[:MOST]
+    lines = [Series(name, tuple(row["point"] for row in pairs if row["encoder"] == name)) for name in encoders]
+    ticks = {point.x: f"{point.x:.1f}" for line in lines for point in line.points}
+    name = "error of the needle's tip in the probe [mm]"
+    drawing = charts.curves(lines, name, label=f"success [%] against {name}", ticks=ticks, joined=False)
+    return Chart("Success [%] against the probe", drawing, charts.key(encoders), (), ())
+
+
+def _correlations(pairs: Sequence[dict[str, Any]]) -> str:
+    """Describe Spearman's rank correlation of tip error and success, each task by itself."""
+    parts = []
+    for task in dict.fromkeys(row["task"] for row in pairs):
+        mine = [(row["point"].x, row["point"].rate) for row in pairs if row["task"] == task]
+        parts.append(f"{'all tasks' if task == ALL else task}: {_correlation(mine)}")
+    if not parts:
+        return "No policy sees through a probed encoder, so there is nothing to correlate."
+    return (
+        f"Spearman's rank correlation of tip error and success: {'; '.join(parts)}. "
+        "Below 0 a better probe goes with more successes."
+    )
+
+
+def _correlation(pairs: Sequence[tuple[float, float]]) -> str:
+    if len(pairs) < FEWEST:
+        return f"{text.plural(len(pairs), 'pair')}, too few"
+    errors, rates = np.array(pairs).T
+    if len(set(errors)) == 1 or len(set(rates)) == 1:
+        return f"{len(pairs)} pairs, all alike in one of the two"
+    from scipy.stats import spearmanr
+
+    found = spearmanr(errors, rates)
+    return f"{found.statistic:.2f} over {len(pairs)} pairs (p {text.probability(float(found.pvalue), '= ')})"

@@ -1,0 +1,1 @@
+"""Visual: what only meets the eye: materials, shapes, textures, the skin, the instruments."""

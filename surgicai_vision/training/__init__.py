@@ -1,0 +1,1 @@
+"""Training: features and actions become a policy."""

@@ -1,0 +1,200 @@
+"""A checkpoint: what a training leaves behind, verified whenever it is read.
+
+Interface:
+
+* `Checkpoint`: everything about a trained policy, frozen, with the folder it lies in.
+* `write_checkpoint(folder, checkpoint, tensors)`: `policy.safetensors` first, `checkpoint.json` last.
+* `read_checkpoint(folder) -> Checkpoint`: refuse in one line what is missing, damaged, tampered with or of
+  another format.
+* `read_tensors(checkpoint)`: the policy's weights and input statistics, hash checked.
+* `check_encoder(checkpoint, encoder)`, `check_task(checkpoint, task)`: refuse what the policy was not
+  trained on.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+
+from surgicai_vision.core.config import TaskConfig, digest, from_mapping, to_mapping
+from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.core.files import read_json, write_bytes, write_json
+
+FORMAT = 1
+CARD, WEIGHTS = "checkpoint.json", "policy.safetensors"
+ENCODER_STATISTICS = "encoder_statistics.safetensors"
+"""BatchNorm statistics of an encoder that drifted (`config.Deviations`); the encoder's hash covers them."""
+
+
+@dataclass(frozen=True)
+class EncoderRecord:
+    """Which encoder a policy was trained on.
+
+    Attributes:
+        name: its registered name.
+        card: its card as plain data.
+        weights_sha256: hash of its weights and buffers.
+        pool: what was taken from it.
+        fingerprint: hash of all its features depend on, compute type included.
+        shape: shape of one feature before it is flattened.
+    """
+
+    name: str
+    card: dict
+    weights_sha256: str
+    pool: str
+    fingerprint: str
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Everything about a trained policy.
+
+    Attributes:
+        task: the task's configuration.
+        policy: registered name of the policy.
+        recipe: the recipe's settings as plain data.
+        recipe_name: "paper", "released" or "custom".
+        views: cameras, in the order of the features; empty for proprioception alone.
+        image_size: side of the pictures it was trained on [px].
+        encoder: the encoder's record; None without views.
+        proprioception: True when the tip pose and jaw are fed too.
+        seed: seed of the initialisation, the split and the order of frames.
+        epoch: passes made over the training frames.
+        dataset: fingerprint of the dataset.
+        demonstrations: episodes trained on.
+        frames: frames trained on.
+        validation_episodes: indices of the episodes held out.
+        train_losses: mean training loss of each epoch.
+        validation_losses: validation loss after each epoch; empty where nothing was held out.
+        device: what it was trained on.
+        code_version: version of this package.
+        policy_sha256: hash of `policy.safetensors`.
+        format: version of this file's layout.
+        folder: where it lies (not stored).
+    """
+
+    task: TaskConfig
+    policy: str
+    recipe: dict
+    recipe_name: str
+    views: tuple[str, ...]
+    image_size: int
+    encoder: EncoderRecord | None
+    proprioception: bool
+    seed: int
+    epoch: int
+    dataset: str
+    demonstrations: int
+    frames: int
+    validation_episodes: tuple[int, ...]
+    train_losses: tuple[float, ...]
+    validation_losses: tuple[float, ...]
+    device: str
+    code_version: str
+    policy_sha256: str = ""
+    format: int = FORMAT
+    folder: Path = field(default=Path("."), compare=False)
+
+    @property
+    def name(self) -> str:
+        """How tables call it: policy, encoder and views."""
+        seen = f"{self.encoder.name}-{'+'.join(self.views)}" if self.encoder else "proprioception"
+        return f"{self.policy}-{seen}"
+
+    @property
+    def visual(self) -> tuple[tuple[int, ...], ...]:
+        """Shape of each view's feature."""
+        return (self.encoder.shape,) * len(self.views) if self.encoder else ()
+
+
+def write_checkpoint(folder: Path, checkpoint: Checkpoint, tensors: Mapping[str, torch.Tensor]) -> Checkpoint:
+    """Write weights, then card; return the checkpoint as it now lies in `folder`."""
+    content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
+    checkpoint = replace(checkpoint, policy_sha256=hashlib.sha256(content).hexdigest(), folder=folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_bytes(folder / WEIGHTS, content)
+    plain = to_mapping(replace(checkpoint, folder=None))  # type: ignore[arg-type]
+    del plain["folder"]
+    plain["card_sha256"] = digest(plain)
+    write_json(folder / CARD, plain)
+    return checkpoint
+
+
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """Read and verify a checkpoint folder.
+
+    Raises:
+        BadFile: it is missing, damaged, changed by hand or of another format.
+    """
+    folder = Path(folder)
+    if not (folder / CARD).is_file():
+        hint = "its training has not ended" if (folder / "training.json").exists() else f"no {CARD} in it"
+        raise BadFile(f"{folder} is not a checkpoint ({hint}); make one with 'surgicai-vision train'.")
+    plain = read_json(folder / CARD)
+    if not isinstance(plain, dict) or plain.get("format") != FORMAT:
+        found = plain.get("format") if isinstance(plain, dict) else None
+        raise BadFile(f"{folder / CARD} has format {found!r}; this version reads {FORMAT}. Train again.")
+    if plain.pop("card_sha256", None) != digest(plain):
+        raise BadFile(f"{folder / CARD} was changed after training (its hash does not fit); train again.")
+    try:
+        checkpoint = replace(from_mapping(Checkpoint, plain, str(folder / CARD)), folder=folder)
+    except (InputError, TypeError) as error:
+        raise BadFile(f"{folder / CARD} is damaged ({error}); train again.") from None
+    read_tensors(checkpoint)
+    return checkpoint
+
+
+def read_tensors(checkpoint: Checkpoint) -> dict[str, torch.Tensor]:
+    """Return the policy's tensors after checking their hash; `BadFile` where it does not fit."""
+    path = checkpoint.folder / WEIGHTS
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise BadFile(f"Cannot read {path}: {error.strerror}; train again.") from None
+    if hashlib.sha256(content).hexdigest() != checkpoint.policy_sha256:
+        raise BadFile(f"{path} is not the file its {CARD} was written for (sha256 differs); train again.")
+    try:
+        return load(content)
+    except SafetensorError as error:
+        raise BadFile(f"{path} is not a safetensors file ({error}); train again.") from None
+
+
+SEEN = ("input_size", "input_range", "mean", "std", "interpolation", "channel_order")
+"""Entries of a card that change what the network sees."""
+
+
+def check_encoder(checkpoint: Checkpoint, encoder: Any) -> None:
+    """Refuse an encoder whose weights, preprocessing or pool differ from those trained on.
+
+    Raises:
+        InputError: it differs; the message says in what.
+    """
+    wanted = checkpoint.encoder
+    if wanted is None or encoder is None:
+        if (wanted is None) != (encoder is None):
+            has = "needs no encoder" if wanted is None else f"needs encoder '{wanted.name}'"
+            raise InputError(f"The checkpoint {checkpoint.folder} {has}.")
+        return
+    card = to_mapping(encoder.card)
+    given = {"weights": encoder.weights_sha256, "pool": encoder.pool, **{key: card[key] for key in SEEN}}
+    trained = {"weights": wanted.weights_sha256, "pool": wanted.pool, **{key: wanted.card[key] for key in SEEN}}
+    for key, value in trained.items():
+        if given[key] != value:
+            raise InputError(
+                f"The checkpoint {checkpoint.folder} was trained on encoder '{wanted.name}' with {key} "
+                f"{value}, got '{encoder.card.name}' with {given[key]}; hand over the same with --weights."
+            )
+
+
+def check_task(checkpoint: Checkpoint, task: str) -> None:
+    """Refuse a checkpoint trained on another task."""
+    if checkpoint.task.task != task:
+        trained = checkpoint.task.task
+        raise InputError(f"The checkpoint {checkpoint.folder} was trained on task '{trained}', not '{task}'.")

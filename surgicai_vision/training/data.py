@@ -1,0 +1,84 @@
+"""Training data: what training reads of a dataset, how frames are split and batched, statistics of the inputs."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, clock
+
+
+class TrainingData(Protocol):
+    """The part of a dataset that training reads."""
+
+    config: TaskConfig
+    image_size: int
+    length: int
+    fingerprint: str
+    episode_index: np.ndarray
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return what policies are fed and learn, by key: (N, 7) state and action, (N,) phase, …"""
+
+
+def with_clock(columns: dict[str, np.ndarray], vector: str | None) -> dict[str, np.ndarray]:
+    """Return the columns, and `names.CLOCKED_STATE` (N, 10) beside them where that is the `vector` asked for."""
+    if vector != names.CLOCKED_STATE:
+        return columns
+    steps = np.rint(np.asarray(columns["timestamp"]) * names.FPS)
+    return {**columns, vector: np.concatenate([columns[names.STATE], clock(steps)], axis=1, dtype=np.float32)}
+
+
+def split(episode_index: np.ndarray, recipe: Any, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
+    """Split the frames into training and validation.
+
+    Args:
+        episode_index: (N,) episode of every frame.
+        recipe: has `split` ("episode" or "transition") and `validation` (share held out).
+        seed: of the draw.
+
+    Returns:
+        Training rows, validation rows (both sorted int64), and the episodes held out (whole ones only).
+        At least one episode is held out when the share is above 0 and there are two or more.
+    """
+    generator = np.random.default_rng(seed)
+    units = np.unique(episode_index) if recipe.split == "episode" else np.arange(len(episode_index))
+    count = round(recipe.validation * len(units))
+    if recipe.validation > 0 and len(units) > 1:
+        count = min(max(count, 1), len(units) - 1)
+    held = np.sort(generator.permutation(units)[:count])
+    belongs = np.isin(episode_index, held) if recipe.split == "episode" else np.isin(units, held)
+    episodes = tuple(int(index) for index in held) if recipe.split == "episode" else ()
+    return np.flatnonzero(~belongs), np.flatnonzero(belongs), episodes
+
+
+def cuts(count: int, size: int) -> list[int]:
+    """Return where the batches of `count` rows begin; a last batch of one joins the one before."""
+    starts = list(range(0, count, size))
+    return starts[:-1] if len(starts) > 1 and count - starts[-1] == 1 else starts
+
+
+def over_places(
+    mean: torch.Tensor, std: torch.Tensor, visual: Sequence[tuple[int, ...]]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Give all places of a feature map their channel's statistics: a place that never changes is not made loud.
+
+    Args:
+        mean: (inputs,) means of the inputs, the views' rows first.
+        std: (inputs,) their standard deviations.
+        visual: shape of each view's feature; only maps (C, h, w) are changed.
+    """
+    mean, std = mean.clone(), std.clone()
+    at = 0
+    for shape in visual:
+        size = math.prod(shape)
+        if len(shape) == 3:
+            m, s = mean[at : at + size].view(shape), std[at : at + size].view(shape)
+            channel = m.mean((1, 2), keepdim=True)
+            s.copy_(((s**2 + m**2).mean((1, 2), keepdim=True) - channel**2).clamp(min=0).sqrt().expand(shape))
+            m.copy_(channel.expand(shape))
+        at += size
+    return mean, std

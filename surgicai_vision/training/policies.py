@@ -1,0 +1,109 @@
+"""Policies by name, their recipes, and the policy of a checkpoint.
+
+* `load_recipe(policy, recipe, changes) -> recipe object`: the frozen settings of a policy from
+  configs/recipes, with changes.
+* `load_policy(folder) -> policy` from a checkpoint folder; `policy.checkpoint` says all about it.
+* `load_encoder_of(checkpoint, …)`: the encoder a policy was trained on, verified.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import yaml
+
+from surgicai_vision.core.config import Deviations, from_mapping
+from surgicai_vision.core.errors import BadFile, UnknownName, check_name
+from surgicai_vision.core.files import configs_folder
+from surgicai_vision.core.plugins import resolve
+from surgicai_vision.features.encoders import load_encoder
+
+POLICIES: Mapping[str, str] = MappingProxyType({"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP"})
+"""Policy name → "module:attribute" of its `policies.base.Plugin`."""
+
+
+def policy_plugin(name: str) -> Any:
+    """Import the policy plug-in of `name`; `UnknownName` lists what exists."""
+    if name not in POLICIES:
+        raise UnknownName("policy", name, POLICIES)
+    return resolve(POLICIES[name])
+
+
+def recipe_names() -> tuple[str, ...]:
+    """Return the names of the recipes in configs/recipes."""
+    return tuple(sorted(path.stem for path in (configs_folder() / "recipes").glob("*.yaml")))
+
+
+def load_recipe(policy: str = "bc", recipe: str | Path = "paper", changes: Mapping[str, Any] | None = None) -> Any:
+    """Read a recipe and apply changes.
+
+    Args:
+        policy: one of `POLICIES`.
+        recipe: a name of `recipe_names()`, or the path of a YAML file.
+        changes: keys to replace.
+
+    Raises:
+        UnknownName: a policy, recipe or key that does not exist.
+        BadFile: a recipe file that cannot be read.
+        InputError: a value that is not allowed.
+    """
+    plugin = policy_plugin(policy)
+    path = Path(recipe)
+    if path.suffix not in (".yaml", ".yml"):
+        check_name("recipe", str(recipe), recipe_names())
+        path = (configs_folder() / "recipes") / f"{recipe}.yaml"
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BadFile(f"Cannot read the recipe {path}: {' '.join(str(error).split())}.") from None
+    if not isinstance(values, Mapping):
+        raise BadFile(f"The recipe {path} is not a table of keys.")
+    return from_mapping(plugin.recipe, {**values, **(changes or {})}, f"recipe {recipe}")
+
+
+def load_policy(folder: Path | str) -> Any:
+    """Load a trained policy from a checkpoint folder, verified.
+
+    Returns:
+        The policy; `policy.checkpoint` says everything about it.
+
+    Raises:
+        BadFile: a folder that is no whole checkpoint, or one that was changed.
+    """
+    from surgicai_vision.training.checkpoint import read_checkpoint
+
+    return restore(read_checkpoint(Path(folder)))
+
+
+def restore(checkpoint: Any) -> Any:
+    """Build the trained policy of a checkpoint; see `load_policy`."""
+    from surgicai_vision.training.checkpoint import read_tensors
+
+    plugin = policy_plugin(checkpoint.policy)
+    try:
+        policy = plugin.make(from_mapping(plugin.recipe, checkpoint.recipe), checkpoint.visual)
+        policy.load_state_dict(read_tensors(checkpoint))
+    except RuntimeError as error:
+        raise BadFile(f"{checkpoint.folder} does not fit its own recipe ({str(error).splitlines()[0]}).") from None
+    policy.eval().requires_grad_(False)
+    policy.checkpoint = checkpoint
+    return policy
+
+
+def load_encoder_of(checkpoint: Any, weights: Path | str | None = None, accept_licence: bool = False) -> Any:
+    """Load the encoder a policy was trained on, verified; None for a policy without pictures.
+
+    Raises:
+        InputError: the encoder at hand is not the one trained on; else as `load_encoder`.
+    """
+    from surgicai_vision.training.checkpoint import ENCODER_STATISTICS, check_encoder
+
+    record, encoder = checkpoint.encoder, None
+    if record:
+        deviations = from_mapping(Deviations, checkpoint.recipe.get("deviations") or {})
+        statistics = checkpoint.folder / ENCODER_STATISTICS if deviations.batch_norm_drift else None
+        active = deviations if deviations != Deviations() else None
+        encoder = load_encoder(record.name, weights, record.pool, accept_licence, active, statistics)
+    check_encoder(checkpoint, encoder)
+    return encoder

@@ -1,0 +1,378 @@
+"""Features and actions → policy.
+
+Interface:
+
+* `train(dataset, features, policy, recipe, seed=…, out=…, progress=…) -> Checkpoint`: train from the
+  feature cache. Running it again goes on where it was broken off, or returns what is done.
+* What it reads of a dataset, its split and its batches: `surgicai_vision.training.data`.
+
+Layout of the folder while it trains; the first and the last two stay (see `surgicai_vision.training.checkpoint`):
+
+    training.json          what was asked for; marks the folder as ours
+    training_state.pt      weights, optimiser and random state every few epochs
+    epochs/epoch_0010/     a complete checkpoint every `save_every` epochs, when asked for
+    policy.safetensors     weights and the statistics of the inputs
+    checkpoint.json        everything about them, with their hash; written last
+
+The split is by episode unless the recipe says otherwise. The validation loss is reported and chooses
+nothing: the last epoch is the checkpoint. The same seed gives the same weights on one machine.
+"""
+
+import ctypes
+import io
+import json
+import math
+import pickle
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from surgicai_vision import __version__
+from surgicai_vision.core import names
+from surgicai_vision.core.config import digest, to_mapping
+from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, UnknownName
+from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
+from surgicai_vision.features.cache import Features
+from surgicai_vision.training.checkpoint import CARD, Checkpoint, EncoderRecord, read_checkpoint, write_checkpoint
+from surgicai_vision.training.data import TrainingData, cuts, over_places, split, with_clock
+
+REQUEST, STATE = "training.json", "training_state.pt"
+STATE_EVERY = 5  # epochs between training states: a broken-off training loses at most these
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of malloc.h
+STATISTICS_ROWS = 1024  # rows summed at a time
+SMALLEST_STD = 1e-6  # an input that varies less is constant, and only its mean is removed
+
+Progress = Callable[[int, int], None]
+"""Called with (epochs done, epochs in all)."""
+Log = Callable[[int, dict[str, float]], None]
+"""Called with (epoch, losses by name)."""
+
+
+def train(
+    dataset: TrainingData,
+    features: Sequence[Features],
+    policy: Any,
+    recipe: Any,
+    *,
+    seed: int = 0,
+    out: Path,
+    progress: Progress | None = None,
+    recipe_name: str = "custom",
+    save_every: int = 0,
+    start: Any = None,
+    device: str = "cpu",
+    log: Log | None = None,
+    beside: Mapping[str, bytes] | None = None,
+) -> Checkpoint:
+    """Train a policy and write its checkpoint.
+
+    Args:
+        dataset: an opened dataset.
+        features: one entry of the cache per view, in the order the policy is to see them; none for
+            proprioception alone.
+        policy: a `policies.base.Plugin`.
+        recipe: an instance of `policy.recipe`.
+        seed: of the initialisation, the split and the order of frames.
+        out: the checkpoint folder; new, or one of the same request, which is then continued.
+        progress: called with (epochs done, epochs in all).
+        recipe_name: the name the recipe goes by, recorded.
+        save_every: also keep a checkpoint every so many epochs; 0 keeps the last alone.
+        start: a trained policy with the same inputs to start from (fine-tuning).
+        device: torch device to train on.
+        log: called with (epoch, losses by name) after each epoch.
+        beside: files to keep beside each checkpoint, by name.
+
+    Raises:
+        InputError: features of another dataset or of several encoders, or nothing to train on.
+        OutputExists: `out` holds something else.
+        SurgicaiError: the loss is not finite.
+    """
+    task = _Task(dataset, tuple(features), policy, recipe, seed, recipe_name, dict(beside or {}))
+    out = Path(out)
+    _check(task)
+    request = _request(task, start)
+    check_output(out, may_resume=REQUEST)
+    if (out / REQUEST).exists() and read_json(out / REQUEST) != request:
+        raise OutputExists(f"--out {out} holds another training; give a folder that does not exist yet.")
+    if (out / CARD).exists():
+        return read_checkpoint(out)
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / REQUEST, request)
+    _keep_memory()
+    with torch.random.fork_rng(devices=[]), _one_thread():
+        checkpoint = _Training(task, start, torch.device(device)).run(out, save_every, progress, log)
+    (out / STATE).unlink(missing_ok=True)
+    return checkpoint
+
+
+def _keep_memory() -> None:
+    """Let glibc keep what is freed: a batch of feature maps is allocated anew each step, and handing its pages back
+    and forth costs 1.5 times the arithmetic (221 against 84 ms of CPU a step of 256 maps of 48 × 28 × 28).
+    """
+    with suppress(OSError, AttributeError):  # another C library
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(MMAP_THRESHOLD, 1 << 30)
+        mallopt(TRIM_THRESHOLD, (1 << 31) - 1)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute with one thread: the network is small (threads cost more than they save, seventeen times more
+    on busy cores), and sums keep their order whatever the machine.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What is to be trained."""
+
+    dataset: TrainingData
+    features: tuple[Features, ...]
+    policy: Any
+    recipe: Any
+    seed: int
+    recipe_name: str
+    beside: dict[str, bytes]
+
+    def untrained(self) -> Any:
+        """Return the policy as it is before training."""
+        return self.policy.make(self.recipe, tuple(entry.shape for entry in self.features))
+
+
+def _check(task: _Task) -> None:
+    """Refuse what cannot be trained, before any work."""
+    if not isinstance(task.recipe, task.policy.recipe):
+        raise InputError(f"Policy '{task.policy.name}' needs a {task.policy.recipe.__name__}.")
+    for entry in task.features:
+        if entry.manifest["dataset"] != task.dataset.fingerprint or len(entry.rows) != task.dataset.length:
+            raise InputError(f"The features of view '{entry.view}' are of another dataset; encode this one.")
+    if len({entry.manifest["encoder_fingerprint"] for entry in task.features}) > 1:
+        raise InputError("The features come from several encoders; encode every view by the same one.")
+    with torch.random.fork_rng(devices=[]):
+        vector = task.untrained().inputs.vector
+    columns = with_clock(task.dataset.columns(), vector)
+    for key in (vector or names.STATE, task.policy.target):
+        if key not in columns:
+            raise UnknownName("column", key, columns)
+        if not np.isfinite(columns[key]).all():
+            raise InputError(f"Column '{key}' of the dataset holds values that are not finite.")
+
+
+def _request(task: _Task, start: Any) -> dict[str, Any]:
+    """Return everything that decides the result, as plain data."""
+    return {
+        "policy": task.policy.name,
+        "recipe": to_mapping(task.recipe),
+        "seed": task.seed,
+        "dataset": task.dataset.fingerprint,
+        "views": [entry.view for entry in task.features],
+        "encoder": task.features[0].manifest["encoder_fingerprint"] if task.features else None,
+        "start": None if start is None else digest([float(p.double().sum()) for p in start.state_dict().values()]),
+        "code_version": __version__,
+    }
+
+
+class _Training:
+    """One training: its data, its policy, its optimiser."""
+
+    def __init__(self, task: _Task, start: Any, device: torch.device) -> None:
+        self.task, self.device = task, device
+        columns = with_clock(task.dataset.columns(), task.untrained().inputs.vector)
+        index = np.asarray(task.dataset.episode_index)
+        self.rows, self.held_rows, self.held_episodes = split(index, task.recipe, task.seed)
+        self.demonstrations = len(np.unique(index[self.rows]))
+        if len(self.rows) < 2:
+            raise InputError(f"There are {len(self.rows)} frames to train on; at least 2 are needed.")
+        torch.manual_seed(task.seed)
+        self.policy = task.untrained()
+        vector, target = self.policy.inputs.vector, np.array(columns[task.policy.target])
+        self.vector = np.asarray(columns[vector], np.float32) if vector else None
+        kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
+        last = np.searchsorted(index, index, side="right") - 1
+        ahead = np.minimum(np.arange(len(index)) + math.ceil(task.policy.ahead / task.recipe.every), last)
+        self.target = torch.from_numpy(target[ahead].astype(kind))
+        if start is None:
+            self._measure()
+        else:
+            self._copy(start)
+        self.policy.to(device)
+        self.optimiser, self.schedule = self._optimiser()
+        self.order = np.random.default_rng((task.seed, 1))
+        self.losses: list[float] = []
+        self.held_losses: list[float] = []
+
+    def run(self, out: Path, save_every: int, progress: Progress | None, log: Log | None) -> Checkpoint:
+        """Train all epochs; return the last one's checkpoint."""
+        epochs = self.task.recipe.epochs
+        self._resume(out / STATE)
+        if progress:
+            progress(len(self.losses), epochs)
+        while len(self.losses) < epochs:
+            self.losses.append(self._epoch())
+            if len(self.held_rows):
+                self.held_losses.append(self._validate())
+            done = len(self.losses)
+            if log:
+                held = {"validation": self.held_losses[-1]} if self.held_losses else {}
+                log(done, {"train": self.losses[-1], **held})
+            if save_every and done % save_every == 0 and done < epochs:
+                self._write(out / "epochs" / f"epoch_{done:04d}")
+            if done % STATE_EVERY == 0 and done < epochs:
+                self._save(out / STATE)
+            if progress:
+                progress(done, epochs)
+        return self._write(out)
+
+    def _optimiser(self) -> tuple[torch.optim.Optimizer, Any]:
+        """Return the recipe's optimiser and its schedule, or None where the learning rate stays."""
+        recipe = self.task.recipe
+        kind = torch.optim.AdamW if recipe.weight_decay else torch.optim.Adam
+        optimiser = kind(self.policy.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+        if recipe.schedule == "constant":
+            return optimiser, None
+        steps = recipe.epochs * len(cuts(len(self.rows), recipe.batch_size))
+        return optimiser, torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.learning_rate, total_steps=steps)
+
+    def _observed(self, rows: np.ndarray) -> torch.Tensor:
+        """Return the raw inputs of some frames, (n, inputs) float32: the views' features, then the vector."""
+        parts = [torch.from_numpy(entry.rows[rows]).float() for entry in self.task.features]
+        if self.vector is not None:
+            parts.append(torch.from_numpy(self.vector[rows]))
+        return torch.cat(parts, dim=1)
+
+    def _measure(self) -> None:
+        """Store mean and standard deviation of the inputs over the training frames."""
+        pieces = [self.rows[at : at + STATISTICS_ROWS] for at in range(0, len(self.rows), STATISTICS_ROWS)]
+        mean = torch.zeros(self.policy.inputs.dim, dtype=torch.float64)
+        squares = torch.zeros_like(mean)
+        for piece in pieces:
+            mean += self._observed(piece).double().sum(0) / len(self.rows)
+        for piece in pieces:
+            squares += ((self._observed(piece).double() - mean) ** 2).sum(0) / len(self.rows)
+        std = squares.sqrt()
+        mean, std = over_places(mean, std, self.policy.inputs.visual)
+        self.policy.input_mean.copy_(mean)
+        self.policy.input_std.copy_(torch.where(std > SMALLEST_STD, std, torch.ones_like(std)))
+
+    def _copy(self, start: Any) -> None:
+        """Start from a trained policy, its input statistics included."""
+        if start.inputs != self.policy.inputs:
+            raise InputError(f"The policy to start from sees {start.inputs}, the new one {self.policy.inputs}.")
+        try:
+            self.policy.load_state_dict(start.state_dict())
+        except RuntimeError as error:
+            raise InputError(f"The policy to start from has other layers ({str(error).splitlines()[0]}).") from None
+
+    def _batches(self) -> list[np.ndarray]:
+        """Return the training rows of one epoch in a new order; a last batch of one joins the one before."""
+        order = self.order.permutation(self.rows)
+        return np.split(order, cuts(len(order), self.task.recipe.batch_size)[1:])
+
+    def _epoch(self) -> float:
+        """Make one pass over the training frames; return its mean loss."""
+        self.policy.train()
+        total = 0.0
+        for rows in self._batches():
+            observed = self.policy.normalise(self._observed(rows).to(self.device))
+            loss = self.policy.loss(observed, self.target[rows].to(self.device))
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            self.optimiser.step()
+            if self.schedule:
+                self.schedule.step()
+            total += loss.item() * len(rows)
+        if not np.isfinite(total):
+            raise SurgicaiError("The training loss is not finite; lower the learning rate or look at the features.")
+        return total / len(self.rows)
+
+    @torch.no_grad()
+    def _validate(self) -> float:
+        """Return the mean loss over the frames held out."""
+        self.policy.eval()
+        total = 0.0
+        for at in range(0, len(self.held_rows), STATISTICS_ROWS):
+            rows = self.held_rows[at : at + STATISTICS_ROWS]
+            observed = self.policy.normalise(self._observed(rows).to(self.device))
+            total += self.policy.loss(observed, self.target[rows].to(self.device)).item() * len(rows)
+        return total / len(self.held_rows)
+
+    def _save(self, path: Path) -> None:
+        """Write what the next epoch needs."""
+        content = io.BytesIO()
+        state = {
+            "policy": self.policy.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "schedule": self.schedule.state_dict() if self.schedule else {},
+            "order": json.dumps(self.order.bit_generator.state),  # its integers are wider than a tensor's
+            "random": torch.get_rng_state(),
+            "losses": self.losses,
+            "held_losses": self.held_losses,
+        }
+        torch.save(state, content)
+        write_bytes(path, content.getvalue())
+
+    def _resume(self, path: Path) -> None:
+        """Go on from a training state, if there is a whole one."""
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
+            return
+        self.policy.load_state_dict(state["policy"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        if self.schedule:
+            self.schedule.load_state_dict(state["schedule"])
+        self.order.bit_generator.state = json.loads(state["order"])
+        torch.set_rng_state(state["random"])
+        self.losses, self.held_losses = list(state["losses"]), list(state["held_losses"])
+
+    def _write(self, folder: Path) -> Checkpoint:
+        """Write the policy as it stands."""
+        task, dataset = self.task, self.task.dataset
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in task.beside.items():
+            write_bytes(folder / name, content)
+        checkpoint = Checkpoint(
+            task=dataset.config,
+            policy=task.policy.name,
+            recipe=to_mapping(task.recipe),
+            recipe_name=task.recipe_name,
+            views=tuple(entry.view for entry in task.features),
+            image_size=dataset.image_size,
+            encoder=_record(task.features[0]) if task.features else None,
+            proprioception=self.vector is not None and self.policy.inputs.vector != names.PRIVILEGED_STATE,
+            seed=task.seed,
+            epoch=len(self.losses),
+            dataset=dataset.fingerprint,
+            demonstrations=self.demonstrations,
+            frames=len(self.rows),
+            validation_episodes=self.held_episodes,
+            train_losses=tuple(self.losses),
+            validation_losses=tuple(self.held_losses),
+            device=str(self.device),
+            code_version=__version__,
+        )
+        return write_checkpoint(folder, checkpoint, self.policy.state_dict())
+
+
+def _record(entry: Features) -> EncoderRecord:
+    """Return the encoder's record from a cache entry's manifest."""
+    manifest = entry.manifest
+    return EncoderRecord(
+        name=manifest["encoder"],
+        card=manifest["card"],
+        weights_sha256=manifest["weights_sha256"],
+        pool=manifest["pool"],
+        fingerprint=manifest["encoder_fingerprint"],
+        shape=entry.shape,
+    )

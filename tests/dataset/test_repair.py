@@ -1,0 +1,318 @@
+"""Repair: the longest whole prefix of a broken LeRobot dataset, ours or anyone's."""
+
+import json
+import shutil
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from fake_demos import render_with_fake_env, write_demos
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import BadFile, OutputExists
+from surgicai_vision.dataset import check_dataset, codecs, render_demos, repair_dataset
+from surgicai_vision.dataset.validate import thrift
+from surgicai_vision.dataset.validate.recovery import LEROBOT, Writing, salvage
+from surgicai_vision.dataset.validate.repair import _exchange
+
+CAMERA, DATA = "observation.images.cam", "data/chunk-000/file-000.parquet"
+LENGTHS = (6, 4, 5)
+CONFIG = TaskConfig(max_steps=12)
+
+
+@pytest.fixture(autouse=True)
+def offline(tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
+
+
+def write_lerobot(root, video=False, **options):
+    """Write a foreign dataset of three episodes and two tasks with LeRobot; return it before `finalize`."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    plain = {"dtype": "float32", "names": None}
+    features = {
+        CAMERA: {
+            "dtype": "video" if video else "image",
+            "shape": (48, 64, 3),
+            "names": ["height", "width", "channels"],
+        },
+        names.STATE: {**plain, "shape": (4,)},
+        "grid": {**plain, "shape": (2, 3)},
+        "ok": {"dtype": "bool", "shape": (1,), "names": None},
+        "note": {"dtype": "string", "shape": (1,), "names": None},
+    }
+    dataset = LeRobotDataset.create("local/x", 20, features, root=root, use_videos=video, **options)
+    rng = np.random.default_rng(0)
+    for episode, length in enumerate(LENGTHS):
+        for _ in range(length):
+            frame = {
+                CAMERA: rng.integers(0, 255, (48, 64, 3), dtype=np.uint8),
+                names.STATE: rng.normal(size=4).astype(np.float32),
+                "grid": rng.normal(size=(2, 3)).astype(np.float32),
+                "ok": np.array([True]),
+                "note": "text",
+                "task": f"task {episode % 2}",
+            }
+            dataset.add_frame(frame)
+        dataset.save_episode(parallel_encoding=False)
+    return dataset
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory):
+    """A whole foreign dataset, and what a SIGKILL before `finalize` leaves of it."""
+    folder = tmp_path_factory.mktemp("foreign")
+    dataset = write_lerobot(folder / "whole")
+    shutil.copytree(folder / "whole", folder / "killed")
+    dataset.finalize()
+    return folder
+
+
+def opened(path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    return LeRobotDataset("local/x", root=path, video_backend="pyav")
+
+
+def files(folder):
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
+def same_items(one, other, count):
+    for index in range(count):
+        left, right = one[index], other[index]
+        assert left.keys() == right.keys()
+        for key, value in left.items():
+            if hasattr(value, "numpy"):
+                np.testing.assert_array_equal(value.numpy(), right[key].numpy(), err_msg=key)
+            else:
+                assert value == right[key], key
+
+
+def test_what_lerobots_writer_loses_when_killed_is_kept(tmp_path, foreign):
+    killed = shutil.copytree(foreign / "killed", tmp_path / "set")
+    report = check_dataset(killed)
+    assert "data/chunk-000/file-000.parquet has no footer: its writer was killed." in report.problems
+    assert "meta/episodes is missing." in report.problems
+    before = {path: path.read_bytes() for path in files(killed)}
+    repair = repair_dataset(killed)
+    assert (repair.episodes, repair.claimed, repair.frames) == (3, 3, sum(LENGTHS))
+    assert check_dataset(killed).problems == ()
+    assert repair.original == tmp_path / "set.broken"
+    kept = {killed / path.relative_to(repair.original): path.read_bytes() for path in files(repair.original)}
+    assert kept == before, "the original is as it was"
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name != "cache") == ["set", "set.broken"]
+    mended, whole = opened(killed), opened(foreign / "whole")
+    assert mended.num_episodes == 3
+    same_items(mended, whole, sum(LENGTHS))
+    for key, statistics in whole.meta.stats.items():
+        for name in ("min", "max", "mean", "std", "count"):
+            # LeRobot's own std of pictures is 4e-5 off numpy's.
+            np.testing.assert_allclose(mended.meta.stats[key][name], statistics[name], atol=1e-4, err_msg=key)
+
+
+def test_a_video_dataset_is_repaired_by_counting_its_frames(tmp_path):
+    dataset = write_lerobot(tmp_path / "whole", video=True)
+    shutil.copytree(tmp_path / "whole", tmp_path / "set")
+    dataset.finalize()
+    repair = repair_dataset(tmp_path / "set", tmp_path / "mended")
+    assert repair.episodes == 3
+    assert repair.original == tmp_path / "set"
+    assert check_dataset(tmp_path / "mended").problems == ()
+    mended = opened(tmp_path / "mended")
+    assert mended[sum(LENGTHS) - 1][CAMERA].shape == (3, 48, 64)
+    row = mended.meta.episodes[2]
+    np.testing.assert_allclose(row[f"videos/{CAMERA}/from_timestamp"], sum(LENGTHS[:2]) / 20)
+
+
+def change(path, column, row, value):
+    table = pq.read_table(path)
+    values = table.column(column).to_pylist()
+    values[row] = value
+    field = table.field(column)
+    table = table.set_column(table.schema.get_field_index(column), field, pa.array(values, field.type))
+    pq.write_table(table, path)
+
+
+def counts_more(folder):
+    info = json.loads((folder / "meta/info.json").read_text())
+    info.update(total_episodes=8, total_frames=99)
+    (folder / "meta/info.json").write_text(json.dumps(info))
+
+
+def fewer_rows(folder):
+    path = next(folder.glob("meta/episodes/*/*.parquet"))
+    pq.write_table(pq.read_table(path).slice(0, 2), path)
+
+
+def torn(folder):
+    """The last episode's row group is half on disk."""
+    path = folder / DATA
+    last = pq.ParquetFile(path).metadata.row_group(2).column(0)
+    start = last.dictionary_page_offset or last.data_page_offset
+    path.write_bytes(path.read_bytes()[: start + 3000])
+
+
+DAMAGE = {
+    "more counted": (counts_more, 3, "it counts 8 episodes"),
+    "rows missing": (fewer_rows, 3, "rows are not the episodes"),
+    "torn": (torn, 2, "no footer"),
+    "picture spoilt": (lambda f: change(f / DATA, CAMERA, 8, {"bytes": b"no", "path": "x"}), 1, "cannot be decoded"),
+    "picture missing": (
+        lambda f: change(f / DATA, CAMERA, 8, {"bytes": None, "path": "x.png"}),
+        1,
+        "x.png is missing",
+    ),
+    "path outside": (
+        lambda f: change(f / DATA, CAMERA, 8, {"bytes": None, "path": "/etc/passwd"}),
+        1,
+        "passwd is missing",
+    ),
+    "gap": (lambda f: change(f / DATA, "frame_index", 12, 9), 2, "its frame_index is"),
+    "nan": (lambda f: change(f / DATA, names.STATE, 12, [float("nan")] * 4), 2, "not finite"),
+    "statistics": (lambda f: (f / "meta/stats.json").write_text("{"), 3, "stats.json is not valid JSON"),
+    "tasks": (lambda f: (f / "meta/tasks.parquet").unlink(), 3, "tasks.parquet cannot be read"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_the_longest_whole_prefix_of_a_foreign_dataset_is_kept(tmp_path, foreign, name):
+    spoil, kept, message = DAMAGE[name]
+    folder = shutil.copytree(foreign / "whole", tmp_path / "set")
+    assert check_dataset(folder).ok
+    spoil(folder)
+    problems = check_dataset(folder).problems
+    assert any(message in problem for problem in problems), problems
+    repair = repair_dataset(folder)
+    assert repair.episodes == kept
+    assert check_dataset(folder).problems == ()
+    mended = opened(folder)
+    assert mended.num_episodes == kept
+    if name != "tasks":
+        same_items(mended, opened(foreign / "whole"), sum(LENGTHS[:kept]))
+
+
+def test_pictures_beside_the_data_are_taken_in(tmp_path, foreign):
+    folder = shutil.copytree(foreign / "whole", tmp_path / "set")
+    content = pq.read_table(folder / DATA).column(CAMERA)[3].as_py()["bytes"]
+    (folder / "images").mkdir(exist_ok=True)
+    (folder / "images/a.png").write_bytes(content)
+    change(folder / DATA, CAMERA, 3, {"bytes": None, "path": "images/a.png"})
+    counts_more(folder)
+    assert repair_dataset(folder).episodes == 3
+    same_items(opened(folder), opened(foreign / "whole"), sum(LENGTHS))
+
+
+def test_a_whole_dataset_is_left_alone(tmp_path, foreign):
+    repair = repair_dataset(foreign / "whole", tmp_path / "out")
+    assert (repair.original, repair.problems) == (None, ())
+    assert not (tmp_path / "out").exists()
+    assert not list(foreign.glob("whole.*"))
+
+
+def test_nothing_whole_is_one_line_and_changes_nothing(tmp_path, foreign):
+    folder = shutil.copytree(foreign / "killed", tmp_path / "set")
+    (folder / DATA).write_bytes(b"PAR1")
+    with pytest.raises(BadFile, match="not one episode is whole"):
+        repair_dataset(folder)
+    assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == ["set"]
+    with pytest.raises(BadFile, match="which nothing can be read"):
+        repair_dataset(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/note").write_text("mine")
+    with pytest.raises(OutputExists):
+        repair_dataset(folder, tmp_path / "full")
+
+
+@pytest.fixture
+def ours(tmp_path, monkeypatch):
+    render_with_fake_env(monkeypatch, CONFIG)
+    folder = write_demos(tmp_path / "demos", CONFIG, (1, 2, 4))
+    render_demos(folder, tmp_path / "set", size=32, depth=True, segmentation=True, workers=0)
+    return tmp_path / "set"
+
+
+def black(folder):
+    frame = {"bytes": codecs.encode(np.zeros((32, 32, 3), np.uint8)), "path": "x"}
+    table = pq.read_table(folder / DATA)
+    change(folder / DATA, names.image_key("back"), len(table) - 1, frame)
+
+
+def cut(folder):
+    path = folder / DATA
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+@pytest.mark.parametrize(("spoil", "kept"), [(cut, 3), (black, 2), (counts_more, 3)])
+def test_a_dataset_of_ours_is_repaired(tmp_path, ours, spoil, kept):
+    spoil(ours)
+    repair = repair_dataset(ours)
+    assert repair.episodes == kept
+    report = check_dataset(ours)
+    assert (report.ok, report.episodes) == (True, kept)
+    assert opened(ours).num_episodes == kept
+    with pytest.raises(OutputExists):  # it is no longer what the command made
+        render_demos(tmp_path / "demos", ours, size=32, depth=True, segmentation=True, workers=0)
+
+
+def test_two_folders_swap_names(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).touch()
+    assert _exchange(tmp_path / "a", tmp_path / "b")
+    assert (tmp_path / "a/b").exists()
+    assert (tmp_path / "b/a").exists()
+
+
+def table(count, first=0):
+    rng = np.random.default_rng(first)
+    picture = [{"bytes": rng.bytes(9000), "path": f"{index}"} for index in range(count)]
+    return pa.table(
+        {
+            "picture": pa.array(picture, pa.struct({"bytes": pa.binary(), "path": pa.string()})),
+            "vector": pa.FixedSizeListArray.from_arrays(pa.array(rng.normal(size=count * 7)), 7),
+            "grid": pa.array(rng.normal(size=(count, 2, 3)).tolist(), pa.list_(pa.list_(pa.float64()))),
+            "done": pa.array(np.arange(count) == count - 1),
+            "index": pa.array(np.arange(first, first + count)),
+        }
+    )
+
+
+@pytest.mark.parametrize("writing", [LEROBOT, Writing("zstd", False)])
+def test_footerless_parquet_is_read_up_to_the_last_whole_row_group(tmp_path, writing):
+    parts, sizes = [], []
+    writer = pq.ParquetWriter(
+        tmp_path / "whole", table(1).schema, compression=writing.compression, use_dictionary=writing.dictionary
+    )
+    for count in (150, 1, 7, 300):
+        parts.append(table(count, sum(map(len, parts))))
+        writer.write_table(parts[-1])
+        sizes.append((tmp_path / "whole").stat().st_size)
+    content = (tmp_path / "whole").read_bytes()
+    for size, groups in ((sizes[3], 4), (sizes[3] - 1, 3), (sizes[1] + 5000, 2), (sizes[0] - 3, 0), (3, 0), (0, 0)):
+        (tmp_path / "cut").write_bytes(content[:size])
+        assert salvage(tmp_path / "cut", parts[0].slice(0, 1), tmp_path / "mended", writing) == groups
+        if groups:
+            assert pq.read_table(tmp_path / "mended").equals(pa.concat_tables(parts[:groups]))
+    writer.close()
+
+
+def test_thrift_round_trip_and_rubbish():
+    fields = {
+        1: (thrift.I32, -5),
+        2: (thrift.BINARY, b"abc"),
+        3: (thrift.TRUE, True),
+        20: (thrift.LIST, (thrift.I64, list(range(-20, 20)))),
+        21: (thrift.STRUCT, {1: (thrift.DOUBLE, 0.5), 2: (thrift.FALSE, False), 300: (thrift.I64, 2**60)}),
+    }
+    content = thrift.write_struct(fields)
+    assert thrift.read_struct(content, 0) == (fields, len(content))
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        try:
+            thrift.read_struct(rng.bytes(60), 0)
+        except ValueError:
+            continue

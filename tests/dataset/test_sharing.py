@@ -1,0 +1,159 @@
+"""Push and pull, against a Hub that is a folder."""
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import yaml
+from fake_demos import render_with_fake_env, write_demos
+
+from surgicai_vision.commands.main import main
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
+from surgicai_vision.dataset import check_dataset, hub, open_dataset, render_demos
+from surgicai_vision.dataset.hub import dataset_card, pull_dataset, push_dataset
+
+CONFIG = TaskConfig(max_steps=12)
+REPO = "somebody/suturing-grasp"
+
+
+class FakeHub:
+    """Keeps commits in a folder and notes what it is asked."""
+
+    def __init__(self, folder: Path, fail: Exception | None = None):
+        self.folder, self.fail, self.asked, self.tags = folder, fail, [], {}
+
+    def create_repo(self, repo, *, repo_type, private, exist_ok):
+        self.asked.append(("create_repo", repo, repo_type, private, exist_ok))
+        if self.fail:
+            raise self.fail
+
+    def create_commit(self, repo, operations, *, commit_message, repo_type):
+        for operation in operations:
+            target = self.folder / operation.path_in_repo
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with operation.as_file() as content:
+                target.write_bytes(content.read())
+        self.asked.append(("create_commit", repo, commit_message, repo_type))
+        return SimpleNamespace(oid=f"commit{len(self.asked)}", commit_url=f"https://hub/{repo}")
+
+    def list_repo_refs(self, repo, *, repo_type):
+        return SimpleNamespace(tags=[SimpleNamespace(name=name) for name in self.tags])
+
+    def delete_tag(self, repo, *, tag, repo_type):
+        del self.tags[tag]
+
+    def create_tag(self, repo, *, tag, revision, repo_type):
+        assert tag not in self.tags
+        self.tags[tag] = revision
+
+    def snapshot_download(self, repo, *, repo_type, revision, local_dir, allow_patterns):
+        self.asked.append(("snapshot_download", repo, repo_type, revision, tuple(allow_patterns)))
+        if self.fail:
+            raise self.fail
+        shutil.copytree(self.folder, local_dir, dirs_exist_ok=True)
+        (local_dir / ".cache/huggingface").mkdir(parents=True)
+
+
+@pytest.fixture
+def dataset(tmp_path, monkeypatch):
+    render_with_fake_env(monkeypatch, CONFIG)
+    folder = write_demos(tmp_path / "demos", CONFIG, (1, 2))
+    render_demos(folder, tmp_path / "set", size=32, depth=True, workers=0)
+    return tmp_path / "set"
+
+
+@pytest.fixture
+def fake_hub(tmp_path):
+    return FakeHub(tmp_path / "hub")
+
+
+def test_what_is_pushed_is_what_is_pulled(tmp_path, dataset, fake_hub):
+    (dataset / "notes.txt").write_text("mine")
+    assert push_dataset(dataset, REPO, private=True, api=fake_hub) == f"https://hub/{REPO}"
+    assert fake_hub.asked[0] == ("create_repo", REPO, "dataset", True, True)
+    assert fake_hub.tags == {"v3.0": "commit2"}
+    assert not (fake_hub.folder / "notes.txt").exists()
+    report = pull_dataset(REPO, tmp_path / "pulled", api=fake_hub)
+    assert report.digest == open_dataset(dataset).meta["digest"]
+    assert check_dataset(tmp_path / "pulled").problems == ()
+    assert open_dataset(tmp_path / "pulled").fingerprint == open_dataset(dataset).fingerprint
+    assert sorted(path.name for path in (tmp_path / "pulled").iterdir()) == ["README.md", "data", "meta"]
+    assert not list(tmp_path.glob("*.work"))
+    with pytest.raises(OutputExists):
+        pull_dataset(REPO, tmp_path / "pulled", api=fake_hub)
+    push_dataset(dataset, REPO, api=fake_hub)  # again: the tag moves
+    assert fake_hub.tags == {"v3.0": "commit5"}
+
+
+def test_the_card_says_what_it_is(dataset):
+    card = dataset_card(open_dataset(dataset), REPO, "cc-by-4.0")
+    _, header, body = card.split("---\n", 2)
+    table = yaml.safe_load(header)
+    assert table["license"] == "cc-by-4.0"
+    assert "LeRobot" in table["tags"]
+    assert table["configs"][0]["data_files"] == "data/*/*.parquet"
+    meta = json.loads((dataset / names.META_FILE).read_text())
+    for part in (meta["digest"], "2 simulated demonstrations", names.depth_key("front"), names.TASK_TEXTS["grasp"]):
+        assert part in body
+
+
+def test_damage_is_neither_pushed_nor_pulled(tmp_path, dataset, fake_hub):
+    push_dataset(dataset, REPO, api=fake_hub)
+    data = fake_hub.folder / "data/chunk-000/file-000.parquet"
+    data.write_bytes(data.read_bytes()[:-10])
+    with pytest.raises(BadFile):
+        pull_dataset(REPO, tmp_path / "pulled", api=fake_hub)
+    assert not (tmp_path / "pulled").exists()
+    info = dataset / "meta/info.json"
+    info.write_text(info.read_text().replace('"total_episodes": 2', '"total_episodes": 3'))
+    before = len(fake_hub.asked)
+    with pytest.raises(BadFile, match=r"is damaged: meta/info\.json"):
+        push_dataset(dataset, REPO, api=fake_hub)
+    assert len(fake_hub.asked) == before
+
+
+def test_a_refusal_is_one_line(tmp_path, dataset):
+    fake_hub = FakeHub(tmp_path / "hub", OSError("403 Forbidden\nYou need a token"))
+    with pytest.raises(SurgicaiError, match=r"The Hub refused somebody/suturing-grasp: 403 Forbidden$"):
+        push_dataset(dataset, REPO, api=fake_hub)
+    with pytest.raises(SurgicaiError, match="The Hub refused"):
+        pull_dataset(REPO, tmp_path / "pulled", api=fake_hub)
+    assert not (tmp_path / "pulled").exists()
+
+
+@pytest.mark.parametrize("name", ["", "no spaces/x", "a/b/c", "nobody", "../x", "a/b.git"])
+def test_bad_names_are_refused(tmp_path, dataset, name):
+    with pytest.raises(InputError, match="user/name"):
+        push_dataset(dataset, name)
+    with pytest.raises(InputError, match="user/name"):
+        pull_dataset(name, tmp_path / "pulled")
+
+
+def test_offline_is_said_at_once(tmp_path, dataset, monkeypatch, capsys):
+    for arguments in (["push", str(dataset), "--repo", REPO], ["pull", REPO, "--out", str(tmp_path / "pulled")]):
+        assert main(["dataset", *arguments]) == 1
+        assert "HF_HUB_OFFLINE is set" in capsys.readouterr().err
+    assert not list(tmp_path.glob("pulled*"))
+
+
+def test_a_hub_out_of_reach_is_said_in_one_line(monkeypatch):
+    def refuse(address, timeout):
+        assert (address[1], timeout) == (443, hub.CONNECT_SECONDS)
+        raise OSError(101, "Network is unreachable")
+
+    for name in ("https_proxy", "HTTPS_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(hub.socket, "create_connection", refuse)
+    with pytest.raises(SurgicaiError, match=r"at hub.example cannot be reached \(Network is unreachable\)"):
+        hub._reach("https://hub.example")
+
+
+def test_dry_run_shows_the_card(dataset, capsys):
+    assert main(["dataset", "push", str(dataset), "--repo", REPO, "--dry-run"]) == 0
+    assert "license: mit" in capsys.readouterr().out
+    assert main(["dataset", "push", str(dataset)]) == 2
+    assert "--repo USER/NAME" in capsys.readouterr().err

@@ -1,0 +1,139 @@
+"""A dataset from a dataset, without rendering: fewer views, videos."""
+
+import json
+import shutil
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from fake_demos import render_with_fake_env, write_demos
+
+from surgicai_vision.commands import render_demos as command
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
+from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, repair_dataset, video_jobs, view_dataset
+from surgicai_vision.dataset.video import CODECS
+
+CONFIG = TaskConfig(max_steps=12)
+SIZE = 64
+
+
+@pytest.fixture(autouse=True)
+def offline(tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def demos(tmp_path, monkeypatch):
+    render_with_fake_env(monkeypatch, CONFIG)
+    folder = write_demos(tmp_path / "demos", CONFIG, (1, 2, 4))
+    return folder
+
+
+def render(demos, out, **more):
+    return render_demos(demos, out, **{"size": SIZE, "depth": True, "workers": 0, **more})
+
+
+def test_a_subset_of_views_is_what_rendering_them_gives(tmp_path, demos):
+    render(demos, tmp_path / "both")
+    made = view_dataset(tmp_path / "both", tmp_path / "front", views=("front",))
+    rendered = render(demos, tmp_path / "alone", views=("front",))
+    assert made.digest == rendered.digest
+    assert made.video_error == {}
+    files = sorted(path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").rglob("*.*"))
+    for name in files:
+        if str(name) != names.META_FILE:
+            assert (tmp_path / "front" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
+    assert check_dataset(tmp_path / "front").problems == ()
+    assert list(open_dataset(tmp_path / "front").meta["cameras"]) == ["front"]
+
+
+def test_views_come_in_the_order_asked_for(tmp_path, demos):
+    render(demos, tmp_path / "set")
+    view_dataset(tmp_path / "set", tmp_path / "turned", views=("back", "front"))
+    assert open_dataset(tmp_path / "turned").views == ("back", "front")
+    assert check_dataset(tmp_path / "turned").problems == ()
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_video_is_read_by_us_and_by_lerobot_and_its_error_is_measured(tmp_path, demos, codec):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    render(demos, tmp_path / "set")
+    made = render(demos, tmp_path / "video", video=codec)
+    before, after = open_dataset(tmp_path / "set"), open_dataset(tmp_path / "video")
+    assert check_dataset(tmp_path / "video").problems == ()
+    theirs = LeRobotDataset("local/set", root=tmp_path / "video", video_backend="pyav", depth_output_unit="m")
+    for view in ("front", "back"):
+        frames = after.frames(view)
+        error = np.abs(frames.astype(float) - before.frames(view)).mean()
+        assert made.video_error[view] == pytest.approx(error, abs=1e-4)
+        assert 0 < error < 12
+        np.testing.assert_array_equal(after.frames(view, 7, 9), frames[7:9])
+        for index in (0, 8, after.length - 1):
+            picture = np.round(theirs[index][names.image_key(view)].numpy().transpose(1, 2, 0) * 255)
+            assert np.abs(picture - frames[index]).max() <= 2, "two converters from YUV"
+    np.testing.assert_array_equal(after.depth("back"), before.depth("back"))
+    assert after.meta["video"] == codec
+    assert after.meta["video_error"] == made.video_error
+    with pytest.raises(OutputExists):
+        render(demos, tmp_path / "video")
+
+
+def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(tmp_path, demos, monkeypatch):
+    render(demos, tmp_path / "set")
+    monkeypatch.setattr(video_jobs, "BLOCK_FRAMES", 8)
+    alone = view_dataset(tmp_path / "set", tmp_path / "alone", video="h264", workers=0)
+    monkeypatch.setattr(video_jobs, "_dataset", None)  # not in this process
+    together = view_dataset(tmp_path / "set", tmp_path / "together", video="h264", workers=2)
+    assert (alone.digest, alone.video_error) == (together.digest, together.video_error)
+    assert open_dataset(tmp_path / "alone").fingerprint == open_dataset(tmp_path / "together").fingerprint
+    assert len(list((tmp_path / "alone").rglob("*.mp4"))) == 4, "two views, three episodes in two blocks"
+    assert check_dataset(tmp_path / "together").problems == ()
+
+
+def test_views_of_a_video_dataset_and_its_repair(tmp_path, demos):
+    render(demos, tmp_path / "video", video="h264")
+    view_dataset(tmp_path / "video", tmp_path / "back", views=("back",))
+    assert check_dataset(tmp_path / "back").problems == ()
+    np.testing.assert_array_equal(
+        open_dataset(tmp_path / "back").frames("back"), open_dataset(tmp_path / "video").frames("back")
+    )
+    with pytest.raises(InputError, match="holds videos already"):
+        view_dataset(tmp_path / "video", tmp_path / "again", video="av1")
+    row = tmp_path / "back/meta/episodes/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(row).slice(0, 1), row)
+    assert repair_dataset(tmp_path / "back").episodes == 3
+    assert check_dataset(tmp_path / "back").problems == ()
+
+
+def test_the_same_command_again_does_nothing_and_wrong_ones_are_refused(tmp_path, demos):
+    render(demos, tmp_path / "set")
+    first = view_dataset(tmp_path / "set", tmp_path / "back", views=("back",))
+    shutil.rmtree(tmp_path / "set/data/chunk-000", ignore_errors=False)
+    (tmp_path / "set").rename(tmp_path / "gone")
+    render(demos, tmp_path / "set")
+    assert view_dataset(tmp_path / "set", tmp_path / "back", views=("back",)).digest == first.digest
+    with pytest.raises(OutputExists):
+        view_dataset(tmp_path / "set", tmp_path / "back", views=("front",))
+    with pytest.raises(UnknownName, match="Allowed: back, front"):
+        view_dataset(tmp_path / "set", tmp_path / "other", views=("wrist_psm1",))
+    with pytest.raises(UnknownName, match="Did you mean 'h264'"):
+        view_dataset(tmp_path / "set", tmp_path / "other", video="h26")
+    with pytest.raises(InputError, match="each once"):
+        view_dataset(tmp_path / "set", tmp_path / "other", views=("back", "back"))
+    assert not (tmp_path / "other").exists()
+    assert not list(tmp_path.glob("*.work"))
+
+
+def test_the_command_line_knows_the_codecs(tmp_path, demos, capsys):
+    from surgicai_vision.commands.main import main
+
+    assert tuple(CODECS) == command.CODECS
+    render(demos, tmp_path / "set")
+    assert main(["dataset", "view", str(tmp_path / "set"), "--view", "back", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert result["dataset"] == str(tmp_path / "set-back")
+    assert main(["dataset", "view", str(tmp_path / "set")]) == 2

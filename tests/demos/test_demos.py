@@ -1,0 +1,229 @@
+"""Demonstrations: store and record, on the stand-in environment (the real one: at the end)."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from fake_env import FakeEnv, FakeExpert
+
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
+from surgicai_vision.demos import record as recording
+from surgicai_vision.demos.record import record
+from surgicai_vision.demos.rollout import Disturbance, roll
+from surgicai_vision.demos.store import Demo, list_demos, read_demo, read_marker, write_demo, write_marker
+
+CONFIG = TaskConfig(max_steps=12)
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """Record from the stand-in environment, in this process."""
+    monkeypatch.setattr(recording, "_env", lambda config: FakeEnv(config))
+    monkeypatch.setattr(recording, "SOURCES", {"expert": "fake_env:FakeExpert"})
+
+
+@pytest.fixture
+def demo():
+    env = FakeEnv(CONFIG)
+    return roll(env, FakeExpert(env), 3).demo
+
+
+def test_write_read_returns_the_same_demo(tmp_path, demo):
+    again = read_demo(write_demo(tmp_path, 7, demo))
+    for field in dataclasses.fields(Demo):
+        one, two = getattr(demo, field.name), getattr(again, field.name)
+        if isinstance(one, np.ndarray):
+            assert one.dtype == two.dtype
+            np.testing.assert_array_equal(one, two)
+        else:
+            assert one == two
+    assert [path.name for path in tmp_path.iterdir()] == ["episode_000007.safetensors"]
+
+
+def test_noise_is_executed_and_the_label_is_the_experts(tmp_path):
+    env = FakeEnv(CONFIG)
+    noisy = roll(env, FakeExpert(env), 3, disturbance=Disturbance(noise=0.2)).demo
+    again = read_demo(write_demo(tmp_path, 0, noisy))
+    np.testing.assert_array_equal(again.executed, noisy.executed)
+    difference = noisy.executed - noisy.action
+    assert (difference[:, 1:6].std(axis=0) > 0).all()
+    assert (difference[:, 6] == 0).all(), "the jaw is done as meant"
+    assert np.abs(noisy.executed).max() <= 1.0
+    env.reset(seed=3)
+    for state, label, executed in zip(noisy.state, noisy.action, noisy.executed, strict=False):
+        np.testing.assert_array_equal(env.get_state(), state)
+        np.testing.assert_array_equal(FakeExpert(env).action(), label)
+        env.step(executed)
+    np.testing.assert_array_equal(roll(env, FakeExpert(env), 3, disturbance=Disturbance(0.2)).demo.state, noisy.state)
+
+
+def test_each_episode_draws_its_own_noise_within_the_range():
+    env = FakeEnv(CONFIG)
+    spread = Disturbance(0.6, noise_from=0.1)
+    demos = [roll(env, FakeExpert(env), seed, disturbance=spread).demo for seed in range(12)]
+    off = [np.abs(demo.executed - demo.action)[:, 1:6].mean() for demo in demos]
+    assert max(off) > 1.5 * min(off) > 0, "episodes differ in their noise"
+    even = [roll(env, FakeExpert(env), seed, disturbance=Disturbance(0.6)).demo for seed in range(12)]
+    assert np.mean(off) < np.mean([np.abs(demo.executed - demo.action)[:, 1:6].mean() for demo in even])
+
+
+def test_the_range_of_noise_reaches_the_recording(tmp_path):
+    """It did not: the jobs were given the largest noise alone."""
+    config = TaskConfig("grasp", max_steps=100)
+    calm = record(config, episodes=2, out=tmp_path / "a", disturbance=Disturbance(0.6, noise_from=0.0))
+    loud = record(config, episodes=2, out=tmp_path / "b", disturbance=Disturbance(0.6))
+    for one, other in zip(calm, loud, strict=True):
+        one, other = read_demo(one), read_demo(other)
+        assert one.seed == other.seed and not np.array_equal(one.executed, other.executed)
+
+
+def test_an_episode_lingers_after_its_success():
+    env = FakeEnv(CONFIG)
+    plain = roll(env, FakeExpert(env), 3).demo
+    longer = roll(env, FakeExpert(env), 3, linger=4).demo
+    assert len(longer.action) == len(plain.action) + 4
+    np.testing.assert_array_equal(longer.state[: len(plain.state)], plain.state)
+    assert not longer.success[: len(plain.action) - 1].any() and longer.success[len(plain.action) - 1]
+    short = FakeEnv(dataclasses.replace(CONFIG, max_steps=len(plain.action) + 1))
+    assert len(roll(short, FakeExpert(short), 3, linger=4).demo.action) == len(plain.action) + 1, "up to the limit"
+
+
+class Patient(FakeEnv):
+    """Knows no success while a push lasts."""
+
+    def step(self, action):
+        seen, reward, success, truncated, info = super().step(action)
+        success &= self.state[2] > 25
+        return seen, reward, success, truncated, {**info, "is_success": success}
+
+
+def test_a_recovery_starts_elsewhere_and_its_push_is_not_recorded():
+    env = Patient(dataclasses.replace(CONFIG, max_steps=60))
+    pushed = [roll(env, FakeExpert(env), seed, disturbance=Disturbance(recoveries=0.5)).demo for seed in range(20)]
+    starts = [int(demo.state[0, 2]) for demo in pushed]
+    assert 4 <= sum(start > 0 for start in starts) <= 16
+    assert {start for start in starts if start} <= set(range(8, 26))
+    # A push that ends the episode is undone: the start stays as it was.
+    short = FakeEnv(CONFIG)
+    for seed in range(20):
+        start = roll(short, FakeExpert(short), seed, disturbance=Disturbance(recoveries=1.0)).demo.state[0, 2]
+        assert start < CONFIG.max_steps
+
+
+@pytest.mark.parametrize("wrong", [{"noise": -0.1}, {"noise": float("nan")}, {"recoveries": 1.1}, {"noise_from": 0.1}])
+def test_a_senseless_disturbance_is_refused(wrong):
+    with pytest.raises(InputError, match="within 0 and"):
+        Disturbance(**wrong)
+
+
+def test_disturbed_recordings_are_another_request(tmp_path, fake):
+    calm = record(CONFIG, episodes=2, out=tmp_path / "calm", seed=1, workers=0)
+    disturbed = Disturbance(noise=0.1)
+    noisy = record(CONFIG, episodes=2, out=tmp_path / "noisy", seed=1, workers=0, disturbance=disturbed)
+    assert read_demo(calm[0]).executed is None
+    assert read_demo(noisy[0]).executed is not None
+    assert "noise" not in read_marker(tmp_path / "calm")["request"]
+    assert read_marker(tmp_path / "noisy")["request"]["noise"] == 0.1
+    with pytest.raises(OutputExists):
+        record(CONFIG, episodes=2, out=tmp_path / "noisy", seed=1, workers=0)
+
+
+def test_demo_refuses_bad_lengths_quoting_both(demo):
+    with pytest.raises(InputError, match=f"{len(demo)} states and {len(demo)} actions"):
+        dataclasses.replace(demo, state=demo.state[:-1])
+    with pytest.raises(InputError, match=f"2 of reward and {len(demo)} actions"):
+        dataclasses.replace(demo, reward=demo.reward[:2])
+    with pytest.raises(InputError, match="it must be float32"):
+        dataclasses.replace(demo, action=demo.action.astype(np.float64))
+    with pytest.raises(InputError, match=r"it must be .* float32"):
+        dataclasses.replace(demo, executed=demo.action[:-1])
+    with pytest.raises(InputError, match="not finite"):
+        dataclasses.replace(demo, state=np.full_like(demo.state, np.nan))
+
+
+@pytest.mark.parametrize("spoil", ["empty", "half", "text", "flipped", "foreign"])
+def test_damaged_episode_is_a_bad_file(tmp_path, demo, spoil):
+    path = write_demo(tmp_path, 0, demo)
+    content = path.read_bytes()
+    header = json.dumps({"x": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}).encode()
+    path.write_bytes(
+        {
+            "empty": b"",
+            "half": content[: len(content) // 2],
+            "text": b"hello",
+            "flipped": content.replace(b"surgicai-vision-demos", b"surgicai-vision-demoz"),
+            "foreign": len(header).to_bytes(8, "little") + header + bytes(4),
+        }[spoil]
+    )
+    with pytest.raises(BadFile) as caught:
+        read_demo(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_folder_without_marker_or_with_a_gap_is_refused(tmp_path, demo):
+    with pytest.raises(BadFile, match="not a folder of demonstrations"):
+        list_demos(tmp_path)
+    write_marker(tmp_path, "grasp", "expert")
+    with pytest.raises(BadFile, match="no episodes"):
+        list_demos(tmp_path)
+    write_demo(tmp_path, 1, demo)
+    with pytest.raises(BadFile, match="episode 0 is missing"):
+        list_demos(tmp_path)
+
+
+def test_record_skips_failed_seeds_and_writes_them_down(tmp_path, fake):
+    seen = []
+    paths = record(
+        CONFIG, episodes=6, seed=0, out=tmp_path / "demos", workers=0, progress=lambda *row: seen.append(row)
+    )
+    demos = [read_demo(path) for path in paths]
+    skipped = [row["seed"] for row in read_marker(tmp_path / "demos")["skipped"]]
+    assert len(demos) == 6
+    assert all(demo.success[-1] and not demo.success[:-1].any() for demo in demos)
+    assert skipped, "the stand-in expert fails at some of these starts"
+    assert sorted([demo.seed for demo in demos] + skipped) == list(range(6 + len(skipped)))
+    assert seen[-1] == (6, 6, "episodes")
+    assert [path.name for path in tmp_path.iterdir()] == ["demos"]
+
+
+def test_record_again_does_nothing_and_another_request_is_refused(tmp_path, fake, monkeypatch):
+    out = tmp_path / "demos"
+    first = record(CONFIG, episodes=2, out=out, workers=0)
+    before = [path.stat().st_mtime_ns for path in first]
+    monkeypatch.setattr(recording, "_env", None)
+    assert record(CONFIG, episodes=2, out=out, workers=0) == first
+    assert [path.stat().st_mtime_ns for path in first] == before
+    with pytest.raises(OutputExists, match="another command"):
+        record(CONFIG, episodes=3, out=out, workers=0)
+
+
+def test_record_continues_where_it_was_stopped(tmp_path, fake, monkeypatch):
+    record(CONFIG, episodes=4, out=tmp_path / "whole", workers=0)
+    calls = []
+
+    def stop(done, total, unit):
+        calls.append(done)
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record(CONFIG, episodes=4, out=tmp_path / "demos", workers=0, progress=stop)
+    assert not (tmp_path / "demos").exists()
+    paths = record(CONFIG, episodes=4, out=tmp_path / "demos", workers=0)
+    for one, two in zip(list_demos(tmp_path / "whole"), paths, strict=True):
+        assert one.read_bytes() == two.read_bytes()
+
+
+def test_record_gives_up_on_an_expert_that_fails(tmp_path, fake, monkeypatch):
+    monkeypatch.setattr(FakeExpert, "action", lambda self: np.zeros(7, np.float32))
+    with pytest.raises(SurgicaiError, match=r"succeeded at 0 of \d+ starts of grasp; 2 were wanted \(seed 0: no"):
+        record(CONFIG, episodes=2, out=tmp_path / "demos", workers=0)
+
+
+@pytest.mark.parametrize(("episodes", "seed"), [(0, 0), (-3, 0), (1, -1)])
+def test_record_refuses_senseless_numbers(tmp_path, episodes, seed):
+    with pytest.raises(InputError, match=f"episodes is {episodes}, seed {seed}, linger 0"):
+        record(CONFIG, episodes=episodes, seed=seed, out=tmp_path / "demos")

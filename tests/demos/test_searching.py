@@ -1,0 +1,104 @@
+"""Searching: grasps without the goal; the clock that lets a policy learn them."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_dataset import FakeDataset
+
+from policies.base import Recipe
+from policies.bc import BC
+from surgicai_vision import envs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import CLOCK_PERIOD, CLOCK_SIZE, SUBTASK_STEPS, TaskConfig, clock
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.demos.rollout import roll
+from surgicai_vision.demos.search_expert import Searcher
+from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.training.policies import load_policy
+from surgicai_vision.training.train import train
+
+
+def grasp(env: envs.SuturingEnv, seed: int, goal: float | None = None) -> tuple[bool, np.ndarray]:
+    env.reset(seed=seed)
+    if goal is not None:
+        env.simulation.memory.grasp_angle = math.radians(goal)
+    actor, actions, ended, info = Searcher(env), [], False, {}
+    while not ended:
+        actions.append(actor.action())
+        _, _, terminated, truncated, info = env.step(actions[-1])
+        ended = terminated or truncated
+    return info["is_success"], np.stack(actions)
+
+
+def test_it_meets_every_goal_and_reads_none() -> None:
+    env = envs.make(TaskConfig("grasp"))
+    for seed, goals in ((500_000, (5.0, 9.0, 13.0)), (500_001, (12.0, 16.0, 20.0))):
+        tried = [grasp(env, seed, goal) for goal in goals]
+        assert all(success for success, _ in tried)
+        shortest = min(len(actions) for _, actions in tried)
+        for _, actions in tried[1:]:
+            np.testing.assert_array_equal(actions[:shortest], tried[0][1][:shortest])
+    second, third = Searcher.AGAIN, Searcher.AGAIN + CLOCK_PERIOD
+    steps = [len(grasp(env, 500_000, goal)[1]) for goal in (12.5, 5.0, 20.0)]
+    assert steps[0] < second < steps[1] < third < steps[2] < SUBTASK_STEPS
+
+
+def test_its_demonstrations_show_every_attempt() -> None:
+    """They go on after the success, so that what a learner does after a failed attempt has been shown."""
+    env = envs.make(TaskConfig("grasp"))
+    rollout = roll(env, Searcher(env), 500_000, "search")
+    assert rollout.success and len(rollout.demo) == env.config.max_steps and rollout.demo.success.any()
+    closing = rollout.demo.action[:, 6] < -0.5
+    opening = rollout.demo.action[:, 6] > 0.5
+    edges = range(Searcher.AGAIN, env.config.max_steps + 1, CLOCK_PERIOD)
+    assert len(edges) == len(Searcher.ATTEMPTS)
+    for start, stop in pairwise(edges):
+        assert opening[start:stop].any() and closing[start:stop].any()
+        assert opening[start:stop].argmax() < closing[start:stop].argmax()
+    other = envs.make(TaskConfig("pullout"))
+    assert len(roll(other, Searcher(other), 500_000, "search").demo) < other.config.max_steps
+
+
+def test_the_clock_tells_steps_apart_and_comes_round() -> None:
+    told = clock(np.arange(SUBTASK_STEPS))
+    assert told.shape == (SUBTASK_STEPS, CLOCK_SIZE) and told.dtype == np.float32
+    np.testing.assert_allclose(told[CLOCK_PERIOD:, 1:], told[:-CLOCK_PERIOD, 1:], atol=1e-5)
+    assert np.abs(np.diff(told[:, 1:], axis=0)).sum(1).min() > 0.2
+
+
+class Stepped(FakeDataset):
+    """A dataset whose action is the clock's."""
+
+    def columns(self) -> dict[str, np.ndarray]:
+        columns = super().columns()
+        step = np.tile(np.arange(self.steps), self.episodes)
+        clock = np.where(step >= self.steps // 2, 0.5, -0.5).astype(np.float32)
+        return {**columns, "timestamp": step / names.FPS, names.ACTION: np.repeat(clock[:, None], 7, axis=1)}
+
+
+class Still:
+    """An env whose proprioception never changes."""
+
+    def agent_pos(self) -> np.ndarray:
+        return np.zeros(7, np.float32)
+
+
+def test_a_policy_with_a_clock_acts_by_it(tmp_path: Path) -> None:
+    recipe = Recipe(hidden=(32,), epochs=60, batch_size=32, learning_rate=1e-2, clock=True)
+    train(Stepped(), [], BC, recipe, out=tmp_path / "clocked")
+    policy = load_policy(tmp_path / "clocked")
+    agent = PolicyAgent("clocked", policy, None, (), 224, policy.inputs.vector)
+    agent.begin(0, Still(), 0)
+    early = [agent.act([0], [Still()], [None])[0, 0] for _ in range(40)]
+    assert np.mean(early[:18]) < -0.3 and np.mean(early[22:]) > 0.3
+    agent.restart(0)
+    assert agent.act([0], [Still()], [None])[0, 0] == early[0]
+
+
+def test_a_clock_goes_with_proprioception() -> None:
+    with pytest.raises(InputError, match="clock goes with proprioception"):
+        replace(Recipe(), clock=True, proprioception=False)

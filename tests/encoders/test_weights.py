@@ -1,0 +1,167 @@
+"""Weights: where they are found, which files are refused, and loaders on tables of the right names and shapes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import timm
+import torch
+from photographs import hopper, photograph
+from safetensors.torch import load_file, save_file
+
+from encoders import imagenet, weights
+from encoders.base import Encoder
+from surgicai_vision.core.errors import BadFile, InputError, MissingWeights, UnknownName
+from surgicai_vision.features.encoders import encoder_card, find_weights, load_encoder
+
+
+def table_of(network: torch.nn.Module, prefix: str = "") -> dict[str, torch.Tensor]:
+    """The network's state, small on disk."""
+    return {prefix + name: value.half() if value.is_floating_point() else value
+            for name, value in network.state_dict().items()}  # fmt: skip
+
+
+def saved(path: Path, content: object) -> Path:
+    torch.save(content, path)
+    return path
+
+
+def r3m_file(path: Path, depth: int = 18) -> Path:
+    """A file as R3M's: wrapped, with a data-parallel prefix and the heads we leave out."""
+    tensors = table_of(timm.create_model(f"resnet{depth}", num_classes=0), "module.convnet.")
+    return saved(path, {"r3m": {**tensors, "module.lang_rew.pred.0.weight": torch.zeros(2, 2)}, "global_step": 7})
+
+
+def test_r3m_loader(tmp_path: Path) -> None:
+    path = r3m_file(tmp_path / "r3m.bin")
+    encoder = load_encoder("r3m-18", path)
+    assert encoder(hopper()).shape == (1, 512)
+    wanted = torch.load(path, weights_only=True)["r3m"]["module.convnet.conv1.weight"].float()
+    got = encoder._network.state_dict()["conv1.weight"].float()
+    assert torch.allclose(got, wanted, rtol=1e-2)
+
+
+def test_clip_loader_takes_the_picture_tower(tmp_path: Path) -> None:
+    import open_clip
+
+    network = open_clip.create_model("ViT-B-32", load_weights=False, force_quick_gelu=True).visual
+    path = saved(tmp_path / "clip.bin", {**table_of(network, "visual."), "logit_scale": torch.zeros(())})
+    with pytest.warns(UserWarning, match="not the published"):
+        encoder = load_encoder("clip", path)
+    assert_stable(encoder, 512)
+
+
+def test_dinov2_loader_resamples_positions(tmp_path: Path) -> None:
+    path = saved(tmp_path / "dino.pth", table_of(timm.create_model("vit_small_patch14_dinov2", num_classes=0)))
+    assert_stable(load_encoder("dinov2", path), 384)
+
+
+def test_vc1_loader_leaves_the_decoder_out(tmp_path: Path) -> None:
+    tensors = table_of(timm.create_model("vit_base_patch16_224", num_classes=0, global_pool="token"))
+    extra = {"mask_token": torch.zeros(1, 1, 768), "decoder_embed.weight": torch.zeros(2, 2)}
+    path = saved(tmp_path / "vc1.bin", {"model": {**tensors, **extra}})
+    with pytest.raises(InputError, match="--accept-licence"):
+        load_encoder("vc1", path)
+    assert_stable(load_encoder("vc1", path, accept_licence=True), 768)
+
+
+def test_any_timm_network(tmp_path: Path) -> None:
+    save_file(table_of(timm.create_model("resnet18")), tmp_path / "r.safetensors")
+    encoder = load_encoder("timm:resnet18.a1_in1k", tmp_path / "r.safetensors")
+    assert encoder.card.dim == encoder.dim == 512 and encoder.card.licence
+    with pytest.raises(UnknownName, match="resnet1"):
+        load_encoder("timm:resnet19")
+
+
+def assert_stable(encoder: Encoder, dim: int) -> None:
+    """Check the dimension, and that a feature depends neither on its batch nor on the thread count."""
+    frames = np.concatenate([np.roll(hopper(), 9 * shift, axis=2) for shift in range(11)])
+    together = encoder(frames)
+    assert together.shape == (11, dim) and encoder.card.dim == dim
+    np.testing.assert_array_equal(together[4], encoder(frames[4:5])[0])
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        np.testing.assert_array_equal(together, encoder(frames))
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize(
+    ("name", "label", "probability"),
+    [("cat", 285, 0.73), ("coffee", 967, 0.994), ("palace", 698, 0.75)],  # Egyptian cat, espresso, palace
+)
+def test_known_imagenet_file_classifies(shared: Path, name: str, label: int, probability: float) -> None:
+    """Stride and statistics are the file's own: its classifier, on our features, says what is listed beside it."""
+    path = known_file(shared)
+    encoder, tensors = load_encoder("imagenet", path), load_file(path)
+    logits = torch.from_numpy(encoder(photograph(name))) @ tensors["fc.weight"].T + tensors["fc.bias"]
+    probabilities = logits.softmax(1)[0]
+    assert int(probabilities.argmax()) == label
+    assert float(probabilities.max()) == pytest.approx(probability, abs=0.04), "JPEG and bfloat16 cost up to 0.03"
+    card = encoder.card
+    assert "conv1" in card.architecture and card.mean == (0.48502, 0.45795, 0.40760) and "Keras" in card.source
+
+
+def test_stride_decides_what_the_known_file_sees(shared: Path) -> None:
+    """With torchvision's stride the same tensors load and are less sure of the cat, by more than the test allows."""
+    card, network = imagenet.classifier(imagenet.CARD, known_file(shared))
+    for stage in (network.layer2, network.layer3, network.layer4):
+        stage[0].conv1.stride, stage[0].conv2.stride = (1, 1), (2, 2)
+    logits = torch.from_numpy(Encoder(card, network, dtype=torch.float32)(photograph("cat")))
+    assert float(logits.softmax(1)[0, 285]) < 0.73 - 0.1
+
+
+def known_file(shared: Path) -> Path:
+    path = shared / "weights" / "resnet50_keras_imagenet.safetensors"
+    if not path.is_file():
+        pytest.skip(f"{path} is not here")
+    return path
+
+
+def test_folder_of_the_environment_finds_the_known_file(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(weights.FOLDER_VARIABLE, str(shared / "weights"))
+    found = find_weights("imagenet")
+    assert found is not None and found.name == "resnet50_keras_imagenet.safetensors"
+
+
+def test_order_and_hash_of_the_weights_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(weights.FOLDER_VARIABLE, str(tmp_path))
+    with pytest.raises(MissingWeights):
+        find_weights("r3m-18")
+    (tmp_path / "r3m-18.bin").write_bytes(b"any, its hash is not known beforehand")
+    assert find_weights("r3m-18") == tmp_path / "r3m-18.bin"
+    given = tmp_path / "given.bin"
+    given.write_bytes(b"x")
+    assert find_weights("r3m-18", given) == given
+    (tmp_path / "r3m").mkdir()
+    (tmp_path / "r3m" / "pytorch_model.bin").write_bytes(b"tampered")
+    with pytest.raises(BadFile, match=str(encoder_card("r3m").sha256)):
+        find_weights("r3m")
+
+
+def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
+    whole = r3m_file(tmp_path / "whole.bin")
+    (tmp_path / "cut.bin").write_bytes(whole.read_bytes()[:100_000])
+    (tmp_path / "text.bin").write_text("<html>not found</html>")
+    (tmp_path / "text.safetensors").write_text("<html>not found</html>")
+    saved(tmp_path / "list.bin", [torch.zeros(2)])
+    for name in ("cut.bin", "text.bin", "text.safetensors", "list.bin"):
+        with pytest.raises(BadFile) as caught:
+            load_encoder("r3m-18", tmp_path / name)
+        assert name in str(caught.value) and "\n" not in str(caught.value)
+    with pytest.raises(BadFile, match=r"lacks|wrong shape"):
+        load_encoder("r3m-34", whole)
+    with pytest.raises(BadFile, match="does not hold"):
+        load_encoder("dinov2", whole)
+
+
+def test_files_that_would_run_code_are_refused(tmp_path: Path) -> None:
+    class Harm:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return (Path(tmp_path / "harm").touch, ())  # type: ignore[return-value]
+
+    saved(tmp_path / "harm.bin", {"convnet.conv1.weight": Harm()})
+    with pytest.raises(BadFile, match="weights alone"):
+        load_encoder("r3m-18", tmp_path / "harm.bin")
+    assert not (tmp_path / "harm").exists()

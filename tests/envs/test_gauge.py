@@ -1,0 +1,175 @@
+"""The gauge: it measures what happened, in known cases, and changes nothing."""
+
+import math
+
+import numpy as np
+import pytest
+
+from surgicai_vision import envs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig
+from surgicai_vision.demos.expert import Expert
+from surgicai_vision.envs.episode_monitor import Gauge, Plate, crossing
+from surgicai_vision.scene import needle
+from surgicai_vision.scene.holes import OPENING, PAIRS
+
+NO_ACTION = np.zeros(7, np.float32)
+INFO = {"needle_slip": (0.0, 0.0)}
+
+
+def started(task="grasp", seed=names.TEST_SEED, **options):
+    env = envs.make(TaskConfig(task, **options))
+    env.reset(seed=seed)
+    gauge = Gauge(env)
+    gauge.begin()
+    return env, gauge
+
+
+def test_a_lying_needle_weighs_what_it_weighs():
+    env, _ = started()
+    for _ in range(60):
+        env.step(NO_ACTION)
+    weight = env.model.body("needle").mass[0] * 9.81
+    assert Plate(env.model).force(env.data) == pytest.approx(weight, rel=0.02)
+
+
+def test_a_needle_in_the_air_presses_nothing():
+    env, _ = started("place")
+    env.step(np.array([0, 0, 1, 0, 0, 0, 0], np.float32))
+    pose = np.array(env.simulation.needle())
+    pose[2] += 0.05
+    env.simulation.pose_needle(tuple(pose))
+    env.simulation.refresh()
+    assert Plate(env.model).force(env.data) == 0.0
+
+
+def test_an_instrument_that_is_driven_into_the_tissue_presses_it():
+    env, gauge = started()
+    down = env.simulation.bases[names.PSM2]
+    # World's -z in the arm's base: the third row of R_world_base, turned round.
+    action = np.array([*(-np.array(down[9:12])), 0, 0, 0, 0], np.float32)
+    for _ in range(env.config.max_steps):
+        gauge.look(env.step(action)[4])
+    assert gauge.tissue_force > 1.0
+
+
+def test_looking_changes_nothing():
+    (plain, _), (watched, gauge) = started("insert"), started("insert")
+    ones = np.ones(7, np.float32)
+    for _ in range(60):
+        plain.step(ones)
+        gauge.look(watched.step(ones)[4])
+    assert gauge.tissue_force > 0.001
+    np.testing.assert_array_equal(watched.get_state(), plain.get_state())
+
+
+def test_the_expert_goes_through_the_middle_of_both_holes():
+    env, gauge = started("insert")
+    expert = Expert(env)
+    for _ in range(env.config.max_steps):
+        *_, ended, _, info = env.step(expert.action())
+        gauge.look(info)
+        if ended:
+            break
+    assert info["is_success"]
+    assert 0 < gauge.entry_error < 1e-3 and 0 < gauge.exit_error < 1e-3
+    assert 0 < gauge.slip < 1e-3 and gauge.turn > 0
+    assert not gauge.wrong_hole
+    gauge.begin()
+    assert math.isnan(gauge.entry_error) and gauge.slip == 0.0
+
+
+def lead_tip(gauge, *points):
+    """Move the needle's tip along points in world [m], a millimetre a step."""
+    env = gauge._env
+    simulation = env.simulation
+    pose = np.array(simulation.needle())
+    here = np.array(simulation.needle_point(needle.TIP_ANGLE))
+    for point in points:
+        steps = max(2, round(float(np.linalg.norm(np.array(point) - here)) / 1e-3) + 1)
+        for goal in np.linspace(here, point, steps)[1:]:
+            tip = np.array(simulation.needle_point(needle.TIP_ANGLE))
+            pose[:3] += goal - tip
+            simulation.pose_needle(tuple(pose))
+            simulation.refresh()
+            gauge.look(INFO)
+        here = np.array(point)
+
+
+def through(hole, inward, off=(0.0, 0.0)):
+    """Return points outside and inside of a hole, `off` its centre [m]."""
+    centre = np.array(hole.centre) + hole.rotation[:, 0] * off[0] + hole.rotation[:, 1] * off[1]
+    ends = centre + np.outer((2e-3, -2e-3), hole.rotation[:, 2])
+    return ends if inward else ends[::-1]
+
+
+def test_passages_are_measured_from_the_holes_centre():
+    _, gauge = started()
+    pair = PAIRS["simple"][0]
+    lead_tip(gauge, *through(pair.entry, True, (3e-4, 4e-4)))
+    assert gauge.entry_error == pytest.approx(5e-4, abs=1e-6)
+    assert math.isnan(gauge.exit_error)
+    lead_tip(gauge, *through(pair.exit, False, (-1e-3, 0.0)))
+    assert gauge.exit_error == pytest.approx(1e-3, abs=1e-6)
+    assert not gauge.wrong_hole
+
+
+def test_another_stitchs_hole_is_the_wrong_one_until_the_right_exit():
+    _, gauge = started()
+    pairs = PAIRS["simple"]
+    lead_tip(gauge, *through(pairs[2].entry, True))
+    assert gauge.wrong_hole and math.isnan(gauge.entry_error)
+    lead_tip(gauge, *through(pairs[2].entry, False), *through(pairs[0].entry, True), *through(pairs[0].exit, False))
+    assert not gauge.wrong_hole
+
+
+def test_the_exit_from_outside_is_the_wrong_hole():
+    _, gauge = started()
+    lead_tip(gauge, *through(PAIRS["simple"][0].exit, True))
+    assert gauge.wrong_hole
+
+
+def test_the_holes_of_the_chosen_pair_are_the_right_ones():
+    _, gauge = started(scene=SceneConfig(hole_pair=3))
+    lead_tip(gauge, *through(PAIRS["simple"][2].entry, True))
+    assert gauge.entry_error == pytest.approx(0.0, abs=1e-6)
+    assert not gauge.wrong_hole
+
+
+def test_holes_move_with_a_shifted_phantom():
+    env, gauge = started(randomisation=RandomisationConfig(phantom_shift=5.0))
+    lead_tip(gauge, *through(env.stitch.pair.entry, True))
+    assert gauge.entry_error == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_jump_is_no_passage():
+    _, gauge = started()
+    simulation = gauge._env.simulation
+    for point in through(PAIRS["simple"][0].entry, True) * 1.0 + np.array([[0, 0, 2e-3], [0, 0, -2e-3]]):
+        pose = np.array(simulation.needle())
+        pose[:3] += point - np.array(simulation.needle_point(needle.TIP_ANGLE))
+        simulation.pose_needle(tuple(pose))
+        simulation.refresh()
+        gauge.look(INFO)
+    assert math.isnan(gauge.entry_error)
+
+
+def test_crossing_has_a_direction_and_an_opening():
+    hole = PAIRS["simple"][0].entry
+    out, into = through(hole, True)
+    assert crossing(tuple(out), tuple(into), hole, inward=True) == pytest.approx(0.0, abs=1e-9)
+    assert crossing(tuple(out), tuple(into), hole, inward=False) is None
+    assert crossing(tuple(into), tuple(out), hole, inward=True) is None
+    beside = through(hole, True, (0.0, 0.51 * OPENING))
+    assert crossing(*map(tuple, beside), hole, inward=True) is None
+
+
+def test_the_thread_does_not_press():
+    bare, threaded = (Plate(envs.make(TaskConfig(scene=SceneConfig(thread=count))).model) for count in (0, 10))
+    assert threaded._model.ngeom > bare._model.ngeom
+    assert threaded._presses.sum() == bare._presses.sum()
+
+
+def test_the_needle_is_held_by_either_arm():
+    held = {task: started(task)[1].held() for task in ("grasp", "place", "handoff", "pullout")}
+    assert held == {"grasp": False, "place": True, "handoff": True, "pullout": True}

@@ -1,0 +1,196 @@
+"""The chain: high-level policy, low-level policies, terminations, limits."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from checkpoints import checkpoint
+
+from surgicai_vision import envs
+from surgicai_vision.commands.main import main
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, from_mapping
+from surgicai_vision.core.errors import BadFile, InputError, UnknownName
+from surgicai_vision.evaluation import hierarchical
+from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.evaluation.hierarchical import PATIENCE, Chain, ChainAgent
+from surgicai_vision.evaluation.metrics import summary
+from surgicai_vision.evaluation.rollout import evaluate
+
+EXPERTS = dict.fromkeys(names.SUBTASKS, "expert")
+
+
+class Env:
+    """Counts what a chain asks of it; the present subtask succeeds after `length` steps."""
+
+    def __init__(self, length: int = 3):
+        self.length, self.phase, self.steps, self.begun = length, 0, 0, []
+
+    @property
+    def dwell(self) -> int:
+        """Steps for which the success has held: it comes after two."""
+        return max(0, self.steps - 2)
+
+    def begin(self, phase: int) -> None:
+        if phase != self.phase:
+            self.begun.append(phase)
+            self.phase, self.steps = phase, 0
+
+    def step(self) -> None:
+        self.steps += 1
+        if self.steps == self.length and self.phase < 4:
+            self.phase, self.steps = self.phase + 1, 0
+
+
+def agent(classes: list[int], **changes: object) -> ChainAgent:
+    """Return a chain whose high-level policy says `classes` one after another, and whose policies say their index."""
+    made = ChainAgent("chain", Chain("order", **{**EXPERTS, **changes}))
+    said = iter(classes)
+    made._high = SimpleNamespace(answer=lambda envs, _: np.eye(5)[[next(said) for _ in envs]])
+    made._low = [
+        SimpleNamespace(
+            begin=lambda *_: None, act=lambda slots, *_, value=index: np.full((len(slots), 7), value / 10)
+        )
+        for index in range(5)
+    ]  # fmt: skip
+    return made
+
+
+def roll(actor: ChainAgent, env: Env, steps: int) -> list[int]:
+    """Return which low-level policy acted in each step; -1 where the arms hold still."""
+    actor.begin(0, env, 0)
+    acted = []
+    for _ in range(steps):
+        value = actor.act([0], [env], [None])[0, 0]
+        acted.append(round(10 * float(value)))
+        env.step()
+    return acted
+
+
+def test_privileged_termination_asks_when_the_subtask_has_ended() -> None:
+    env = Env(3)
+    assert roll(agent([0, 1, 2, 3, 4]), env, 14) == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4]
+    assert env.begun == []
+
+
+def test_a_grasp_may_end_sooner_than_the_env_ends_it_and_nothing_else_may() -> None:
+    env = Env(10)
+    acted = roll(agent([0, 1, 2], grasp_hold=3), env, 17)
+    assert acted == [0] * 5 + [1] * 10 + [2] * 2 and env.begun == [1]
+    learned = agent([0] * 9, grasp_hold=3)
+    object.__setattr__(learned.chain, "termination", "learned")
+    assert roll(learned, Env(10), 8) == [0] * 8, "a learned termination asks the high-level policy alone"
+    for wrong in (0, 16):
+        with pytest.raises(InputError, match="grasp_hold is"):
+            Chain("order", **EXPERTS, grasp_hold=wrong)
+
+
+def test_a_choice_moves_its_own_arm() -> None:
+    env = Env(3)
+    assert roll(agent([0, 3, 1]), env, 7) == [0, 0, 0, 3, 3, 3, 1]
+    assert env.begun == [3, 1]
+
+
+def test_a_subtask_ends_after_its_steps_and_an_episode_after_its_decisions() -> None:
+    acted = roll(agent([1, 2, 3, 4], steps=2, decisions=3), Env(100), 9)
+    assert acted == [1, 1, 2, 2, 3, 3, 0, 0, 0], "after the third decision the arms hold still"
+
+
+def test_a_policy_that_plans_ahead_forgets_its_plan_when_its_subtask_begins() -> None:
+    actor, forgotten = agent([0, 1, 2, 3, 4]), []
+    for index, low in enumerate(actor._low):
+        low.restart = lambda slot, index=index: forgotten.append((slot, index))
+    roll(actor, Env(3), 8)
+    assert forgotten == [(0, 0), (0, 1), (0, 2)]
+
+
+def test_learned_termination_waits_for_the_high_level_policy() -> None:
+    actor, env = agent([0] * 4 + [1] * 3 + [0] + [1] * 20), Env(2)
+    object.__setattr__(actor.chain, "termination", "learned")
+    acted = roll(actor, env, 8 + PATIENCE + 2)
+    assert acted == [0] * (8 + PATIENCE - 1) + [1] * 3, "the env's own success must not end a subtask"
+
+
+def test_experts_in_their_order_sew_and_count_their_stages() -> None:
+    made = hierarchical.subject(Chain("order", **EXPERTS, max_steps=1000, grasp_hold=5))
+    assert made.config.task == "suture"
+    row = evaluate(made.make_agent, made.config, [names.TEST_SEED], workers=1)[0].row
+    assert row.success and row.stages == 5, row
+    assert summary([row])["reached"] == dict.fromkeys(names.SUBTASKS, 1)
+
+
+def test_begin_changes_the_arm_and_earns_nothing() -> None:
+    env = envs.make(TaskConfig("suture", max_steps=50))
+    env.reset(seed=names.TEST_SEED)
+    both, first = env.both_arms(), env.agent_pos()
+    np.testing.assert_array_equal(both[7:], first)
+    env.begin(4)
+    np.testing.assert_array_equal(env.agent_pos(), both[:7])
+    _, _, _, _, info = env.step(np.zeros(7, np.float32))
+    assert (info["phase"], info["progress"], info["is_success"]) == (4, 0, False)
+    with pytest.raises(InputError, match="no subtask 5"):
+        env.begin(5)
+
+
+def test_trained_policies_are_chained_in_any_batch(tmp_path: Path) -> None:
+    hlp = checkpoint(tmp_path / "hlp", "suture", "hlp")
+    low = {subtask: checkpoint(tmp_path / subtask, subtask) for subtask in names.SUBTASKS}
+    for termination in hierarchical.TERMINATIONS:
+        made = hierarchical.subject(Chain(hlp, **low, termination=termination, steps=4, max_steps=12))
+        rows = [
+            [e.row for e in evaluate(made.make_agent, made.config, [900_000, 900_001], batch=batch, workers=1)]
+            for batch in (1, 2)
+        ]
+        assert repr(rows[0]) == repr(rows[1]) and rows[0][0].steps == 12  # NaN is unequal to itself
+
+
+def test_policies_of_a_chain_share_features() -> None:
+    encoded: list[int] = []
+
+    def encoder(frames: np.ndarray) -> np.ndarray:
+        encoded.append(len(frames))
+        return frames.reshape(len(frames), -1)[:, :2].astype(np.float32)
+
+    encoder.fingerprint = "one"  # type: ignore[attr-defined]
+    policy = SimpleNamespace(act=lambda features, vectors: np.tile(features[:, :1], 7))
+    shared: dict = {}
+    agents = [PolicyAgent("a", policy, encoder, ("back",), 4) for _ in range(2)]
+    for one in agents:
+        one.share(shared)
+        for slot in range(3):
+            one.begin(slot, None, 0)
+    observations = [{"pixels": {"back": np.full((4, 4, 3), value, np.uint8)}} for value in (1, 2, 3)]
+    envs = [SimpleNamespace(agent_pos=lambda: np.zeros(7, np.float32))] * 3
+    assert agents[0].act([0, 2], envs[:2], observations[::2])[:, 0].tolist() == [1, 3]
+    assert agents[1].act([0, 1, 2], envs, observations)[:, 0].tolist() == [1, 2, 3]
+    assert encoded == [2, 1]
+
+
+def test_wrong_chains_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grasp, hlp = checkpoint(tmp_path / "grasp", "grasp"), checkpoint(tmp_path / "hlp", "suture", "hlp")
+    with pytest.raises(InputError, match="not for 'place'"):
+        hierarchical.subject(Chain("order", **{**EXPERTS, "place": grasp}))
+    with pytest.raises(InputError, match="takes an 'hlp'"):
+        hierarchical.subject(Chain(grasp, **EXPERTS))
+    with pytest.raises(InputError, match="does not act"):
+        hierarchical.subject(Chain("order", **{**EXPERTS, "grasp": hlp}))
+    with pytest.raises(BadFile, match="not a checkpoint"):
+        hierarchical.subject(Chain(str(tmp_path), **EXPERTS))
+    with pytest.raises(InputError, match="needs a high-level policy"):
+        Chain("order", **EXPERTS, termination="learned")
+    with pytest.raises(UnknownName, match="termination"):
+        from_mapping(Chain, {"hlp": "order", **EXPERTS, "terminaton": "learned"})
+    (tmp_path / "chain.yaml").write_text("hlp: order\ngrasp: expert\n")
+    assert main(["evaluate", str(tmp_path / "chain.yaml")]) == 2
+    assert "'place'" in capsys.readouterr().err
+
+
+def test_the_documented_chain_is_one(root: Path) -> None:
+    import yaml
+
+    text = (root / "docs" / "chain.md").read_text(encoding="utf-8")
+    made = from_mapping(Chain, yaml.safe_load(text.split("```yaml\n")[1].split("```")[0]))
+    assert made.termination in hierarchical.TERMINATIONS and all(
+        f"{s}-of-suture-state" in getattr(made, s) for s in EXPERTS
+    )

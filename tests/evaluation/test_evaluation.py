@@ -1,0 +1,261 @@
+"""Evaluation: rows do not depend on batch or workers; errors are failures; the summary has its keys."""
+
+import functools
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from surgicai_vision import envs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError, PhysicsError
+from surgicai_vision.envs import episode_monitor
+from surgicai_vision.evaluation import policy_spec, storage
+from surgicai_vision.evaluation.agents import PolicyAgent, RandomAgent, ZeroAgent
+from surgicai_vision.evaluation.metrics import KINDS, EpisodeRow, as_table, failure_kind, summary
+from surgicai_vision.evaluation.rollout import evaluate
+from surgicai_vision.evaluation.statistics import clopper_pearson
+
+SHORT = TaskConfig("grasp", max_steps=12)
+
+
+class FakeEnv:
+    """Counts steps; seed s succeeds after s steps, 97 cannot start, 98 diverges, 99 raises in a step."""
+
+    def __init__(self, config):
+        self.config, self.closed = config, False
+
+    def reset(self, seed):
+        if seed == 97:
+            raise PhysicsError("impossible start")
+        self.seed, self.count = seed, 0
+        return np.zeros(21, np.float32), self._info()
+
+    def step(self, action):
+        self.count += 1
+        if self.seed == 99 and self.count == 2:
+            raise PhysicsError("diverged")
+        info = self._info()
+        ended = info["is_success"] or info["physics_error"]
+        return np.zeros(21, np.float32), 0.0, ended, self.count >= self.config.max_steps, info
+
+    def _info(self):
+        return {
+            "is_success": self.count == self.seed or (self.seed == 98 and self.count == 3),
+            "physics_error": self.seed == 98 and self.count == 3,
+            "contact": self.count % 2 == 1,
+            "tip_path": 1e-3 * self.count,
+            "d_trans": 2e-3,
+            "d_angle": np.pi / 2,
+        }
+
+    def get_state(self):
+        return np.array([self.seed, self.count], np.float64)
+
+    def close(self):
+        self.closed = True
+
+
+class FakeGauge:
+    """Measures what the fake env's count says."""
+
+    def __init__(self, env):
+        self.env = env
+        self.forget()
+
+    def forget(self):
+        self.entry_error = self.exit_error = np.nan
+        self.slip = self.turn = self.tissue_force = 0.0
+        self.wrong_hole = False
+
+    begin = forget
+
+    def held(self):
+        return self.env._info()["contact"]
+
+    def look(self, info):
+        self.entry_error = 5e-4
+        self.slip, self.turn, self.tissue_force = 1e-4 * self.env.count, np.pi / 180, 0.1 * self.env.count
+
+
+@pytest.fixture
+def fake_envs(monkeypatch):
+    made = []
+    monkeypatch.setattr(episode_monitor, "Gauge", FakeGauge)
+
+    def make(config, **_):
+        made.append(FakeEnv(config))
+        return made[-1]
+
+    monkeypatch.setattr(envs, "make", make)
+    return made
+
+
+def rows_of(episodes):
+    return [episode.row for episode in episodes]
+
+
+def test_rows_are_in_the_order_of_seeds_for_any_batch(fake_envs):
+    seeds = [5, 3, 11, 40, 97, 7, 98, 99, 2]
+    wanted = rows_of(evaluate(ZeroAgent, SHORT, seeds, batch=1, workers=1))
+    assert [row.seed for row in wanted] == seeds
+    for batch in (2, 4, 20):
+        # A distance that was never measured is not a number on both sides, so the text is compared.
+        assert repr(rows_of(evaluate(ZeroAgent, SHORT, seeds, batch=batch, workers=1))) == repr(wanted)
+    assert all(env.closed for env in fake_envs)
+
+
+def test_errors_are_failures_and_counted(fake_envs):
+    rows = {row.seed: row for row in rows_of(evaluate(ZeroAgent, SHORT, [3, 97, 98, 99], workers=1))}
+    assert rows[3].success
+    for seed in (97, 98, 99):
+        assert not rows[seed].success
+        assert rows[seed].error
+    # A start that cannot be made is no divergence of the physics.
+    assert [rows[seed].failure for seed in (97, 98, 99)] == ["error", "physics", "physics"]
+    result = summary(list(rows.values()))
+    assert (result["successes"], result["errors"], result["failures"]) == (1, 3, {"physics": 2, "error": 1})
+
+
+def test_an_action_that_is_not_finite_is_an_error(fake_envs):
+    class Broken:
+        name, cameras, image_size = "broken", (), 64
+
+        def begin(self, slot, env, seed):
+            pass
+
+        def act(self, slots, envs, observations):
+            return np.full((len(slots), 7), np.nan, np.float32)
+
+    row = evaluate(Broken, SHORT, [3], workers=1)[0].row
+    assert not row.success
+    assert "not finite" in row.error
+
+
+def test_an_episode_ends_at_success_or_at_the_limit(fake_envs):
+    rows = {row.seed: row for row in rows_of(evaluate(ZeroAgent, SHORT, [5, 40], workers=1))}
+    assert (rows[5].success, rows[5].steps, rows[5].trajectory_length_mm) == (True, 5, pytest.approx(5.0))
+    assert (rows[40].success, rows[40].steps) == (False, SHORT.max_steps)
+    assert rows[5].d_trans_mm == pytest.approx(2.0)
+    assert rows[5].d_angle_deg == pytest.approx(90.0)
+
+
+def test_film_keeps_first_and_last_state(fake_envs):
+    film = evaluate(ZeroAgent, SHORT, [11], workers=1)[0].film
+    assert film.steps[0] == 0
+    assert film.steps[-1] == 11
+    np.testing.assert_array_equal(film.states[:, 1], film.steps)
+
+
+def test_progress_ends_at_the_total(fake_envs):
+    calls = []
+    evaluate(ZeroAgent, SHORT, [3, 4, 40], batch=2, workers=1, progress=lambda *numbers: calls.append(numbers))
+    assert calls[-1] == (3 * SHORT.max_steps, 3 * SHORT.max_steps)
+    assert [done for done, _ in calls] == sorted(done for done, _ in calls)
+
+
+@pytest.mark.parametrize("seeds", [[], [1, 1]])
+def test_seeds_are_checked(seeds):
+    with pytest.raises(InputError, match="start seeds"):
+        evaluate(ZeroAgent, SHORT, seeds)
+
+
+def test_summary_has_the_promised_keys(fake_envs):
+    result = summary(rows_of(evaluate(ZeroAgent, SHORT, [3, 5, 40], workers=1)))
+    promised = "task policy episodes successes success_rate ci95 trajectory_length_mm time_steps grasp errors"
+    assert set(promised.split()) <= set(result)
+    assert result["successes"] == 2
+    assert result["time_steps"]["mean"] == 4.0
+    assert set(result["trajectory_length_mm"]) == {"mean", "std"}
+    assert result["grasp"] == "friction"
+    assert result["first_seed"] == 3
+
+
+def test_rows_and_summary_hold_what_was_measured(fake_envs, tmp_path):
+    episodes = evaluate(ZeroAgent, SHORT, [3, 40, 97], workers=1)
+    rows = {row.seed: row for row in rows_of(episodes)}
+    assert (rows[3].entry_mm, rows[3].slip_mm, rows[3].slip_deg) == pytest.approx((0.5, 0.3, 1.0))
+    assert rows[40].tissue_force_n == pytest.approx(1.2)
+    # Nothing of the episode before is left in one that could not start.
+    assert np.isnan([rows[97].entry_mm, rows[3].exit_mm]).all() and rows[97].slip_mm == 0.0
+    result = storage.write_evaluation(tmp_path, episodes, {})
+    assert result["entry_mm"] == {"mean": pytest.approx(0.5), "std": pytest.approx(0.0), "n": 2}
+    assert result["exit_mm"] == {"mean": None, "std": None, "n": 0}
+    assert result["tissue_force_n"]["n"] == 3
+    assert json.loads((tmp_path / storage.MARKER).read_text())["summary"] == result
+    assert repr(storage.read_rows(tmp_path)) == repr(as_table(rows_of(episodes)))
+
+
+def test_kinds_of_failure():
+    assert [failure_kind("x", diverged, True, True, True) for diverged in (True, False)] == ["physics", "error"]
+    assert failure_kind("", False, touched=False, wrong_hole=False, held=False) == "missed"
+    assert failure_kind("", False, touched=True, wrong_hole=True, held=False) == "wrong_hole"
+    assert failure_kind("", False, touched=True, wrong_hole=False, held=False) == "dropped"
+    assert failure_kind("", False, touched=True, wrong_hole=False, held=True) == "time"
+    assert KINDS == ("missed", "dropped", "wrong_hole", "time", "physics", "error")
+
+
+def test_survival_counts_each_stage_and_all_before_it():
+    rows = [row_with_stages(seed, stages) for seed, stages in enumerate((0, 2, 2, 5))]
+    survival = summary(rows)["survival"]
+    assert [(stage["subtask"], stage["k"]) for stage in survival] == [
+        ("grasp", 3), ("place", 3), ("insert", 1), ("handoff", 1), ("pullout", 1),
+    ]  # fmt: skip
+    assert (survival[0]["low"], survival[0]["high"]) == clopper_pearson(3, 4)
+
+
+def row_with_stages(seed, stages):
+    return EpisodeRow(
+        task="suture", policy="x", seed=seed, success=stages == 5, steps=9, trajectory_length_mm=1.0, d_trans_mm=1.0,
+        d_angle_deg=1.0, contact=True, error="", grasp="friction", failure="" if stages == 5 else "time",
+        stages=stages,
+    )  # fmt: skip
+
+
+def test_real_env_gives_the_same_rows_for_any_batch_and_workers():
+    seeds = list(range(names.TEST_SEED, names.TEST_SEED + 4))
+    one = evaluate(RandomAgent, SHORT, seeds, batch=1, workers=1)
+    many = evaluate(RandomAgent, SHORT, seeds, batch=4, workers=1)
+    spread = evaluate(RandomAgent, SHORT, seeds, batch=2, workers=2)
+    for other in (many, spread):
+        assert repr(rows_of(other)) == repr(rows_of(one))
+        for mine, theirs in zip(one, other, strict=True):
+            np.testing.assert_array_equal(mine.film.states, theirs.film.states)
+
+
+def pixel_agent():
+    """A policy that turns real features of a real encoder into actions."""
+    from surgicai_vision.features.encoders import load_encoder
+
+    encoder = load_encoder("imagenet-lite")
+    weights = np.random.default_rng(0).normal(0, 0.05, (2 * encoder.dim + 7, 7))
+
+    def act(features, agent_pos):
+        inputs = np.concatenate([features, agent_pos], axis=1).astype(np.float64)
+        return np.tanh(np.einsum("bi,ia->ba", inputs, weights)).astype(np.float32)
+
+    return PolicyAgent("probe", SimpleNamespace(act=act), encoder, ("front", "back"), 96)
+
+
+def test_a_policy_with_pictures_gives_the_same_rows_for_any_batch():
+    seeds, config = range(names.TEST_SEED, names.TEST_SEED + 3), TaskConfig("grasp", max_steps=5)
+    one = evaluate(pixel_agent, config, seeds, batch=1, workers=1)
+    many = evaluate(pixel_agent, config, seeds, batch=3, workers=1)
+    assert repr(rows_of(one)) == repr(rows_of(many))
+    assert one[0].row.trajectory_length_mm > 0
+
+
+def test_expert_solves_held_out_starts():
+    subject = policy_spec.baseline_subject("expert", TaskConfig("grasp"))
+    rows = rows_of(
+        evaluate(subject.make_agent, subject.config, range(names.TEST_SEED, names.TEST_SEED + 3), workers=1)
+    )
+    assert all(row.success for row in rows), rows
+
+
+def test_zero_fails():
+    make = functools.partial(policy_spec.baseline, "zero")
+    row = evaluate(make, SHORT, [names.TEST_SEED], workers=1)[0].row
+    assert (row.success, row.failure, row.steps) == (False, "missed", SHORT.max_steps)

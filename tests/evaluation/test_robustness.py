@@ -1,0 +1,267 @@
+"""Robustness: strength 0 is the plain evaluation, strengths are paired, each axis changes what it says and no more."""
+
+import json
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from surgicai_vision import envs
+from surgicai_vision.commands.main import main
+from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig
+from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
+from surgicai_vision.evaluation import policy_spec
+from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.evaluation.robustness import AXES, CURVES, axes_of, robustness, shifted
+from surgicai_vision.evaluation.robustness.corruption import CORRUPTIONS, CorruptedAgent, Moment
+from surgicai_vision.evaluation.rollout import evaluate
+from surgicai_vision.evaluation.statistics import clopper_pearson, mcnemar
+from surgicai_vision.evaluation.storage import MARKER, read_rows
+
+SEEDS = range(names.TEST_SEED, names.TEST_SEED + 2)
+SHORT = TaskConfig("grasp", max_steps=4)
+WORLD = [name for name, axis in AXES.items() if axis.world]
+
+
+def seeing(image_size=48):
+    """A policy whose actions depend on every pixel of two views."""
+
+    def encode(frames):
+        return frames.reshape(len(frames), -1).astype(np.float64)
+
+    def act(features, agent_pos):
+        weights = np.random.default_rng(0).normal(size=(features.shape[1], 7)) / features.shape[1]
+        return np.tanh(features @ weights / 30).astype(np.float32)
+
+    return PolicyAgent("seeing", SimpleNamespace(act=act), encode, ("front", "wrist_psm2"), image_size)
+
+
+def subject(config=SHORT):
+    return policy_spec.Subject("seeing", config, seeing, {"views": ["front", "wrist_psm2"]})
+
+
+def played(chosen, batch=8):
+    return evaluate(chosen.make_agent, chosen.config, SEEDS, batch=batch, workers=1)
+
+
+def rows_of(episodes):
+    return [repr(episode.row) for episode in episodes]
+
+
+@contextmanager
+def silent(title, unit):
+    yield lambda *numbers: None
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_strength_0_is_the_plain_evaluation_row_by_row(axis):
+    plain, zero = played(subject()), played(shifted(subject(), axis, 0.0))
+    assert rows_of(zero) == rows_of(plain)
+    for one, other in zip(zero, plain, strict=True):
+        np.testing.assert_array_equal(one.film.states, other.film.states)
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_an_axis_changes_what_a_seeing_policy_does_and_not_where_it_starts(axis):
+    plain, half, full = (played(shifted(subject(), axis, strength)) for strength in (0.0, 0.5, 1.0))
+    for one, other in ((half, plain), (full, half)):
+        for mine, theirs in zip(one, other, strict=True):
+            assert repr(mine.row) != repr(theirs.row)
+    needles = [[needle_at_start(episode) for episode in episodes] for episodes in (plain, half, full)]
+    np.testing.assert_allclose(needles[1], needles[0], atol=1e-6)
+    np.testing.assert_allclose(needles[2], needles[0], atol=1e-6)
+
+
+def needle_at_start(episode):
+    """The needle's pose at the start of an episode: qpos follows the clock in MuJoCo's state."""
+    model = envs.make(SHORT)
+    first = model.scene.needle_qpos
+    return episode.film.states[0][1 + first.start : 1 + first.stop]
+
+
+@pytest.mark.parametrize("axis", WORLD)
+def test_an_episode_keeps_its_direction_and_grows_with_the_strength(axis):
+    drawn = {}
+    for strength in (0.5, 1.0):
+        env = envs.make(shifted(subject(), axis, strength).config)
+        drawn[strength] = env.reset(seed=5)[1]["randomisation"]
+    assert set(drawn[0.5]) == set(drawn[1.0]) == set(AXES[axis].world)
+    for name, values in drawn[1.0].items():
+        if name != "latency":
+            np.testing.assert_allclose(drawn[0.5][name], values / 2)
+            assert np.abs(values).max() > 0
+
+
+def test_latency_is_in_whole_steps():
+    steps = [shifted(subject(), "latency", strength).config.randomisation.latency for strength in (0, 0.25, 0.5, 1)]
+    assert steps == [0, 1, 3, 5]
+
+
+def test_a_shift_comes_on_top_of_the_tasks_own_randomisation_up_to_what_is_possible():
+    config = TaskConfig("grasp", randomisation=RandomisationConfig(light=0.3, friction=0.1))
+    light = [shifted(subject(config), "light", s).config.randomisation.light for s in (0.0, 0.5, 1.0)]
+    assert light == pytest.approx([0.3, 0.7, 0.9])
+    assert shifted(subject(config), "blur", 1.0).config == config
+
+
+@pytest.mark.parametrize("kind", CORRUPTIONS)
+def test_a_corruption_grows_with_its_strength_from_nothing(kind):
+    picture = np.random.default_rng(0).integers(60, 200, (64, 64, 3)).astype(np.uint8)
+    before = picture.copy()
+    changed = [CORRUPTIONS[kind](picture, s, Moment(1, 2, 0)) for s in (0.0, 0.25, 0.5, 1.0)]
+    np.testing.assert_array_equal(picture, before)
+    np.testing.assert_array_equal(changed[0], picture)
+    off = [np.abs(one.astype(float) - picture).mean() for one in changed]
+    assert off == sorted(off) and off[1] > 0.3
+    assert all(one.shape == picture.shape and one.dtype == np.uint8 for one in changed)
+    np.testing.assert_array_equal(CORRUPTIONS[kind](picture, 1.0, Moment(1, 2, 0)), changed[3])
+
+
+def test_noise_is_new_each_step_and_view_and_smoke_drifts():
+    picture = np.full((64, 64, 3), 90, np.uint8)
+    for kind in ("noise", "smoke"):
+        moments = [Moment(1, 0, 0), Moment(1, 40, 0), Moment(1, 0, 1), Moment(2, 0, 0)]
+        looks = [CORRUPTIONS[kind](picture, 0.5, moment) for moment in moments]
+        assert all(not np.array_equal(looks[0], other) for other in looks[1:])
+    still, later = (CORRUPTIONS["smoke"](picture, 0.5, Moment(1, step, 0)) for step in (0, 40))
+    np.testing.assert_array_equal(np.roll(still, round(40 * 64 / 200), axis=1), later)
+
+
+def test_noise_and_smoke_are_as_strong_as_said():
+    grey = np.full((200, 200, 3), 128, np.uint8)
+    assert CORRUPTIONS["noise"](grey, 0.5, Moment(0, 0, 0)).std() == pytest.approx(32.0, rel=0.02)
+    hidden = CORRUPTIONS["smoke"](np.zeros_like(grey), 1.0, Moment(0, 0, 0)) / np.array([196, 198, 202])
+    assert 0.39 < hidden.min() < hidden.max() < 0.91
+
+
+@pytest.mark.parametrize("axis", ["noise", "smoke"])
+def test_rows_do_not_depend_on_the_batch(axis):
+    chosen = shifted(subject(), axis, 0.5)
+    assert rows_of(played(chosen, 1)) == rows_of(played(chosen, 2))
+
+
+def test_a_corruption_leaves_the_env_and_everything_but_pictures_alone():
+    seen = []
+    agent = SimpleNamespace(
+        name="x", cameras=("front",), image_size=8, begin=lambda *_: None,
+        act=lambda slots, envs, observations: seen.extend(observations),
+    )  # fmt: skip
+    wrapped = CorruptedAgent(agent, CORRUPTIONS["noise"], 1.0)
+    wrapped.begin(3, None, 7)
+    given = {"pixels": {"front": np.full((8, 8, 3), 100, np.uint8)}, "agent_pos": np.ones(7)}
+    wrapped.act([3], [None], [given])
+    wrapped.act([3], [None], [given])
+    assert (given["pixels"]["front"] == 100).all()
+    assert seen[0]["agent_pos"] is given["agent_pos"]
+    assert not np.array_equal(seen[0]["pixels"]["front"], seen[1]["pixels"]["front"])
+
+
+class Pretend:
+    """Stands for `evaluate`: start s is solved up to strength s / 4; counts its calls."""
+
+    def __init__(self, real):
+        self.real, self.calls = real, []
+
+    def __call__(self, out, chosen, seeds, workers, progress):
+        shift = chosen.about["shift"]
+        self.calls.append((shift["axis"], shift["strength"]))
+        from surgicai_vision.evaluation.metrics import EpisodeRow
+        from surgicai_vision.evaluation.rollout import Episode, Film
+        from surgicai_vision.evaluation.storage import write_evaluation
+
+        film = Film(np.zeros(1, np.int64), np.zeros((1, 2)))
+        rows = [
+            EpisodeRow(
+                "grasp", "seeing", seed, 4 * shift["strength"] <= index, 1, 1.0, 1.0, 1.0, True, "", "friction", ""
+            )
+            for index, seed in enumerate(seeds)
+        ]
+        return write_evaluation(out, [Episode(row, film) for row in rows], dict(chosen.about))
+
+
+@pytest.fixture
+def pretend(monkeypatch):
+    from surgicai_vision.evaluation import robustness as module
+
+    fake = Pretend(module.evaluate_into)
+    monkeypatch.setattr(module, "evaluate_into", fake)
+    return fake
+
+
+def test_curves_count_compare_and_are_stored(tmp_path, pretend):
+    import pyarrow.parquet as pq
+
+    seeds = range(900_000, 900_005)
+    rows = robustness(subject(), seeds, tmp_path, silent, ("light", "blur"), (0.0, 0.5, 1.0))
+    assert [(row["axis"], row["strength"], row["k"], row["n"]) for row in rows] == [
+        ("light", 0.0, 5, 5), ("light", 0.5, 3, 5), ("light", 1.0, 1, 5),
+        ("blur", 0.0, 5, 5), ("blur", 0.5, 3, 5), ("blur", 1.0, 1, 5),
+    ]  # fmt: skip
+    assert (rows[1]["low"], rows[1]["high"]) == clopper_pearson(3, 5)
+    assert rows[0]["auc"] == pytest.approx(0.6) and rows[0]["auc_low"] < 0.6 < rows[0]["auc_high"]
+    p = mcnemar([True] * 5, [False] * 4 + [True])
+    assert (rows[0]["p"], rows[2]["p"], rows[2]["p_holm"]) == (None, p, min(1.0, 4 * p))
+    assert pq.read_table(tmp_path / CURVES).to_pylist() == rows
+    # The plain evaluation is made once, and kept for each axis under its own name.
+    assert pretend.calls == [("light", 0.0), ("light", 0.5), ("light", 1.0), ("blur", 0.5), ("blur", 1.0)]
+    stored = json.loads((tmp_path / "blur" / "0" / MARKER).read_text())
+    assert stored["about"]["shift"] == {"axis": "blur", "strength": 0.0}
+    assert repr(read_rows(tmp_path / "blur" / "0")) == repr(read_rows(tmp_path / "light" / "0"))
+
+
+def test_running_again_does_only_what_is_missing(tmp_path, pretend):
+    seeds = range(900_000, 900_003)
+    first = robustness(subject(), seeds, tmp_path, silent, ("light",), (0.0, 1.0))
+    done = len(pretend.calls)
+    assert robustness(subject(), seeds, tmp_path, silent, ("light",), (0.0, 1.0)) == first
+    assert len(pretend.calls) == done
+    robustness(subject(), seeds, tmp_path, silent, ("light", "smoke"), (0.0, 0.5, 1.0))
+    assert pretend.calls[done:] == [("light", 0.5), ("smoke", 0.5), ("smoke", 1.0)]
+    with pytest.raises(OutputExists, match="of another policy"):
+        robustness(subject(), range(5), tmp_path, silent, ("light",))
+
+
+def test_without_pictures_only_the_arm_can_shift(tmp_path):
+    blind = policy_spec.baseline_subject("expert", SHORT)
+    assert axes_of(blind) == ("latency", "kinematic_error")
+    assert axes_of(subject()) == tuple(AXES)
+    with pytest.raises(InputError, match="sees no pictures"):
+        robustness(blind, SEEDS, tmp_path, silent, ("blur",))
+
+
+def test_wrong_axes_and_strengths_are_refused(tmp_path):
+    with pytest.raises(UnknownName, match="blur"):
+        robustness(subject(), SEEDS, tmp_path, silent, ("blurr",))
+    for strengths in ((), (0.5, 0.5), (1.0, 0.0), (0.0, 1.5), (float("nan"),)):
+        with pytest.raises(InputError, match="strengths"):
+            robustness(subject(), SEEDS, tmp_path, silent, ("blur",), strengths)
+
+
+def test_the_verb_measures_the_expert_and_continues(tmp_path, capsys):
+    make = ["robustness", "expert", "--axis", "latency", "--strength", "0,1", "--episodes", "1", "--workers", "1"]
+    make += ["--out", str(tmp_path / "out"), "--json"]
+    assert main(make) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert [row["strength"] for row in result["curves"]] == [0.0, 1.0]
+    assert result["curves"][0]["k"] == 1
+    assert main(make) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1]) == result
+
+
+@pytest.mark.parametrize(
+    ("more", "wanted"),
+    [
+        (["--axis", "lihgt"], "light"),
+        (["--strength", "0,x"], "expected a number"),
+        (["--strength", "0,2"], "from 0 to 1"),
+        (["--axis", "blur"], "sees no pictures"),
+        (["--axis", "light,light"], "twice"),
+    ],
+)
+def test_wrong_options_end_with_one_line(more, wanted, tmp_path, capsys):
+    assert main(["robustness", "expert", "--out", str(tmp_path / "out"), *more]) == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len(error) == 1 and wanted in error[0]
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,105 @@
+"""The whole flow, tiny: quickstart and sweep from nothing, and once more without work."""
+
+import json
+import os
+
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+from surgicai_vision.commands.main import main
+
+TINY = {
+    "demonstrations": 3,
+    "episodes": 2,
+    "view": ["back"],
+    "size": 64,
+    "depth": False,
+    "workers": 1,
+    "policies": [{"encoder": "imagenet-lite", "view": ["back"]}, {}],
+}
+GRID = {
+    "task": ["grasp"],
+    "encoder": ["r3m"],  # its weights are nowhere here; the cells that run need no pictures
+    "view": ["back"],
+    "seed": [0, 1],
+    "proprioception": True,
+    "demonstrations": 3,
+    "episodes": 2,
+    "size": 64,
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the configurations and a feature cache of its own."""
+    path = tmp_path_factory.mktemp("flow")
+    (path / "tiny.yaml").write_text(yaml.safe_dump(TINY))
+    (path / "grid.yaml").write_text(yaml.safe_dump(GRID))
+    return path
+
+
+def run(folder, monkeypatch, capsys, *arguments):
+    """Run a command in `folder`; return its exit code and its JSON result."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("SURGICAI_VISION_CACHE", str(folder / "cache"))
+    code = main([*arguments, "--json"])
+    return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def times(folder):
+    """Modification times of every file below `folder`, but for the page and the run's own times."""
+    paths = [os.path.join(root, name) for root, _, found in os.walk(folder) for name in found]
+    return {path: os.stat(path).st_mtime_ns for path in paths if not path.endswith(("report.html", "run.json"))}
+
+
+def test_quickstart_runs_and_runs_again_without_work(folder, monkeypatch, capsys):
+    code, first = run(folder, monkeypatch, capsys, "quickstart", "--config", "tiny.yaml", "--out", "out")
+    assert code == 0
+    assert [result["policy"] for result in first["results"]] == ["imagenet-lite-back", "proprioception", "expert"]
+    assert all(result["episodes"] == 2 and result["errors"] == 0 for result in first["results"])
+    page = (folder / first["report"]).read_text()
+    assert page.count("<img") >= 3, "at least the views"
+    before = times(folder / "out")
+    code, second = run(folder, monkeypatch, capsys, "quickstart", "--config", "tiny.yaml", "--out", "out")
+    assert code == 0
+    assert second["results"] == first["results"]
+    assert times(folder / "out") == before
+
+
+def test_a_checkpoint_of_it_is_evaluated_to_the_same_result(folder, monkeypatch, capsys):
+    stored = json.loads((folder / "out/evaluations/imagenet-lite-back/evaluation.json").read_text())["summary"]
+    policy = "out/policies/imagenet-lite-back"
+    _, again = run(folder, monkeypatch, capsys, "evaluate", policy, "--episodes", "2", "--workers", "2")
+    assert {key: again[key] for key in stored} == stored
+
+
+def test_a_checkpoint_is_not_evaluated_on_another_task(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert main(["evaluate", "out/policies/proprioception", "--task", "place"]) == 2
+    assert "trained for 'grasp'" in capsys.readouterr().err
+
+
+def test_quickstart_refuses_the_folder_of_another_plan(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert main(["quickstart", "--config", "tiny.yaml", "--out", "out", "--episodes", "3"]) == 2
+    assert "other options" in capsys.readouterr().err
+
+
+def test_sweep_runs_reports_and_resumes(folder, monkeypatch, capsys):
+    code, first = run(folder, monkeypatch, capsys, "sweep", "grid.yaml", "--out", "sweep")
+    assert code == 0
+    counts = {name: first[name] for name in ("cells", "done", "cached", "failed", "not_run")}
+    assert counts == {"cells": 4, "done": 2, "cached": 0, "failed": 0, "not_run": 2}
+    assert pq.read_table(folder / "sweep/episodes.parquet").num_rows == 4
+    before = times(folder / "sweep")
+    code, second = run(folder, monkeypatch, capsys, "sweep", "grid.yaml", "--out", "sweep")
+    assert (second["done"], second["cached"], second["digest"]) == (0, 2, first["digest"])
+    after = times(folder / "sweep")
+    assert {path for path in after if after[path] != before.get(path)} == {str(folder / "sweep/episodes.parquet")}
+    code, _ = run(folder, monkeypatch, capsys, "report", "sweep")
+    assert code == 0
+    page = (folder / "sweep/report.html").read_text()
+    assert page.split('id="missing"')[1].split('id="origin"')[0].count("r3m on back") == 1
+    states = pq.read_table(folder / "sweep/tables/cells.parquet")["state"].to_pylist()
+    assert sorted(states) == ["done", "done", "done", "not run", "not run"]  # the expert too

@@ -1,0 +1,141 @@
+"""The feature cache: encode once, resume, never meet an old entry."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from encoders.random_resnet import CARD
+from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, UnknownName
+from surgicai_vision.features import cache as module
+from surgicai_vision.features.cache import encode, list_cache, prune_cache
+
+
+@dataclass
+class FakeDataset:
+    """Tiny frames whose mean is their index."""
+
+    length: int = 23
+    fingerprint: str = "data"
+    views: tuple[str, ...] = ("front", "back")
+    reads: int = 0
+
+    def frames(self, view: str, start: int, stop: int) -> np.ndarray:
+        self.reads += stop - start
+        values = np.arange(start, stop) + 100 * self.views.index(view)
+        return np.broadcast_to(values[:, None, None, None], (stop - start, 4, 4, 3)).astype(np.uint8)
+
+
+class FakeEncoder:
+    """Three numbers a frame; counts what it sees."""
+
+    card, pool, dim, shape = CARD, "global", 3, (3,)
+
+    def __init__(self, fingerprint: str = "encoder", fail_after: int | None = None, value: float = 0.0):
+        self.fingerprint, self.weights_sha256, self.seen = fingerprint, fingerprint, 0
+        self.fail_after, self.value = fail_after, value
+
+    def __call__(self, frames: np.ndarray) -> np.ndarray:
+        if self.fail_after is not None and self.seen >= self.fail_after:
+            raise KeyboardInterrupt
+        self.seen += len(frames)
+        return frames[:, 0, 0, :].astype(np.float32) + self.value
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CHUNK", 5)
+
+
+def expected(length: int = 23, offset: int = 0) -> np.ndarray:
+    return np.tile(np.arange(length)[:, None] + offset, 3).astype(np.float16)
+
+
+def test_rows_are_aligned_with_the_frames(tmp_path: Path) -> None:
+    entry = encode(FakeDataset(), "back", FakeEncoder(), tmp_path)
+    np.testing.assert_array_equal(entry.rows, expected(offset=100))
+    assert entry.rows.dtype == np.float16 and not entry.rows.flags.writeable
+    assert (entry.view, entry.dim, entry.encoded) == ("back", 3, 23)
+    assert entry.manifest["card"]["name"] == "random"
+
+
+def test_encoding_twice_does_nothing(tmp_path: Path) -> None:
+    encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
+    dataset, encoder = FakeDataset(), FakeEncoder()
+    again = encode(dataset, "front", encoder, tmp_path)
+    assert again.encoded == 0 and encoder.seen == 0 and dataset.reads == 0
+    np.testing.assert_array_equal(again.rows, expected())
+
+
+def test_interrupted_encoding_resumes(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        encode(FakeDataset(), "front", FakeEncoder(fail_after=10), tmp_path)
+    assert [entry.manifest for entry in list_cache(tmp_path)] == [None]
+    encoder, steps = FakeEncoder(), []
+    entry = encode(FakeDataset(), "front", encoder, tmp_path, lambda done, total: steps.append((done, total)))
+    assert encoder.seen == 13 and steps[0] == (10, 23) and steps[-1] == (23, 23)
+    np.testing.assert_array_equal(entry.rows, expected())
+
+
+def test_damaged_progress_starts_over(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        encode(FakeDataset(), "front", FakeEncoder(fail_after=10), tmp_path)
+    folder = list_cache(tmp_path)[0].folder
+    (folder / "features.npy").write_bytes(b"torn")
+    entry = encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
+    np.testing.assert_array_equal(entry.rows, expected())
+
+
+@pytest.mark.parametrize("change", ["dataset", "view", "encoder"])
+def test_a_change_never_meets_an_old_entry(tmp_path: Path, change: str) -> None:
+    first = encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
+    dataset = replace(FakeDataset(), fingerprint="other") if change == "dataset" else FakeDataset()
+    encoder = FakeEncoder("other" if change == "encoder" else "encoder")
+    second = encode(dataset, "back" if change == "view" else "front", encoder, tmp_path)
+    assert second.folder != first.folder and second.encoded == 23
+
+
+def test_wrong_inputs(tmp_path: Path) -> None:
+    with pytest.raises(UnknownName, match="front"):
+        encode(FakeDataset(), "frnt", FakeEncoder(), tmp_path)
+    with pytest.raises(InputError, match="no frames"):
+        encode(FakeDataset(length=0), "front", FakeEncoder(), tmp_path)
+    with pytest.raises(SurgicaiError, match="not finite"):
+        encode(FakeDataset(), "front", FakeEncoder(value=np.inf), tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be made"):
+        encode(FakeDataset(), "front", FakeEncoder(), tmp_path / "file")
+
+
+def test_values_beyond_float16_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SurgicaiError, match="not finite"):
+        encode(FakeDataset(), "front", FakeEncoder(value=1e6), tmp_path)
+
+
+def test_a_damaged_entry_is_named(tmp_path: Path) -> None:
+    entry = encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
+    path = entry.folder / "features.npy"
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(BadFile, match="delete that folder"):
+        encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
+
+
+def test_list_and_prune(tmp_path: Path) -> None:
+    assert list_cache(tmp_path / "none") == []
+    encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
+    encode(FakeDataset(fingerprint="old"), "front", FakeEncoder(), tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        encode(FakeDataset(), "back", FakeEncoder(fail_after=5), tmp_path)
+    assert sorted(bool(entry.manifest) for entry in list_cache(tmp_path)) == [False, True, True]
+    removed = prune_cache(tmp_path, keep_datasets={"data"})
+    assert len(removed) == 2
+    (left,) = list_cache(tmp_path)
+    assert left.manifest is not None and left.manifest["dataset"] == "data" and left.size > 0
+
+
+def test_cache_root_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path))
+    assert module.default_cache_root() == tmp_path
+    monkeypatch.delenv("SURGICAI_VISION_CACHE")
+    assert module.default_cache_root() == Path.home() / ".cache" / "surgicai-vision"

@@ -1,0 +1,54 @@
+"""A dataset and its features in memory, for the tests of training."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.features.cache import Features
+
+DIM = 12
+
+
+@dataclass
+class FakeDataset:
+    """A dataset in memory: the action is a smooth function of the state, plus one of the features."""
+
+    episodes: int = 5
+    steps: int = 40
+    config: TaskConfig = field(default_factory=TaskConfig)
+    task: str = "grasp"
+    views: tuple[str, ...] = ()
+    image_size: int = 224
+    fingerprint: str = "fake"
+
+    def __post_init__(self) -> None:
+        generator = np.random.default_rng(0)
+        self.length = self.episodes * self.steps
+        self.episode_index = np.repeat(np.arange(self.episodes), self.steps)
+        self.rows = generator.normal(size=(self.length, DIM)).astype(np.float16)
+        state = (generator.normal(size=(self.length, 7)) * 0.01).astype(np.float32)
+        action = np.tanh(state * 100 + self.rows[:, :1]).astype(np.float32)
+        self._columns = {names.STATE: state, names.ACTION: action}
+
+    def columns(self) -> dict[str, np.ndarray]:
+        return dict(self._columns)
+
+
+def features_of(fake: FakeDataset, view: str = "back", **changes: object) -> Features:
+    card = dict.fromkeys(("input_size", "input_range", "mean", "std", "interpolation", "channel_order"), 0)
+    manifest = {
+        "dataset": fake.fingerprint,
+        "view": view,
+        "encoder": "fake",
+        "card": card,
+        "pool": "global",
+        "encoder_fingerprint": "f",
+        "weights_sha256": "w",
+        "dim": DIM,
+        "shape": [DIM],
+        **changes,
+    }
+    return Features(Path("."), manifest, fake.rows)

@@ -1,0 +1,25 @@
+"""Demonstrations of the stand-in environment on disk, and rendering with it in this process."""
+
+import numpy as np
+from fake_env import FakeEnv, FakeExpert
+
+from surgicai_vision.dataset import render
+from surgicai_vision.demos.rollout import roll
+from surgicai_vision.demos.store import write_demo, write_marker
+
+
+def render_with_fake_env(monkeypatch, config):
+    """Let `render_demos` see the stand-in environment, without GL."""
+    monkeypatch.setattr(render, "_env", lambda _, *rest: FakeEnv(config, *rest))
+    monkeypatch.setattr(render, "_renderer", lambda: "none")
+    monkeypatch.setattr(render, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()})
+
+
+def write_demos(folder, config, seeds):
+    """Write one demonstration a seed into `folder` and return it."""
+    env = FakeEnv(config)
+    folder.mkdir()
+    for index, seed in enumerate(seeds):
+        write_demo(folder, index, roll(env, FakeExpert(env), seed).demo)
+    write_marker(folder, "grasp", "expert")
+    return folder

@@ -1,0 +1,75 @@
+"""A small stand-in for the suturing environment: numpy only, the same interface, no GL.
+
+The state is [goal, position, step, command]; each picture is a function of it. Used where a test is about
+files and processes, not about pictures.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from surgicai_vision.core.config import TaskConfig
+
+
+class FakeEnv:
+    def __init__(self, config=None, cameras=("front", "back"), image_size=32, depth=False, segmentation=False, **_):
+        self.config = config or TaskConfig(max_steps=12)
+        self.cameras, self.size, self.depth, self.segmentation = cameras, image_size, depth, segmentation
+        self.scene = SimpleNamespace(hash="f" * 64)
+        self.model = self.data = None
+        self.phase = 0
+        self.state = np.zeros(4)
+
+    def reset(self, seed=0, options=None):
+        self.state = np.array([np.random.default_rng(seed).uniform(0.3, 0.6), 0.0, 0.0, 0.0])
+        return self.observe(), {}
+
+    def step(self, action):
+        self.state = self.state + np.array([0.0, 0.1 * float(action[0]), 1.0, float(action[6])])
+        success = abs(self.state[0] - self.state[1]) < 0.06
+        info = {"is_success": success, "contact": success, "physics_error": False}
+        return self.observe(), 0.0 if success else -1.0, success, self.state[2] >= self.config.max_steps, info
+
+    def get_state(self):
+        return self.state.copy()
+
+    def set_state_vector(self, state):
+        self.state = np.array(state)
+
+    def agent_pos(self):
+        return np.linspace(0, 1, 7).astype(np.float32) + np.float32(self.state[1])
+
+    def both_arms(self):
+        return np.concatenate([self.agent_pos(), self.agent_pos() + np.float32(1)])
+
+    def state_vector(self):
+        return np.full(21, self.state[0] - self.state[1], np.float32)
+
+    def needle_pose(self):
+        return np.array([self.state[0], 0, 0, 1, 0, 0, 0], np.float32)
+
+    def observe(self):
+        y, x = np.mgrid[: self.size, : self.size]
+        views = {}
+        for number, camera in enumerate(self.cameras):
+            red = 40 + 10 * self.state[2] + x
+            views[camera] = np.stack([red, 90 * number + y, x * 0 + 100 * self.state[0]], -1).astype(np.uint8)
+        observation = {"pixels": views, "agent_pos": self.agent_pos()}
+        if self.depth:
+            depth = (0.1 + 0.001 * y + 0.01 * self.state[1]).astype(np.float32)[..., None]
+            observation["depth"] = dict.fromkeys(self.cameras, depth)
+        if self.segmentation:
+            parts = ((x + y + int(self.state[2])) % 6).astype(np.uint8)[..., None]
+            observation["segmentation"] = dict.fromkeys(self.cameras, parts)
+        return observation
+
+
+class FakeExpert:
+    def __init__(self, env):
+        self.env = env
+
+    def action(self):
+        # A start beyond 0.55 is one this expert never reaches.
+        goal, position = self.env.state[:2]
+        speed = 0.0 if goal > 0.55 else np.clip((goal - position) / 0.1, -1, 1)
+        return np.array([speed, 0, 0, 0, 0, 0, 1], np.float32)

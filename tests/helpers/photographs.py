@@ -1,0 +1,24 @@
+"""Pictures for the tests of encoders."""
+
+from pathlib import Path
+
+import numpy as np
+
+
+def hopper() -> np.ndarray:
+    """The photograph of Grace Hopper that matplotlib ships, its upper square, (1, 224, 224, 3) uint8 RGB."""
+    import cv2
+    import matplotlib.cbook
+
+    picture = cv2.imread(str(matplotlib.cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)))
+    assert picture is not None
+    return cv2.resize(picture[:512, :512, ::-1], (224, 224), interpolation=cv2.INTER_AREA)[None]
+
+
+def photograph(name: str) -> np.ndarray:
+    """A photograph of tests/pictures, (1, 224, 224, 3) uint8 RGB."""
+    import cv2
+
+    picture = cv2.imread(str(Path(__file__).parent / "images" / f"{name}.jpg"))
+    assert picture is not None and picture.shape == (224, 224, 3)
+    return np.ascontiguousarray(picture[None, ..., ::-1])

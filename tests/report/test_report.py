@@ -1,0 +1,205 @@
+"""The report: every number and picture is there, the page stands alone, and what it says of a quickstart."""
+
+import contextlib
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from surgicai_vision import report
+from surgicai_vision.core import files, names
+from surgicai_vision.core.config import TaskConfig, to_mapping
+from surgicai_vision.core.errors import BadFile, SurgicaiError
+from surgicai_vision.envs import contact_sheet
+from surgicai_vision.evaluation.rollout import Episode, EpisodeRow, Film
+from surgicai_vision.evaluation.storage import find_evaluations, read_film, read_rows, write_evaluation
+
+LIMIT = 3_000_000
+MACHINE = {"packages": {"mujoco": "4.0.0"}, "python": "3.12.1", "system": "Linux", "processor": "test", "cores": 2}
+
+
+def episode(policy, seed, success):
+    """An episode of 90 steps, or of 200 without success."""
+    steps = 90 if success else 200
+    row = EpisodeRow(
+        task="grasp", policy=policy, seed=seed, success=success, steps=steps, trajectory_length_mm=41.5 + seed % 7,
+        d_trans_mm=0.8 if success else 6.3, d_angle_deg=4.0, contact=success, error="", grasp="friction",
+        failure="" if success else "missed",
+    )  # fmt: skip
+    kept = np.linspace(0, steps, 9).astype(np.int64)
+    return Episode(row, Film(kept, np.stack([kept, np.full(9, seed)], axis=1).astype(np.float64)))
+
+
+def store(folder, name, successes, views=None):
+    """Store an evaluation of 20 episodes."""
+    episodes = [episode(name, names.TEST_SEED + i, i < successes) for i in range(20)]
+    about = {"task_config": to_mapping(TaskConfig("grasp")), "command": "surgicai-vision evaluate", "provenance": {}}
+    if name not in report.REFERENCES:
+        encoder = name.rsplit("-", 1)[0] if views else "proprioception"
+        checkpoint = {"weights_sha256": "0123456789abcdef" * 4, "seed": 0, "dataset": "fedcba9876543210" * 4}
+        about |= {"views": views or [], "encoder": encoder, "checkpoint": checkpoint, "folder": "policies/x"}
+    return write_evaluation(folder / "evaluations" / name, episodes, about)
+
+
+@pytest.fixture
+def results(tmp_path):
+    """Results as quickstart leaves them."""
+    store(tmp_path, "imagenet-lite-front", 13, ["front"])
+    store(tmp_path, "imagenet-lite-back", 9, ["back"])
+    store(tmp_path, "random-back", 0, ["back"])
+    store(tmp_path, "proprioception", 2)
+    store(tmp_path, "expert", 20)
+    run = {
+        "title": "quickstart, grasp",
+        "command": "surgicai-vision quickstart",
+        "seconds": {"demos": 20.4, "dataset": 61.0},
+        "provenance": {**MACHINE, "renderer": "llvmpipe"},
+        "data": "25 demonstrations",
+    }
+    files.write_json(tmp_path / report.RUN_FILE, run)
+    return tmp_path
+
+
+@contextlib.contextmanager
+def painted_stage(config, size, quality="high"):
+    """Paint pictures instead of rendering them."""
+
+    def picture(state, view, modality="rgb"):
+        ramp = np.linspace(40, 220, size).astype(np.uint8)
+        frame = np.stack(np.broadcast_arrays(ramp[:, None], ramp[None], np.uint8(state[0] % 255)), axis=-1)
+        frame = np.ascontiguousarray(frame)
+        frame[:40, :40] = contact_sheet.PALETTE[names.PARTS.index("needle")]
+        return frame
+
+    yield picture
+
+
+@pytest.fixture
+def painted(monkeypatch):
+    """These tests are about the page: they paint."""
+    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+
+
+class Page(HTMLParser):
+    """Counts tags, collects addresses, and knows whether every tag was closed."""
+
+    VOID = ("meta", "link", "img", "br", "input")
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.addresses, self.open = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.addresses += [value for key, value in attributes if key in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append(tag)
+
+
+def assert_stands_alone(text):
+    """Nothing is loaded from anywhere, every tag is closed, every link of the page has its target."""
+    page = Page(text)
+    assert page.open == []
+    inside = {address[1:] for address in page.addresses if address.startswith("#")}
+    assert all(address.startswith(("data:", "#")) for address in page.addresses)
+    assert all(f'id="{target}"' in text for target in inside)
+    assert not re.search(r"https?://|@import|url\(", text)
+    return page
+
+
+def test_page_holds_every_number(results, painted):
+    text = report.write_report(results).read_text()
+    assert "imagenet-lite on front solves 13 of 20 held-out starts of grasp" in text
+    for expected in (
+        "13/20",
+        "9/20",
+        "0/20",
+        "2/20",
+        "20/20",
+        "41–85 %",
+        "0–17 %",
+        "seeds 900000–900019",
+        "20 missed",
+    ):
+        assert expected in text, expected
+    for expected in ("25 demonstrations", "mujoco 4.0.0", "llvmpipe", "0123456789abcdef", "81 s: demos 20 s"):
+        assert expected in text, expected
+    assert "surgicai-vision evaluate policies/x --task grasp --episodes 20 --seed 900000 --json" in text
+
+
+def test_page_stands_alone(results, painted):
+    path = report.write_report(results)
+    page = assert_stands_alone(path.read_text())
+    # two views in three modalities, two films of nine frames, five rollouts of eight
+    assert page.tags.count("img") == 2 * 3 + 2 * 9 + 5 * 8
+    assert path.stat().st_size < LIMIT
+
+
+def test_without_a_success_or_a_failure_the_page_says_so(tmp_path, painted):
+    store(tmp_path, "zero", 0)
+    text = report.write_report(tmp_path).read_text()
+    assert "No episode of any policy was a success." in text
+    assert "zero solves 0 of 20 held-out starts" in text
+    store(tmp_path, "zero", 20)
+    assert "No episode of any policy was a failure." in report.write_report(tmp_path).read_text()
+
+
+def test_films_are_of_a_trained_policy_where_it_has_one(results, painted):
+    text = report.write_report(results).read_text()
+    assert "imagenet-lite, start 900000, seen by front: success after 90 steps" in text
+    assert "imagenet-lite, start 900013, seen by front: failure (missed) after 200 steps" in text
+
+
+def test_without_gl_the_numbers_remain(results, monkeypatch):
+    def no_gl(*_):
+        raise SurgicaiError("nothing renders")
+
+    monkeypatch.setattr(contact_sheet, "stage", no_gl)
+    text = report.write_report(results).read_text()
+    assert "No pictures: nothing renders" in text
+    assert "13/20" in text
+
+
+def test_names_from_outside_are_escaped(tmp_path, painted):
+    evil = "</script><script>alert(1)</script>"
+    episodes = [episode(evil, names.TEST_SEED, True)]
+    about = {"task_config": to_mapping(TaskConfig("grasp")), "encoder": evil, "views": ["front"], "command": evil}
+    write_evaluation(tmp_path / "evil", episodes, {**about, "provenance": {}})
+    files.write_json(tmp_path / report.RUN_FILE, {"title": evil})
+    text = report.write_report(tmp_path).read_text()
+    assert "<script>alert" not in text
+    assert text.count("</script>") == 3
+    assert Page(text).open == []
+
+
+def test_results_round_trip(results):
+    folder = find_evaluations(results)[0]
+    rows = read_rows(folder)
+    assert [row["seed"] for row in rows] == list(range(names.TEST_SEED, names.TEST_SEED + 20))
+    film = read_film(folder, names.TEST_SEED + 3)
+    assert film.states.shape == (9, 2)
+    assert film.states[0, 1] == names.TEST_SEED + 3
+
+
+def test_a_broken_off_evaluation_is_no_result(results, painted):
+    for folder in find_evaluations(results):
+        (folder / "evaluation.json").unlink()
+    with pytest.raises(BadFile, match="holds no evaluation"):
+        report.write_report(results)
+
+
+def test_depth_and_parts_are_coloured():
+    depth = np.linspace(0.05, 0.2, 64 * 64, dtype=np.float32).reshape(64, 64, 1)
+    near, far = contact_sheet.coloured(depth, "depth")[[0, -1], [0, -1]].astype(int)
+    assert near[0] > near[2], "near is red"
+    assert far[2] > far[0], "far is blue"
+    parts = np.full((4, 4, 1), names.PARTS.index("needle"), np.uint8)
+    assert (contact_sheet.coloured(parts, "segmentation") == contact_sheet.PALETTE[2]).all()

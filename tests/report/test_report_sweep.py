@@ -1,0 +1,450 @@
+"""The report of a sweep: nothing is silently absent, numbers agree with the rows, and the page works in a browser."""
+
+import csv
+import itertools
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from matplotlib.figure import Figure
+from sweep_results import COMMAND, TASKS, add_curves, cell, evaluation, store_cell, write_sweep
+from test_report import assert_stands_alone, painted_stage
+
+from surgicai_vision import report
+from surgicai_vision.commands.main import main
+from surgicai_vision.commands.report import Options
+from surgicai_vision.core import names
+from surgicai_vision.envs import contact_sheet
+from surgicai_vision.evaluation import statistics
+from surgicai_vision.report import charts, filmstrips, formats, paper, paper_comparison, tables
+from surgicai_vision.report.experiment_key import Condition
+from surgicai_vision.report.failures import failure_sheet
+from surgicai_vision.report.groups import best_trained, group, of_task
+from surgicai_vision.report.pairs import compare, factor
+from surgicai_vision.report.reader import collect
+
+LIMIT = 8_000_000
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A sweep's folder with its report."""
+    folder = add_curves(write_sweep(tmp_path_factory.mktemp("sweep") / "table"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(contact_sheet, "stage", painted_stage)
+        report.write_report(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def text(written):
+    return (written / "report.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def groups(written):
+    return group(collect(written))
+
+
+def find(groups, **wanted):
+    """The only group with these values in its condition."""
+    found = [item for item in groups if all(getattr(item.condition, name) == v for name, v in wanted.items())]
+    assert len(found) == 1, (wanted, len(found))
+    return found[0]
+
+
+def rows_of(text, table):
+    """The rows of one table of the page, each as its cells' texts."""
+    body = text.split(f'id="{table}"')[1].split("<tbody>")[1].split("</tbody>")[0]
+    return [[re.sub(r"<[^>]+>", " ", c).strip() for c in row.split("</td>")[:-1]] for row in body.split("</tr>")[:-1]]
+
+
+def test_the_papers_numbers_are_the_printed_ones(shared):
+    facts = (shared / "facts.md").read_text()
+    block = facts.split("Table 2 of the paper")[1].split("State-based")[0]
+    lines = re.findall(r"(?m)^\| (\w+) \| ([\d./ |]+)\|$", block)
+    assert [task for task, _ in lines] == ["grasp", "place", "handoff", "pullout"]
+    for task, numbers in lines:
+        for encoder, pair in zip(paper.ENCODERS, numbers.split("|"), strict=False):
+            front, back = (float(number) for number in pair.strip().split("/"))
+            assert (paper.rate(task, encoder, "front"), paper.rate(task, encoder, "back")) == (front, back)
+    assert paper.rate("insert", "clip", "back") is None
+    for task in ("grasp", "place", "handoff", "pullout"):  # why intervals of the paper are those of 60 episodes
+        rates = [paper.rate(task, encoder, view) for encoder in paper.ENCODERS for view in paper.VIEWS]
+        assert all(abs(round(60 * rate) / 60 - rate) < 0.0051 for rate in rates)
+
+
+def test_the_paper_stands_beside_ours_cell_by_cell(text, groups):
+    rows = {(row[0], row[1]): row[2:] for row in rows_of(text, "paper")}
+    assert {task for task, _ in rows} == {*TASKS, "place"}
+    ours = find(groups, task="grasp", encoder="imagenet", views=("back",))
+    assert rows["grasp", "imagenet"][0] == "8 %"
+    assert rows["grasp", "imagenet"][3] == "10 %"
+    assert f"{ours.successes}/{ours.episodes}" in rows["grasp", "imagenet"][4]
+    assert rows["insert", "imagenet"][0] == "not reported"
+    assert rows["insert", "imagenet-lite"][0] == "not in the paper"
+    assert rows["grasp", "r3m"][1] == "not run"
+    assert rows["grasp", "clip"][1] == "not in this sweep"
+    assert "Behaviour cloning from the state, its Table 1: grasp 96 %; place 100 %; insert 97 %" in text
+    assert paper_comparison.paper_rate(ours.condition) == 0.10
+
+
+def test_every_cell_is_there_with_its_count_and_interval(text, groups, written):
+    shown = rows_of(text, "success")
+    assert len(shown) == len(groups)
+    for item, row in zip(groups, shown, strict=True):
+        if item.episodes:
+            low, high = statistics.clopper_pearson(item.successes, item.episodes)
+            assert row[3] == f"{item.successes}/{item.episodes}"
+            assert f"({100 * low:.0f}–{100 * high:.0f} %)" in " ".join(row[4].split())
+    records = pq.read_table(written / "tables/cells.parquet").to_pylist()
+    done = [record for record in records if record["state"] == "done"]
+    assert len(done) == len(list(written.rglob("evaluation.json")))
+    for record in done:
+        assert (record["low"], record["high"]) == statistics.clopper_pearson(record["successes"], record["episodes"])
+        assert record["command"] == COMMAND
+        kinds = sum(record[kind] for kind in ("missed", "dropped", "wrong_hole", "time", "physics", "error"))
+        assert kinds == record["episodes"] - record["successes"]
+
+
+def test_across_training_seeds_are_mean_deviation_and_bootstrap(groups):
+    item = find(groups, task="insert", encoder="imagenet-lite", views=("front",))
+    rates = [result.summary["success_rate"] for result in item.results]
+    assert len(rates) == 2
+    assert item.across.mean == pytest.approx(np.mean(rates))
+    assert item.across.std == pytest.approx(np.std(rates, ddof=1))
+    outcomes = [[float(row["success"]) for row in result.rows] for result in item.results]
+    assert item.across.interval == statistics.hierarchical_bootstrap(outcomes, np.random.default_rng(0))
+    assert find(groups, task="grasp", encoder="proprioception").across is None
+
+
+def test_what_failed_or_was_not_run_is_told_with_its_reason(text, written, groups):
+    missing = text.split('id="missing"')[1].split('id="origin"')[0]
+    assert missing.count('class="state not run"') == 9, "one row a condition"
+    assert missing.count('training seeds">0, 1<') == 9
+    assert missing.count('class="state failed"') == 1
+    assert missing.count("R3M&#39;s weights are not here; see its card.") == 9
+    assert "RuntimeError: the disk is full" in missing
+    assert "failed: replay-grasp: the mean demonstration is empty" in missing
+    assert "1 training seed failed" in text
+    states = pq.read_table(written / "tables/cells.parquet")["state"].to_pylist()
+    assert (states.count("not run"), states.count("failed")) == (18, 1)
+    assert len(find(groups, task="handoff", encoder="imagenet", views=("back",)).results) == 1
+
+
+def test_a_plans_cells_that_nobody_came_to_are_pending(tmp_path):
+    write_sweep(tmp_path / "s", tasks=("grasp",), seeds=(0,), views=(("back",),))
+    plan = [
+        {**cell("grasp", "imagenet", ("back",), 0), "state": "to do", "key": "a", "reason": "made by other code"},
+        {**cell("grasp", "imagenet", ("front",), 0), "state": "to do", "key": "b", "reason": ""},
+        {**cell("grasp", "clip", ("front",), 3), "state": "not run", "key": "c", "reason": "no weights"},
+    ]
+    missing = collect(tmp_path / "s", plan).missing
+    assert [(item.condition.encoder, item.seed, item.state) for item in missing] == [
+        ("clip", 3, "not run"), ("imagenet", 0, "pending"),
+    ]  # fmt: skip
+    assert missing[0].reason == "no weights"
+
+
+def test_what_could_not_be_run_where_the_sweep_ran_stays_not_run_here(tmp_path):
+    write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
+    plan = [{**cell("grasp", "r3m", ("back",), 0), "state": "to do", "key": "a", "reason": ""}]
+    (missing,) = collect(tmp_path, plan).missing
+    assert (missing.state, missing.reason) == ("not run", "R3M's weights are not here; see its card.")
+
+
+def test_a_cell_that_the_run_skipped_is_told_whatever_its_name(tmp_path):
+    write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
+    run = json.loads((tmp_path / "run.json").read_text())
+    skipped = cell("grasp", "clip", ("front",), 0, epochs=2)
+    run["skipped"] = [{"key": "a", "cell": skipped, "reason": "its licence"}]
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    missing = collect(tmp_path, [{**skipped, "state": "to do", "key": "a", "reason": ""}]).missing
+    assert [(item.condition.label, item.state, item.reason) for item in missing] == [
+        ("clip · 2 epochs on front", "not run", "its licence")
+    ]
+
+
+def test_cells_keep_their_columns_where_the_first_has_no_result(tmp_path):
+    write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),), encoders={"random": 0.5})
+    missing = json.loads((tmp_path / "run.json").read_text())
+    missing["skipped"] = [{"key": "a", "cell": cell("grasp", "clip", ("back",), 0), "reason": "its licence"}]
+    (tmp_path / "run.json").write_text(json.dumps(missing))
+    found = group(collect(tmp_path))
+    assert not found[0].episodes
+    table = pq.read_table(tables.write_tables(tmp_path, found, [], "title") / "cells.parquet")
+    assert {"low", "high", "command", "missed"} <= set(table.column_names)
+
+
+def test_the_command_reports_a_sweep_whose_grid_it_cannot_read(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
+    assert main(["report", str(tmp_path), "--strips", "2", "--json"]) == 0
+    said = capsys.readouterr()
+    told = json.loads(said.out.splitlines()[-1])
+    assert (told["evaluations"], told["missing"]) == (5, 1)
+    assert "grid cannot be read" in said.err
+    assert Options(str(tmp_path)).strips == filmstrips.MOST_STRIPS
+
+
+def test_a_folder_where_every_cell_failed_has_a_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    folder = tmp_path / "cells" / "a"
+    folder.mkdir(parents=True)
+    (folder / "failed.json").write_text(
+        json.dumps({"cell": cell("grasp", "random", ("front",), 0), "error": "no disk"})
+    )
+    text = report.write_report(tmp_path).read_text()
+    assert "No cell has a result yet" in text
+    assert "no disk" in text
+    assert_stands_alone(text)
+
+
+def test_a_cell_and_its_record_have_the_same_condition(tmp_path):
+    """A failed seed and a done one must fall into one group, whatever the cell's variant."""
+    described = cell("grasp", "random", ("front",), 1, policy="act", deviations=["bgr"], demonstrations=30)
+    store_cell(tmp_path, "done", {**described, "seed": 0}, 0.5, np.random.default_rng(0))
+    (tmp_path / "cells/broken").mkdir()
+    (tmp_path / "cells/broken/failed.json").write_text(json.dumps({"cell": described, "error": "no disk"}))
+    (item,) = group(collect(tmp_path))
+    assert (len(item.results), len(item.missing)) == (1, 1)
+    assert item.condition.variant == "act · bgr"
+    assert item.condition.demonstrations == 30
+
+
+def test_a_reference_that_several_sweeps_evaluated_stands_once(tmp_path):
+    for name, seed, episodes in (("right", 0, 20), ("left", 0, 12), ("other", 1, 20)):
+        rate = 0.6  # the same generator draws the same first episodes
+        evaluation(tmp_path / name, "grasp", "expert", rate, np.random.default_rng(seed), {}, episodes)
+    told = {(r.folder.name, r.condition.place) for r in collect(tmp_path).results}
+    assert told == {("right", "right"), ("other", "other")}, "what another saw goes in, what differs is told apart"
+    shutil.rmtree(tmp_path / "other")
+    assert [(r.folder.name, r.condition.place) for r in collect(tmp_path).results] == [("right", "")]
+
+
+def test_pairs_differ_in_one_thing_and_are_corrected_within_their_task(groups):
+    pairs = compare(groups)
+    assert {pair.factor for pair in pairs} == {"encoder", "views", "pictures", "demonstrations"}
+    grasp = [pair for pair in pairs if pair.first.condition.task == "grasp"]
+    assert sorted(pair.adjusted for pair in grasp) == pytest.approx(sorted(statistics.holm([p.p for p in grasp])))
+    pair = next(pair for pair in grasp if pair.factor == "encoder")
+    assert pair.episodes == 40
+    wins = [
+        {(r.seed, row["seed"]): row["success"] for r in side.results for row in r.rows}
+        for side in (pair.first, pair.second)
+    ]
+    assert pair.first_only == sum(wins[0][key] and not wins[1][key] for key in wins[0])
+    assert pair.p == statistics.mcnemar([wins[0][key] for key in wins[0]], [wins[1][key] for key in wins[0]])
+
+
+def test_conditions_that_differ_in_two_things_are_no_pair():
+    one = Condition("grasp", "imagenet", ("front",))
+    assert factor(one, Condition("grasp", "random", ("back",))) == ""
+    assert factor(one, Condition("grasp", "state")) == ""
+    assert factor(one, Condition("grasp", "proprioception")) == "pictures"
+    assert factor(one, replace(one, trained_by="act")) == "policy"
+    assert factor(one, replace(one, trained_by="act", recipe="released")) == ""
+    early = {"encoder": "imagenet-lite-early", "views": ("front_psm2",), "pool": "spatial"}
+    best = Condition("grasp", **early, recipe="best", demonstrations=350)
+    assert factor(one, best) == "recipe", "a recipe is compared as a whole"
+    assert factor(replace(best, changes=("clock=false",)), best) == "change"
+    assert factor(Condition("grasp", "proprioception"), best) == ""
+    blind = Condition("grasp", "proprioception", recipe="best", demonstrations=350)
+    assert factor(blind, best) == "pictures", "without an encoder nothing is taken from it"
+
+
+def test_curves_chain_and_probes_are_drawn_with_their_numbers(text, groups):
+    for section in ("curves", "chain", "probes"):
+        assert f'<h2 id="{section}">' in text
+    curves = text.split('id="curves"')[1].split('id="chain"')[0]
+    assert curves.count('<svg class="curve"') == 3
+    assert curves.count("<th>area (interval)</th>") == 2
+    lite = [find(groups, task="place", encoder="imagenet-lite", axis="light", strength=s) for s in (0.25, 0.5, 1.0)]
+    area = statistics.area_under_curve((0.25, 0.5, 1.0), [item.rate for item in lite])
+    assert re.search(rf"{area:.2f} \(0\.\d\d–0\.\d\d\)", curves.split("<h3>place: light</h3>")[1])
+    item = find(groups, task="place", encoder="imagenet", axis="light", strength=0.5)
+    assert f"{item.successes}/{item.episodes}" in curves
+    chain = text.split('id="chain"')[1].split('id="probes"')[0]
+    swapped = find(groups, task="suture", swap="insert")
+    finished = sum(row["stages"] > 2 for row in swapped.rows)
+    assert f"{finished}/20" in chain
+    assert "expert in insert" in chain
+    probes = text.split('id="probes"')[1].split('id="pairs"')[0]
+    assert re.search(r"handoff: -0\.\d\d over 9 pairs \(p [=&]", probes)
+    assert probes.count('<svg class="curve"') == 1
+    assert "(2.00–7.00; 9.50)" in probes
+
+
+def test_a_shifted_policy_is_no_cell_of_the_tables(text, groups):
+    assert not any(paper_comparison.paper_rate(item.condition) for item in groups if not item.condition.plain)
+    assert text.count('data-plain="no"') == 2 * sum(not item.condition.plain for item in groups)
+
+
+def test_shifted_evaluations_alone_make_a_page(tmp_path, monkeypatch):
+    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    generator = np.random.default_rng(0)
+    for strength in (0.0, 0.5, 1.0):
+        about = {"views": ["front"], "encoder": "random", "shift": {"axis": "blur", "strength": strength}}
+        evaluation(tmp_path / "blur" / f"{strength:g}", "grasp", "random-front", 1.5 - strength, generator, about)
+    text = report.write_report(tmp_path).read_text()
+    assert "random on front, blur 0 solves 20 of 20 held-out starts of grasp" in text
+    assert len(rows_of(text, "success")) == 3
+    assert text.split('id="curves"')[1].count("<polyline") == 1
+
+
+def test_two_evaluations_of_the_same_thing_are_not_counted_as_one(tmp_path):
+    generator = np.random.default_rng(0)
+    for name in ("friction", "attach"):
+        evaluation(tmp_path / name, "grasp", "expert", 1.5, generator, {})
+    assert [(item.label, item.episodes) for item in group(collect(tmp_path))] == [
+        ("expert · attach", 20), ("expert · friction", 20),
+    ]  # fmt: skip
+
+
+def test_what_a_running_sweep_has_not_filed_is_no_result_yet(tmp_path):
+    write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
+    before = len(collect(tmp_path).results)
+    evaluation(tmp_path / "work/job/evaluation", "grasp", "expert", 1.5, np.random.default_rng(0), {})
+    assert len(collect(tmp_path).results) == before
+
+
+def test_films_show_every_condition_and_stay_within_the_budget(text, groups, written, monkeypatch):
+    assert (written / "report.html").stat().st_size < LIMIT
+    details = json.loads(text.split('id="details">')[1].split("</script>")[0])
+    assert len(details) == len(groups)
+    assert all(entry["films"] for entry, item in zip(details, groups, strict=True) if item.episodes)
+    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    monkeypatch.setattr(filmstrips, "BUDGET", 100_000)
+    reel = filmstrips.make_reel(groups)
+    assert 0 < sum(len(frame) for strip in reel.strips.values() for frame in strip.frames) <= 100_000
+    assert reel.wanted > len(reel.strips)
+    assert filmstrips.make_reel(groups, most=0).strips == {}
+
+
+def test_the_compared_start_is_one_and_shows_successes_and_failures(groups):
+    chosen = filmstrips.comparison(groups, "insert")
+    assert len({choice.row["seed"] for choice in chosen}) == 1
+    assert {choice.row["success"] for choice in chosen} == {True, False}
+    assert 2 < len(chosen) <= filmstrips.COMPARED
+    assert len({choice.group.label for choice in chosen}) == len(chosen)
+
+
+def test_details_tell_every_episode(text, groups):
+    details = json.loads(text.split('id="details">')[1].split("</script>")[0])
+    for entry, item in zip(details, groups, strict=True):
+        for told, result in zip(entry["cells"], item.results, strict=True):
+            assert told["outcomes"].count("s") == result.summary["successes"]
+            assert len(told["outcomes"]) == len(told["steps"]) == len(told["mm"]) == len(result.rows)
+            assert told["starts"] == result.rows[0]["seed"]
+            assert told["commands"][-1] == COMMAND
+
+
+def test_failures_are_those_of_the_best_policy_of_each_task_once_a_kind(written, groups, monkeypatch):
+    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    reel, drawn = filmstrips.make_reel(groups), []
+    monkeypatch.setattr(contact_sheet, "sheet", lambda rows, columns, title: drawn.append(rows) or Figure())
+    assert failure_sheet(groups, reel)
+    titles = [title.split() for title, _ in drawn[0]]
+    best = {task: best_trained(of_task(groups, task)) for task in names.TASKS}
+    for task, start, *_ in titles:
+        lost = [row for r in best[task].results for row in r.rows if row["seed"] == int(start) and not row["success"]]
+        assert lost, "a failure of the best"
+    kinds = [(task, *outcome) for task, _, *outcome in titles]
+    assert len({kind[:2] for kind in kinds}) == len(kinds), "each kind once"
+    assert len({len(frames) for _, frames in drawn[0]}) == 1
+    assert failure_sheet(groups, filmstrips.Reel()) is None
+    assert contact_sheet.decoded((written / "tables/failures.jpg").read_bytes()).shape[2] == 3
+
+
+def test_page_and_tables_are_the_same_each_time(written, text, monkeypatch):
+    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    before = {path.name: path.read_bytes() for path in (written / "tables").iterdir()}
+    assert report.write_report(written).read_text() == text
+    assert {path.name: path.read_bytes() for path in (written / "tables").iterdir()} == before
+
+
+def test_latex_has_the_structure_of_booktabs(written):
+    latex = (written / "tables/table.tex").read_text()
+    assert r"\usepackage{booktabs}" in latex.splitlines()[0]
+    depth = []
+    for kind, name in re.findall(r"\\(begin|end)\{(\w+)\}", latex):
+        if kind == "begin":
+            depth.append(name)
+        else:
+            assert depth.pop() == name
+    assert not depth
+    found = re.findall(r"\\begin\{tabular\}\{(\w+)\}(.*?)\\end\{tabular\}", latex, re.DOTALL)
+    assert len(found) == 2
+    for columns, body in found:
+        assert [body.count(rule) for rule in (r"\toprule", r"\midrule", r"\bottomrule")] == [1, 1, 1]
+        assert r"\hline" not in body
+        rows = [line for line in body.splitlines() if line.endswith(r"\\") and "multicolumn" not in line]
+        assert len(rows) > 10
+        assert all(len(re.findall(r"(?<!\\)&", row)) == len(columns) - 1 for row in rows)
+    plain = latex.replace("% needs", "")
+    assert not re.search(r"(?<!\\)[%#]", plain)
+    assert not re.search(r"(?<!\\)_", re.sub(r"\\label\{[^}]*\}", "", plain))
+    assert plain.count("{") - plain.count(r"\{") == plain.count("}") - plain.count(r"\}")
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no TeX here (texlive-latex-recommended)")
+def test_latex_compiles(written, tmp_path):
+    kind, packages = r"\documentclass{article}", r"\usepackage{booktabs}"
+    body = (written / "tables/table.tex").read_text()
+    strange = formats.escape_latex("".join(formats._LATEX))
+    (tmp_path / "paper.tex").write_text(
+        "\n".join([kind, packages, r"\begin{document}", strange, body, r"\end{document}"])
+    )
+    command = ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "paper.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert (tmp_path / "paper.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_latex_escapes_what_it_would_read_as_a_command():
+    assert formats.escape_latex("50 % of a_b & {c} ~ \\x") == (
+        r"50 \% of a\_b \& \{c\} \textasciitilde{} \textbackslash{}x"
+    )
+
+
+def test_markdown_and_csv_hold_the_same_numbers(written, groups):
+    lines = (written / "tables/table.md").read_text().splitlines()
+    starts = [at for at, line in enumerate(lines) if line.startswith("| ---")]
+    assert len(starts) == 3  # beside the paper, success, without a result
+    for at in starts:
+        width = lines[at].count("|")
+        block = [line for line in lines[at:] if line.startswith("|")]
+        assert len(re.findall(r"(?<!\\)\|", lines[at - 1])) == width
+        assert len(re.findall(r"(?<!\\)\|", block[1])) == width
+    with open(written / "tables/table.csv", newline="") as file:
+        records = list(csv.DictReader(file))
+    assert len(records) == len(groups)
+    for record, item in zip(records, groups, strict=True):
+        assert int(record["episodes"]) == item.episodes
+        if item.episodes:
+            assert float(record["rate"]) == item.rate
+    with open(written / "tables/pairs.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == len(compare(groups))
+
+
+def test_text_in_a_heat_map_can_be_read():
+    def luminance(colour):
+        channels = [int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)]
+        linear = [c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    steps = [charts.heat(rate / 100) for rate in range(101)]
+    for back, front in steps:
+        light, dark = sorted((luminance(back), luminance(front)), reverse=True)
+        assert (light + 0.05) / (dark + 0.05) > 4.5
+    values = [luminance(back) for back, _ in steps]
+    assert all(a >= b for a, b in itertools.pairwise(values)), "lightness alone carries the value"
+
+
+def test_page_stands_alone(text):
+    assert_stands_alone(text)

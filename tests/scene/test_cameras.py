@@ -1,0 +1,139 @@
+"""Cameras of the scene: the published poses arrived, and the wrist cameras see what they are aimed at."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from surgicai_vision.core.config import SceneConfig
+from surgicai_vision.core.errors import UnknownName
+from surgicai_vision.core.names import ARMS, CAMERAS, FOLLOWING_CAMERAS, PARTS
+from surgicai_vision.scene import build_scene, kinematics
+from surgicai_vision.scene.cameras import (
+    FOLLOWED,
+    FOLLOWING_SPAN,
+    WORLD_CAMERAS,
+    add_wrist_camera,
+    extrinsics,
+    intrinsics,
+    look_at,
+)
+from surgicai_vision.scene.rendering import FrameRenderer
+
+SIZE = (224, 224)
+
+
+def at_start(instrument: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The scene with both tools at their starts, the jaws open."""
+    model = build_scene(SceneConfig(instrument=instrument)).model
+    data = mujoco.MjData(model)
+    for arm in ARMS:
+        joints = kinematics.inverse(kinematics.start_in_base(arm), instrument)
+        for name, value in zip(kinematics.DVRK_JOINTS, joints, strict=True):
+            data.joint(f"{arm}_{name}").qpos = value
+        for side in ("left", "right"):
+            data.joint(f"{arm}_{side}_finger").qpos = 0.4
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+@pytest.fixture(scope="module", params=sorted(kinematics.INSTRUMENTS))
+def start(request):
+    return at_start(request.param)
+
+
+def test_the_scene_has_the_named_cameras(start):
+    model, _ = start
+    assert {model.camera(index).name for index in range(model.ncam)} == set(CAMERAS)
+    assert model.ncam == len(CAMERAS)
+
+
+@pytest.mark.parametrize("name", sorted(WORLD_CAMERAS))
+def test_world_cameras_stand_where_the_table_says(start, name):
+    model, data = start
+    pose, table = extrinsics(model, data, name), WORLD_CAMERAS[name]
+    assert np.allclose(pose[:3, 3], table.position, atol=1e-12)
+    assert np.allclose(pose[:3, 2], np.array(table.direction) / np.linalg.norm(table.direction), atol=1e-6)
+    assert -pose[:3, 1] @ table.up > 0.99
+    focal = intrinsics(model, name, 480, 640)[1, 1]
+    assert math.isclose(2 * math.atan(240 / focal), table.fovy, rel_tol=1e-9)
+
+
+def test_endoscopes_are_4_mm_apart_and_toed_in(start):
+    model, data = start
+    left, right = extrinsics(model, data, "front"), extrinsics(model, data, "front_right")
+    right_in_left = (np.linalg.inv(left) @ right)[:3, 3]
+    assert math.isclose(right_in_left[0], 0.004, abs_tol=2e-5)  # to the right, as OpenCV's x goes
+    assert math.isclose(math.degrees(math.acos(left[:3, 2] @ right[:3, 2])), 2 * 2.3, abs_tol=0.1)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_wrist_cameras_see_their_own_jaws(start, arm):
+    model, data = start
+    camera, part = f"wrist_{arm}", PARTS.index(arm)
+    grasp = np.array([*data.site(f"{arm}_grasp").xpos, 1.0])
+    grasp_in_camera = (np.linalg.inv(extrinsics(model, data, camera)) @ grasp)[:3]
+    pixel = (intrinsics(model, camera, *SIZE) @ grasp_in_camera / grasp_in_camera[2])[:2]
+    assert np.all(np.abs(pixel - 111.5) < 45)  # well inside the picture
+    pads = [data.geom(f"{arm}_{side}_pad").xpos for side in ("left", "right")]
+    with FrameRenderer(model, *SIZE) as renderer:
+        parts = renderer.render(data, camera, "segmentation")[..., 0]
+        depth = renderer.render(data, camera, "depth")[..., 0]
+    seen = 0
+    for pad in pads:
+        pad_in_camera = (np.linalg.inv(extrinsics(model, data, camera)) @ [*pad, 1.0])[:3]
+        u, v = np.rint((intrinsics(model, camera, *SIZE) @ pad_in_camera / pad_in_camera[2])[:2]).astype(int)
+        seen += parts[v, u] == part and abs(depth[v, u] - pad_in_camera[2]) < 0.003
+    assert seen >= 1  # one finger may hide the other
+
+
+@pytest.mark.parametrize("camera", FOLLOWING_CAMERAS)
+def test_following_cameras_see_the_jaws_in_their_middle_from_where_the_fixed_one_stands(start, camera):
+    model, data = start
+    base, arm = camera.split("_")
+    for move in (0.0, 0.3):
+        data.joint(f"{arm}_outer_yaw").qpos += move
+        mujoco.mj_forward(model, data)
+        pose = extrinsics(model, data, camera)
+        assert np.allclose(pose[:3, 3], WORLD_CAMERAS[base].position, atol=1e-12)
+        grasp = (np.linalg.inv(pose) @ [*data.site(f"{arm}_grasp").xpos, 1.0])[:3]
+        np.testing.assert_allclose(grasp[:2], 0.0, atol=1e-9)
+        assert grasp[2] > 0
+        assert -pose[2, 1] > 0.5  # the world's up is up in the picture
+        data.joint(f"{arm}_outer_yaw").qpos -= move
+    mujoco.mj_forward(model, data)
+
+
+def test_following_cameras_see_smaller_things_than_the_fixed_ones(start):
+    model, data = start
+    for camera in FOLLOWING_CAMERAS:
+        focal = intrinsics(model, camera, *SIZE)[0, 0]
+        assert focal > 1.9 * intrinsics(model, camera.split("_")[0], *SIZE)[0, 0]
+        distance = math.dist(extrinsics(model, data, camera)[:3, 3], FOLLOWED)
+        assert math.isclose(SIZE[0] * distance / focal, FOLLOWING_SPAN, rel_tol=1e-6)
+
+
+@pytest.mark.parametrize("camera", ["front", "front_right", "back"])
+def test_world_cameras_see_needle_phantom_and_both_arms(start, camera):
+    model, data = start
+    with FrameRenderer(model, *SIZE) as renderer:
+        parts = renderer.render(data, camera, "segmentation")
+    needle = int((parts == PARTS.index("needle")).sum())
+    assert needle >= 25
+    assert {PARTS.index(name) for name in ("phantom", *ARMS)} <= set(np.unique(parts))
+
+
+def test_look_at_is_a_rotation():
+    rotation = look_at((0.0, 3.0, -4.0), (0.0, 0.0, 1.0))
+    assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert math.isclose(np.linalg.det(rotation), 1.0, abs_tol=1e-12)
+    assert np.allclose(rotation[:, 2], (0.0, 0.6, -0.8), atol=1e-12)
+
+
+def test_wrong_names_are_refused(start):
+    model, data = start
+    with pytest.raises(UnknownName, match="Did you mean 'front'"):
+        extrinsics(model, data, "frnt")
+    with pytest.raises(UnknownName, match="world"):
+        add_wrist_camera(mujoco.MjSpec(), "psm1")

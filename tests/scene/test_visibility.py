@@ -1,0 +1,32 @@
+"""Visibility: at the end of a successful subtask both world views show the needle."""
+
+import pytest
+
+from surgicai_vision import envs
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.names import PARTS
+from surgicai_vision.demos.expert import Expert
+from surgicai_vision.scene.rendering import FrameRenderer
+
+SEEDS = range(8)
+PIXELS = 25
+"""Fewest needle pixels at 224 × 224."""
+
+
+@pytest.mark.parametrize("task", ["grasp", "place", "insert", "handoff"])
+def test_the_needle_is_seen_at_the_end(task):
+    env = envs.make(TaskConfig(task=task))
+    counts = {"front": [], "back": []}
+    with FrameRenderer(env.model, 224, 224) as renderer:
+        for seed in SEEDS:
+            env.reset(seed=seed)
+            expert, info, ended = Expert(env), {}, False
+            while not ended:
+                _, _, terminated, truncated, info = env.step(expert.action())
+                ended = terminated or truncated
+            assert info["is_success"]
+            for camera, seen in counts.items():
+                picture = renderer.render(env.data, camera, "segmentation")
+                seen.append(int((picture == PARTS.index("needle")).sum()))
+    for camera, seen in counts.items():
+        assert min(seen) >= PIXELS, (camera, seen)

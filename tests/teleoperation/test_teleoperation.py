@@ -1,0 +1,376 @@
+"""Teleoperation: scripted hands drive whole sessions; what they kept is demonstrations like any others."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from teleoperators import REST, SHORT, VIEWS, Script, Stand, Still, event, right
+
+from surgicai_vision.commands.main import main
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import BadFile, OutputExists, SurgicaiError
+from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_marker
+from surgicai_vision.teleoperation.inputs import DISCARD, KEEP, START, STOP, VIEW, Input
+from surgicai_vision.teleoperation.keyboard import TABLE, key_names, key_table
+from surgicai_vision.teleoperation.loop import drive
+from surgicai_vision.teleoperation.pacer import Pacer
+from surgicai_vision.teleoperation.recordings import open_recordings
+from surgicai_vision.teleoperation.session import DRIVING, JUDGED, STOPPED, WAITING, Rules, Session
+
+LONG = TaskConfig("grasp", max_steps=1500)
+
+
+# -- sessions ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def begin(tmp_path):
+    """Return a function that opens a session of the stand-in env on one folder."""
+    opened = []
+
+    def begin(config=SHORT, seed=None, **rules):
+        for before in opened:
+            before.__exit__(None, None, None)
+        opened[:] = [open_recordings(tmp_path / "demos", config, "f" * 64, seed)]
+        return Session(Stand(config), Still(), opened[0].__enter__(), VIEWS, Rules(**rules))
+
+    yield begin
+    for before in opened:
+        before.__exit__(None, None, None)
+
+
+def ticks(session, *inputs):
+    for given in inputs:
+        session.tick(given)
+    return session.status()
+
+
+def succeed(session):
+    """Drive to a success."""
+    session.tick(REST)
+    for _ in range(12):
+        if session.status().state == JUDGED:
+            break
+        session.tick(right())
+    return session.status()
+
+
+def test_keep_goes_on_to_the_next_start(begin, tmp_path):
+    session = begin()
+    status = succeed(session)
+    assert (status.state, status.success, status.kept) == (JUDGED, True, 0)
+    assert not list((tmp_path / "demos").iterdir()), "nothing is written before it is kept"
+    status = ticks(session, event(KEEP))
+    assert (status.state, status.kept, status.episode, status.seed) == (WAITING, 1, 1, 1)
+    (path,) = list_demos(tmp_path / "demos")
+    demo = read_demo(path)
+    assert (demo.source, demo.seed, demo.config) == ("teleoperate", 0, SHORT)
+    assert demo.success.tolist() == [False] * (len(demo) - 1) + [True]
+
+
+def test_discard_does_the_same_start_again(begin, tmp_path):
+    session = begin()
+    succeed(session)
+    status = ticks(session, event(DISCARD))
+    assert (status.state, status.seed, status.steps, status.discarded) == (WAITING, 0, 0, 1)
+    status = ticks(session, REST, right(), right(), event(DISCARD))
+    assert (status.state, status.seed, status.discarded) == (WAITING, 0, 2), "also in the middle"
+    assert ticks(session, event(DISCARD)).discarded == 2, "there is nothing to discard while waiting"
+    succeed(session)
+    ticks(session, event(KEEP))
+    assert read_demo(list_demos(tmp_path / "demos")[0]).seed == 0
+
+
+def test_a_start_is_given_up(begin, tmp_path):
+    session = begin()
+    assert ticks(session, event(KEEP)).seed == 1, "at once while waiting"
+    status = ticks(session, REST, right(), event(KEEP))
+    assert (status.state, status.success, status.seed) == (JUDGED, False, 1), "never without a word while driving"
+    assert ticks(session, event(KEEP)).seed == 2
+    assert [row["seed"] for row in read_marker(tmp_path / "demos")["skipped"]] == [0, 1]
+    assert not list((tmp_path / "demos").glob("episode*"))
+
+
+def test_time_ends_an_attempt_and_a_failure_is_not_kept(begin):
+    session = begin()
+    status = ticks(session, REST, event(START), *[REST] * 11)
+    assert (status.state, status.success, status.steps) == (JUDGED, False, 12)
+    assert "time is up" in status.message
+    assert ticks(session, event(KEEP)).kept == 0
+
+
+def test_failures_are_kept_on_request(begin, tmp_path):
+    session = begin(keep_failures=True)
+    assert ticks(session, REST, right(), right(), event(KEEP)).kept == 1
+    assert ticks(session, event(START), *[REST] * 11, event(KEEP)).kept == 2
+    demos = [read_demo(path) for path in list_demos(tmp_path / "demos")]
+    assert [(len(demo), demo.success.any()) for demo in demos] == [(2, False), (12, False)]
+
+
+def test_successes_are_kept_without_asking_on_request_and_counted(begin):
+    session = begin(auto_keep=True, episodes=2)
+    for _ in range(60):
+        if session.over:
+            break
+        ticks(session, REST, right())
+    status = session.status()
+    assert (status.state, status.kept) == (STOPPED, 2)
+    assert ticks(session, right(), event(KEEP)).kept == 2, "after the end nothing happens"
+
+
+@pytest.mark.parametrize(("before", "kept", "discarded"), [("waiting", 0, 0), ("driving", 0, 1), ("judged", 1, 0)])
+def test_escape_stops_and_loses_no_success(begin, before, kept, discarded):
+    session = begin()
+    if before == "driving":
+        ticks(session, REST, right())
+    elif before == "judged":
+        succeed(session)
+    status = ticks(session, Input(events=(STOP, DISCARD)))
+    assert session.over
+    assert (status.kept, status.discarded) == (kept, discarded)
+
+
+def test_a_key_still_held_does_not_begin_the_next_episode(begin):
+    session = begin()
+    succeed(session)
+    status = ticks(session, Input((1, 0, 0), events=(KEEP,)), *[right()] * 5)
+    assert (status.state, status.steps) == (WAITING, 0)
+    assert ticks(session, REST, right()).state == DRIVING
+
+
+def test_pauses_are_recorded_unless_told_otherwise(begin):
+    assert ticks(begin(), REST, right(), REST, REST, right()).steps == 4
+    assert ticks(begin(skip_idle=True), REST, right(), REST, REST, right()).steps == 2
+
+
+def test_the_next_view_leads(begin):
+    session = begin()
+    seen = [session.view] + [ticks(session, event(VIEW)).view for _ in range(2)]
+    assert seen == ["front", "back", "front"]
+
+
+def test_an_episode_that_diverged_is_never_kept(begin):
+    session = begin(keep_failures=True)
+    step = session.env.step
+    session.env.step = lambda action: (*step(action)[:2], True, False, {**step(action)[4], "physics_error": True})
+    assert "physics error" in ticks(session, REST, right()).message
+    assert ticks(session, event(KEEP)).kept == 0
+
+
+# -- recordings -------------------------------------------------------------------------------------------------------
+
+
+def keep_one(session):
+    assert succeed(session).success
+    session.tick(event(KEEP))
+
+
+def test_the_same_folder_goes_on_with_numbers_and_seeds(begin, tmp_path):
+    session = begin(seed=7)
+    keep_one(session)
+    ticks(session, event(KEEP))  # seed 8 is given up
+    session = begin()
+    assert (session.status().seed, session.status().episode) == (9, 1)
+    keep_one(session)
+    assert [read_demo(path).seed for path in list_demos(tmp_path / "demos")] == [7, 9]
+    assert read_marker(tmp_path / "demos")["seeds"] == [7, 9]
+
+
+def test_an_episode_whose_entry_a_kill_prevented_counts(begin, tmp_path):
+    session = begin()
+    keep_one(session)
+    marker = (tmp_path / "demos" / "demos.json").read_bytes()
+    keep_one(session)
+    (tmp_path / "demos" / "demos.json").write_bytes(marker)
+    (tmp_path / "demos" / ".partial-1-episode_000002.safetensors").write_bytes(b"half")
+    session = begin()
+    assert (session.status().seed, session.status().episode) == (2, 2)
+    keep_one(session)
+    assert len(list_demos(tmp_path / "demos")) == 3
+    assert not list((tmp_path / "demos").glob(".partial*"))
+
+
+def test_a_folder_is_one_sessions_at_a_time(begin, tmp_path):
+    keep_one(begin())
+    with pytest.raises(SurgicaiError, match="another session"), open_recordings(tmp_path / "demos", SHORT, "f" * 64):
+        pass
+
+
+def test_another_task_scene_or_seed_is_refused(tmp_path):
+    with open_recordings(tmp_path / "demos", SHORT, "f" * 64) as recordings:
+        recordings.skip(0, "given up")
+    for config, scene, seed in ((LONG, "f", None), (SHORT, "e", None), (SHORT, "f", 3)):
+        with pytest.raises(OutputExists), open_recordings(tmp_path / "demos", config, scene * 64, seed):
+            pass
+    write_marker(tmp_path / "demos", "grasp", "teleoperate", request=read_marker(tmp_path / "demos")["request"])
+    with (
+        pytest.raises(BadFile, match="does not say which seeds"),
+        open_recordings(tmp_path / "demos", SHORT, "f" * 64),
+    ):
+        pass
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "thesis.txt").write_text("mine")
+    with (
+        pytest.raises(OutputExists, match="already holds files"),
+        open_recordings(tmp_path / "notes", SHORT, "f" * 64),
+    ):
+        pass
+
+
+def test_a_session_without_a_result_leaves_no_folder(tmp_path):
+    with open_recordings(tmp_path / "demos", SHORT, "f" * 64):
+        assert (tmp_path / "demos").is_dir()
+    assert not (tmp_path / "demos").exists()
+
+
+# -- the loop ---------------------------------------------------------------------------------------------------------
+
+
+class Clock:
+    """Time that passes when told."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+    def sleep(self, seconds):
+        assert seconds > 0
+        self.now += seconds
+
+
+class Canvas:
+    """A screen that wants every picture; each costs `cost` seconds."""
+
+    closed = False
+
+    def __init__(self, clock, cost):
+        self.clock, self.cost, self.shown = clock, cost, []
+
+    def wants(self):
+        return True
+
+    def show(self, pictures, status):
+        self.shown.append(status)
+
+    def look(self):
+        self.clock.now += self.cost
+        return {}
+
+
+def run_loop(session, cost, inputs, pace=1.0):
+    clock = Clock()
+    canvas = Canvas(clock, cost)
+    heard = []
+    drive(session, Script(*inputs), canvas, canvas, Pacer(pace, clock, clock.sleep), heard.append)
+    return clock.now, canvas.shown, heard
+
+
+@pytest.mark.parametrize(("cost", "pictures"), [(0.001, 102), (0.03, 68), (0.09, 22)])
+def test_a_slow_screen_loses_pictures_and_no_ticks(begin, cost, pictures):
+    config = TaskConfig("grasp", max_steps=1000)
+    inputs = [REST, event(START), *[right(1e-6)] * 99, event(STOP)]
+    session = begin(config, keep_failures=True)
+    seconds, shown, _ = run_loop(session, cost, inputs)
+    assert shown[-1].steps == 100, "a step a tick, whatever is drawn"
+    assert len(shown) == pytest.approx(pictures, abs=3)
+    assert seconds == pytest.approx(102 / 50, abs=0.15), "in real time all the same"
+
+
+def test_pace_slows_the_clock_and_not_the_world(begin):
+    inputs = [REST, event(START), *[right(1e-6)] * 8, event(STOP)]
+    times = {pace: run_loop(begin(), 0.0, inputs, pace)[0] for pace in (1.0, 0.5)}
+    assert times[0.5] == pytest.approx(2 * times[1.0])
+
+
+def test_what_happened_is_heard_once(begin):
+    _, _, heard = run_loop(begin(), 0.0, [REST, *[right()] * 9, event(KEEP), REST, REST, event(STOP)])
+    messages = [status.message for status in heard]
+    assert len(messages) == len(set(messages))
+    assert any(message.startswith("Kept as episode 0") for message in messages)
+
+
+def test_a_closed_screen_ends_the_loop(begin):
+    session, clock = begin(), Clock()
+    canvas = Canvas(clock, 0.0)
+    canvas.closed = True
+    drive(session, Script(), canvas, canvas, Pacer(1.0, clock, clock.sleep))
+    assert not session.over
+
+
+# -- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--veiw", "front"], "Did you mean '--view'?"),
+        (["--view", "frnt"], "Did you mean 'front'?"),
+        (["--view", ""], "--view is empty"),
+        (["--frame", "cam"], "Did you mean 'camera'?"),
+        (["--speed", "2"], "--speed is 2.0; it must be above 0 and at most 1"),
+        (["--seconds", "nan"], "--seconds is nan"),
+        (["--port", "8000"], "give --web with it"),
+        (["--port", "99999", "--web"], "--port is 99999"),
+        (["--episodes", "0"], "at least 1"),
+        (["--out", "/proc/x"], "cannot be written"),
+    ],
+)
+def test_wrong_input_is_one_line(arguments, said, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["teleoperate", *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_help_and_documentation_have_the_key_table(root, capsys):
+    assert main(["teleoperate", "--help"]) == 0
+    assert key_table() in capsys.readouterr().out
+    text = (root / "docs" / "teleoperation.md").read_text()
+    for row in TABLE:
+        keys = " ".join(f"<kbd>{name}</kbd>" for name in key_names(row))
+        assert f"| {keys} | {row.gamepad} | {row.meaning} |" in text
+
+
+# -- the process ------------------------------------------------------------------------------------------------------
+
+ENDLESS = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from teleoperators import REST, SHORT, VIEWS, Stand, Still, right
+from surgicai_vision.teleoperation.recordings import open_recordings
+from surgicai_vision.teleoperation.session import Rules, Session
+with open_recordings(Path(sys.argv[2]), SHORT, "f" * 64) as recordings:
+    session = Session(Stand(SHORT), Still(), recordings, VIEWS, Rules(auto_keep=True))
+    while True:
+        for _ in range(12):
+            session.tick(right() if session.status().steps else REST)
+            session.tick(right())
+        print(session.kept, flush=True)
+"""
+
+
+def test_a_killed_process_leaves_whole_episodes_and_the_next_goes_on(begin, root, tmp_path):
+    for enough in (3, 6):
+        command = [sys.executable, "-c", ENDLESS, str(root / "tests" / "helpers"), str(tmp_path / "demos")]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        for line in process.stdout:
+            if int(line) >= 3:
+                break
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+        demos = [read_demo(path) for path in list_demos(tmp_path / "demos")]
+        assert len(demos) >= enough
+        assert all(demo.success[-1] for demo in demos)
+        seeds = [demo.seed for demo in demos]
+        assert len(set(seeds)) == len(seeds), "no start twice"
+    session = begin()
+    assert session.status().episode == len(demos)
+    assert session.status().seed > max(seeds)
+    assert json.loads((tmp_path / "demos" / "demos.json").read_text())["source"] == "teleoperate"

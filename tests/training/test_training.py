@@ -1,0 +1,296 @@
+"""Training: from the cache to a checkpoint that is read back or refused."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from fake_dataset import DIM, FakeDataset, features_of
+
+from policies.base import Recipe
+from policies.bc import BC, BCPolicy
+from policies.layers import MapConvolutions, SpatialSoftmax
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
+from surgicai_vision.dataset.stride import thinned
+from surgicai_vision.training.checkpoint import CARD, WEIGHTS, check_encoder, check_task, read_checkpoint
+from surgicai_vision.training.data import split
+from surgicai_vision.training.policies import load_policy, load_recipe, recipe_names
+from surgicai_vision.training.train import train
+
+QUICK = Recipe(hidden=(32,), epochs=12, batch_size=32, learning_rate=1e-2)
+
+
+def tensors_of(folder: Path) -> bytes:
+    return (folder / WEIGHTS).read_bytes()
+
+
+def test_paper_recipe_is_the_paper() -> None:
+    assert load_recipe("bc", "paper") == Recipe()
+    assert Recipe().hidden == (256, 256, 256) and Recipe().learning_rate == 1e-3
+    assert Recipe().epochs == 30 and Recipe().batch_size == 256 and Recipe().batch_norm
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_every_recipe_loads(name: str) -> None:
+    assert isinstance(load_recipe("bc", name), Recipe)
+
+
+def test_recipes_refuse_unknown_keys_and_values(tmp_path: Path) -> None:
+    with pytest.raises(UnknownName, match="learning_rate"):
+        load_recipe("bc", "paper", {"learnin_rate": 1.0})
+    with pytest.raises(UnknownName, match="paper"):
+        load_recipe("bc", "papre")
+    with pytest.raises(InputError, match="epochs"):
+        load_recipe("bc", "paper", {"epochs": 0})
+    (tmp_path / "bad.yaml").write_text("[")
+    with pytest.raises(BadFile):
+        load_recipe("bc", tmp_path / "bad.yaml")
+
+
+def test_network_is_three_layers_each_preceded_by_batch_norm() -> None:
+    kinds = [type(layer).__name__ for layer in BC.make(Recipe(), ((2048,),)).network.layers]
+    assert kinds == ["BatchNorm1d", "Linear", "ReLU"] * 3 + ["Linear"]
+
+
+def test_split_is_by_episode() -> None:
+    index = np.repeat(np.arange(20), 7)
+    rows, held, episodes = split(index, Recipe(), seed=3)
+    assert len(episodes) == 2 and set(index[held]) == set(episodes)
+    assert not set(index[rows]) & set(index[held])
+    assert sorted([*rows, *held]) == list(range(len(index)))
+    again = split(index, Recipe(), seed=3)[2]
+    assert again == episodes and split(index, Recipe(), seed=4)[2] != episodes
+
+
+def test_training_learns_and_reads_back(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    checkpoint = train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "a")
+    assert checkpoint.train_losses[-1] < 0.5 * checkpoint.train_losses[0]
+    assert len(checkpoint.validation_losses) == QUICK.epochs == checkpoint.epoch
+    assert read_checkpoint(tmp_path / "a") == checkpoint
+    policy = load_policy(tmp_path / "a")
+    rows, state = dataset.rows[:9].astype(np.float32), dataset.columns()[names.STATE][:9]
+    action = policy.act(rows, state)
+    assert action.shape == (9, 7) and action.dtype == np.float32 and np.abs(action).max() <= 1
+    assert np.array_equal(action, load_policy(tmp_path / "a").act(rows, state))
+    alone = np.concatenate([policy.act(rows[i : i + 1], state[i : i + 1]) for i in range(9)])
+    assert np.array_equal(action, alone), "an action depends on the batch it was asked in"
+
+
+def test_statistics_are_those_of_the_training_frames(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "a")
+    policy = load_policy(tmp_path / "a")
+    rows, _, _ = split(dataset.episode_index, QUICK, 0)
+    inputs = np.concatenate([dataset.rows.astype(np.float32), dataset.columns()[names.STATE]], axis=1)[rows]
+    np.testing.assert_allclose(policy.input_mean, inputs.mean(0), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(policy.input_std, inputs.std(0), rtol=1e-4)
+
+
+def test_a_maps_statistics_are_its_channels(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    entry = features_of(dataset, shape=[3, 2, 2])
+    checkpoint = train(dataset, [entry], BC, QUICK, out=tmp_path / "map")
+    index = np.asarray(dataset.episode_index)
+    rows = entry.rows[~np.isin(index, checkpoint.validation_episodes)].astype(np.float64).reshape(-1, 3, 4)
+    policy = load_policy(tmp_path / "map")
+    np.testing.assert_allclose(policy.input_mean[:12].view(3, 4), rows.mean((0, 2))[:, None].repeat(4, 1), rtol=1e-4)
+    np.testing.assert_allclose(policy.input_std[:12].view(3, 4), rows.std((0, 2))[:, None].repeat(4, 1), rtol=1e-4)
+
+
+def test_same_seed_same_weights_other_seed_others(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        torch.manual_seed(hash(name) % 1000)  # the caller's random state must not matter
+        train(dataset, [features_of(dataset)], BC, QUICK, seed=seed, out=tmp_path / name)
+    assert tensors_of(tmp_path / "a") == tensors_of(tmp_path / "b") != tensors_of(tmp_path / "c")
+
+
+def test_training_leaves_the_callers_random_state(tmp_path: Path) -> None:
+    before = torch.get_rng_state()
+    dataset = FakeDataset()
+    train(dataset, [], BC, QUICK, out=tmp_path / "a")
+    assert torch.equal(before, torch.get_rng_state())
+
+
+@pytest.mark.parametrize("changes", [{}, {"schedule": "one_cycle", "weight_decay": 1e-3}])
+def test_broken_off_training_resumes_to_the_same_weights(tmp_path: Path, changes: dict[str, Any]) -> None:
+    recipe = replace(QUICK, **changes)
+    dataset = FakeDataset()
+
+    def stop(done: int, total: int) -> None:
+        if done == 7:
+            raise KeyboardInterrupt
+
+    train(dataset, [features_of(dataset)], BC, recipe, out=tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, [features_of(dataset)], BC, recipe, out=tmp_path / "broken", progress=stop)
+    with pytest.raises(BadFile, match="has not ended"):
+        read_checkpoint(tmp_path / "broken")
+    seen: list[int] = []
+    train(dataset, [features_of(dataset)], BC, recipe, out=tmp_path / "broken", progress=lambda d, t: seen.append(d))
+    assert seen[0] == 5 and seen[-1] == recipe.epochs
+    assert tensors_of(tmp_path / "whole") == tensors_of(tmp_path / "broken")
+    assert not (tmp_path / "broken" / "training_state.pt").exists()
+
+
+def test_training_again_does_nothing_and_another_request_is_refused(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    first = train(dataset, [], BC, QUICK, out=tmp_path / "a")
+    assert train(dataset, [], BC, QUICK, out=tmp_path / "a", progress=lambda d, t: pytest.fail("trained")) == first
+    with pytest.raises(OutputExists):
+        train(dataset, [], BC, QUICK, seed=1, out=tmp_path / "a")
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.tex").write_text("x")
+    with pytest.raises(OutputExists):
+        train(dataset, [], BC, QUICK, out=tmp_path / "foreign")
+
+
+def test_proprioception_alone_and_several_views(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    state = dataset.columns()[names.STATE][:4]
+    train(dataset, [], BC, QUICK, out=tmp_path / "none")
+    assert load_policy(tmp_path / "none").act(None, state).shape == (4, 7)
+    views = [features_of(dataset, "front"), features_of(dataset, "back")]
+    checkpoint = train(dataset, views, BC, QUICK, out=tmp_path / "two")
+    assert checkpoint.views == ("front", "back") and checkpoint.visual == ((DIM,), (DIM,))
+    both = np.tile(dataset.rows[:4].astype(np.float32), 2)
+    assert load_policy(tmp_path / "two").act(both, state).shape == (4, 7)
+
+
+@pytest.mark.parametrize(("shape", "width"), [([3, 2, 2], 64), ([4, 3], 3), ([12], 12)])
+def test_maps_and_tokens_pass_a_trained_layer(tmp_path: Path, shape: list[int], width: int) -> None:
+    dataset = FakeDataset()
+    checkpoint = train(dataset, [features_of(dataset, shape=shape)], BC, QUICK, out=tmp_path / "a")
+    policy = load_policy(tmp_path / "a")
+    assert checkpoint.visual == (tuple(shape),) and policy.network.heads[0].dim == width
+    state = dataset.columns()[names.STATE][:4]
+    assert policy.act(dataset.rows[:4].astype(np.float32), state).shape == (4, 7)
+
+
+def test_spatial_softmax_finds_the_bright_place() -> None:
+    head = SpatialSoftmax(1, 5, 5)
+    torch.nn.init.constant_(head.patterns.weight, 50.0)
+    picture = torch.zeros(1, 1, 5, 5)
+    picture[0, 0, 4, 0] = 1.0
+    np.testing.assert_allclose(head(picture.flatten(1)).detach()[0, :2], [-1, 1], atol=1e-5)
+
+
+def test_convolutions_read_where_an_arc_lies_after_little_training() -> None:
+    torch.manual_seed(0)
+    head = torch.nn.Sequential(MapConvolutions(1, 28, 28), torch.nn.Linear(MapConvolutions.FEATURES, 2))
+    places = torch.randint(4, 24, (600, 2))
+    maps = torch.zeros(600, 28, 28)
+    for index, (y, x) in enumerate(places.tolist()):
+        maps[index, y - 3 : y + 4, x] = maps[index, y, x - 3 : x + 1] = 1.0
+    rows, wanted = maps.flatten(1), places.float() / 14 - 1
+    optimiser = torch.optim.Adam(head.parameters(), 1e-3)
+    for _ in range(150):
+        batch = torch.randint(500, (64,))
+        optimiser.zero_grad()
+        torch.nn.functional.mse_loss(head(rows[batch]), wanted[batch]).backward()
+        optimiser.step()
+    with torch.no_grad():
+        error = (head(rows[500:]) - wanted[500:]).abs().mean() * 14
+    assert error < 1.0, "in places of the map; a guess errs by 5"
+
+
+def test_recipes_name_how_maps_are_taken_in_and_how_many_frames() -> None:
+    best = load_recipe("bc", "best")
+    assert BC.make(best, ((40, 28, 28),)).network.heads[0].dim == MapConvolutions.FEATURES  # type: ignore[attr-defined]
+    with pytest.raises(UnknownName, match="convolutions"):
+        Recipe(map_head="convolution")
+    with pytest.raises(InputError, match="every is 0"):
+        Recipe(every=0)
+
+
+def test_thinned_labels_of_a_policy_that_looks_ahead_stay_at_their_time(tmp_path: Path) -> None:
+    """A target ten frames ahead is five frames ahead of every second frame."""
+    seen = []
+
+    class Watched(BCPolicy):
+        def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+            seen.append(torch.cat([observed[:, :1] * self.input_std[0] + self.input_mean[0], target[:, :1]], dim=1))
+            return super().loss(observed, target)
+
+    dataset = FakeDataset(episodes=2, steps=40)
+    number = np.tile(np.arange(40, dtype=np.float32), 2)[:, None].repeat(7, 1)
+    dataset._columns = {names.STATE: number, names.ACTION: number / 100}
+    plugin = replace(BC, make=lambda recipe, visual: Watched(recipe, visual), ahead=10)
+    recipe = replace(QUICK, every=2, validation=0.0, epochs=1)
+    train(thinned(dataset, 2), [], plugin, recipe, out=tmp_path / "a")
+    state, target = torch.cat(seen).T
+    torch.testing.assert_close(target * 100, state.round().add(10).clamp(max=38), atol=1e-3, rtol=0)
+
+
+def test_epoch_checkpoints_and_fine_tuning(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    train(dataset, [], BC, QUICK, out=tmp_path / "a", save_every=5)
+    kept = sorted(path.name for path in (tmp_path / "a" / "epochs").iterdir())
+    assert kept == ["epoch_0005", "epoch_0010"]
+    early = load_policy(tmp_path / "a" / "epochs" / "epoch_0005")
+    assert early.checkpoint.epoch == 5
+    tuned = train(dataset, [], BC, QUICK, out=tmp_path / "b", start=load_policy(tmp_path / "a"))
+    assert tuned.train_losses[0] < read_checkpoint(tmp_path / "a").train_losses[0]
+
+
+def test_wrong_inputs_are_refused(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    with pytest.raises(InputError, match="another dataset"):
+        train(dataset, [features_of(dataset, dataset="other")], BC, QUICK, out=tmp_path / "a")
+    mixed = [features_of(dataset), features_of(dataset, "front", encoder_fingerprint="g")]
+    with pytest.raises(InputError, match="several encoders"):
+        train(dataset, mixed, BC, QUICK, out=tmp_path / "a")
+    with pytest.raises(InputError, match="blind"):
+        BC.make(Recipe(proprioception=False), ())
+    assert not (tmp_path / "a").exists()
+    dataset.columns()[names.ACTION][3] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        train(dataset, [], BC, QUICK, out=tmp_path / "a")
+
+
+def test_policy_refuses_wrong_observations(tmp_path: Path) -> None:
+    policy = BC.make(QUICK, ((DIM,),))
+    policy.eval()
+    good, state = np.zeros((2, DIM), np.float32), np.zeros((2, 7), np.float32)
+    for features, pose in ((None, state), (good[:, 1:], state), (good, state[:1]), (good, state[:, 1:])):
+        with pytest.raises(InputError):
+            policy.act(features, pose)
+    with pytest.raises(InputError, match="not finite"):
+        policy.act(good * np.nan, state)
+
+
+def test_tampered_checkpoints_are_refused(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    folder = tmp_path / "a"
+    train(dataset, [], BC, QUICK, out=folder)
+    card, weights = (folder / CARD).read_text(), tensors_of(folder)
+    (folder / WEIGHTS).write_bytes(weights[:-4] + b"abcd")
+    with pytest.raises(BadFile, match="sha256"):
+        load_policy(folder)
+    (folder / WEIGHTS).unlink()
+    with pytest.raises(BadFile, match="Cannot read"):
+        load_policy(folder)
+    (folder / WEIGHTS).write_bytes(weights)
+    for change in ({"seed": 5}, {"format": 99}):
+        (folder / CARD).write_text(json.dumps({**json.loads(card), **change}))
+        with pytest.raises(BadFile):
+            load_policy(folder)
+    (folder / CARD).write_text(card[:50])
+    with pytest.raises(BadFile, match="JSON"):
+        load_policy(folder)
+    with pytest.raises(BadFile, match="not a checkpoint"):
+        load_policy(tmp_path)
+
+
+def test_another_encoder_or_task_is_refused(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+    checkpoint = train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "a")
+    with pytest.raises(InputError, match="needs encoder 'fake'"):
+        check_encoder(checkpoint, None)
+    with pytest.raises(InputError, match="not 'place'"):
+        check_task(checkpoint, "place")
