@@ -1,11 +1,12 @@
-"""Measure random reads of the feature cache: rows of 2,048 float16 values, in random order, as training takes them.
+"""Measure random reads of the feature cache: rows of 2,048 float16 values, in random order, as
+training takes them.
 
     python benchmarks/cache.py --json
 
-An entry is written by `surgicai_vision.features.cache.encode` itself, with an encoder that costs nothing. Each repetition
-reads batches of 256 rows drawn at random from all of them: as they lie (`float16`), and cast to float32 as `training`
-does. The pages are in memory, as they are from the second epoch on. Every batch is checked to hold the rows asked
-for. Prints one JSON line.
+An entry is written by `surgicai_vision.features.cache.encode` itself, with an encoder that costs
+nothing. Each repetition reads batches of 256 rows drawn at random from all of them: as they lie
+(`float16`), and cast to float32 as `training` does. The pages are in memory, as they are from the
+second epoch on. Every batch is checked to hold the rows asked for. Prints one JSON line.
 """
 
 import argparse
@@ -47,7 +48,9 @@ class Filler:
         return np.repeat(frames[:, 0, 0, :1] % 2048, DIM, axis=1).astype(np.float32)
 
 
-def read(rows: np.ndarray, count: int, batch: int, kind: type, generator: np.random.Generator) -> float:
+def read(
+    rows: np.ndarray, count: int, batch: int, kind: type, generator: np.random.Generator
+) -> float:
     """Read `count` rows at random; return rows/s."""
     order = generator.integers(0, len(rows), (count // batch, batch))
     began = time.perf_counter()
@@ -61,12 +64,16 @@ def read(rows: np.ndarray, count: int, batch: int, kind: type, generator: np.ran
 
 def main() -> None:
     """Write an entry, read it and print the speeds."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rows", type=int, default=50_000, help="rows of the entry: 4 KiB each")
     parser.add_argument("--read", type=int, default=200_000, help="rows read in each repetition")
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the output is always JSON")
+    parser.add_argument(
+        "--json", action="store_true", help="accepted for symmetry; the output is always JSON"
+    )
     arguments = parser.parse_args()
     generator = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
@@ -75,7 +82,9 @@ def main() -> None:
         rates: dict[str, list[float]] = {name: [] for name in kinds}
         for _ in range(arguments.repeats):
             for name, kind in kinds.items():
-                rates[name].append(read(entry.rows, arguments.read, arguments.batch, kind, generator))
+                rates[name].append(
+                    read(entry.rows, arguments.read, arguments.batch, kind, generator)
+                )
     row = {
         "rows": arguments.rows,
         "dim": DIM,

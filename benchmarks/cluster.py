@@ -1,10 +1,12 @@
-"""Render on a Ray cluster of two nodes while its workers are killed and a node is lost; compare with a quiet run.
+"""Render on a Ray cluster of two nodes while its workers are killed and a node is lost; compare
+with a quiet run.
 
     python benchmarks/cluster.py --kills 10 --losses 1 --json
 
-Both nodes run on this machine's loopback and share its disk. The kills are spread over the episodes; a lost node comes
-back. Prints one JSON object last: whether the dataset is identical (digest and file fingerprint) and how many of its
-episodes stand in it twice. Exits with 1 unless it is and none does.
+Both nodes run on this machine's loopback and share its disk. The kills are spread over the
+episodes; a lost node comes back. Prints one JSON object last: whether the dataset is identical
+(digest and file fingerprint) and how many of its episodes stand in it twice. Exits with 1 unless it
+is and none does.
 """
 
 import argparse
@@ -62,7 +64,9 @@ def two_nodes() -> Iterator[TwoNodes]:
 
 
 def busy_workers() -> list[int]:
-    """Return the processes in which Ray runs a task of the executor now: Ray gives them its name."""
+    """Return the processes in which Ray runs a task of the executor now: Ray gives them its
+    name.
+    """
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
@@ -97,7 +101,9 @@ def kill_one(workers: list[int], moments: random.Random) -> bool:
     return True
 
 
-def spread(events: list[Callable[[], bool]], total: int, moments: random.Random) -> list[tuple[int, Callable]]:
+def spread(
+    events: list[Callable[[], bool]], total: int, moments: random.Random
+) -> list[tuple[int, Callable]]:
     """Return each event with the number of finished jobs at which it is due, in order."""
     due = sorted(moments.sample(range(total), min(total, len(events))))
     return list(zip(due, moments.sample(events, len(events)), strict=False))
@@ -105,12 +111,16 @@ def spread(events: list[Callable[[], bool]], total: int, moments: random.Random)
 
 def main() -> int:
     """Run the quiet and the disturbed rendering; exit 1 unless the datasets are identical."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--losses", type=int, default=1)
     parser.add_argument("--episodes", type=int, default=24)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the last line is always JSON")
+    parser.add_argument(
+        "--json", action="store_true", help="accepted for symmetry; the last line is always JSON"
+    )
     arguments = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
     root = Path(tempfile.mkdtemp(prefix="surgicai-vision-cluster-"))
@@ -132,7 +142,9 @@ def main() -> int:
             said["kills"] += done
             return done
 
-        events = spread([kill] * arguments.kills + [lose] * arguments.losses, arguments.episodes - 1, moments)
+        events = spread(
+            [kill] * arguments.kills + [lose] * arguments.losses, arguments.episodes - 1, moments
+        )
         began = time.monotonic()
         process = start(script, root / "demos", root / "disturbed", 2, cluster.address)
         while process.poll() is None:

@@ -1,4 +1,6 @@
-"""What the benchmarks share: workers, medians, and one JSON line that says where and with what it was measured."""
+"""What the benchmarks share: workers, medians, and one JSON line that says where and with what it
+was measured.
+"""
 
 import json
 import os
@@ -21,10 +23,14 @@ def emit(name: str, row: dict[str, Any], *, render: bool = False) -> None:
 
 
 def spread(function: Callable[[Job], Result], jobs: Iterable[Job], workers: int) -> list[Result]:
-    """Return the results of `function` over `jobs`, in order, from `workers` processes (0: this one)."""
+    """Return the results of `function` over `jobs`, in order, from `workers` processes (0: this
+    one).
+    """
     if workers < 1:
         return [function(job) for job in jobs]
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_settle_in) as pool:
+    with ProcessPoolExecutor(
+        workers, mp_context=get_context("spawn"), initializer=_settle_in
+    ) as pool:
         return list(pool.map(function, jobs))
 
 

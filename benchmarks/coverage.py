@@ -4,15 +4,17 @@
     python benchmarks/coverage.py --repeats 500
 
 clopper_pearson  exact, not sampled: the chance over all k of n, at rates from 0.01 to 0.99.
-bootstrap        3, 5 and 10 training seeds of 20 episodes. Each seed has its own success rate, drawn from the Beta
-                 distribution of mean p and correlation r of two episodes of one seed (r = 0.2: the seeds' rates
-                 scatter by 0.22 at p = 0.5, by 0.1 at 0.95), and its episodes are Bernoulli draws.
+bootstrap        3, 5 and 10 training seeds of 20 episodes. Each seed has its own success rate,
+drawn from the Beta
+                 distribution of mean p and correlation r of two episodes of one seed (r = 0.2: the
+                 seeds' rates scatter by 0.22 at p = 0.5, by 0.1 at 0.95), and its episodes are
+                 Bernoulli draws.
 lengths          the same for trajectory lengths: normal seeds, log-normal episodes.
 area             20 starts, five strengths: each start fails from a strength on that is its own.
 
-Beside `bootstrap` stands `percentile`, the plain hierarchical bootstrap of 5 seeds, to show what it would have
-covered. `worst` is the smallest coverage of a table, `held` whether none is below 95 % by more than three standard
-errors of the simulation.
+Beside `bootstrap` stands `percentile`, the plain hierarchical bootstrap of 5 seeds, to show what it
+would have covered. `worst` is the smallest coverage of a table, `held` whether none is below 95 %
+by more than three standard errors of the simulation.
 """
 
 import argparse
@@ -37,7 +39,9 @@ CORRELATIONS = (0.0, 0.05, 0.1, 0.2)
 SIZES = ((3, 20), (5, 20), (10, 20))
 PAPER = (5, 20)
 LENGTHS = 5
-"""Times as many repeats for lengths: few rows, and an interval that covers little more than it must."""
+"""Times as many repeats for lengths: few rows, and an interval that covers little more than it
+must.
+"""
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 Interval = tuple[float, float]
@@ -47,7 +51,9 @@ def exact_coverage(trials: int, rate: float) -> float:
     """Return the chance that Clopper and Pearson's interval holds the rate."""
     bounds = [clopper_pearson(k, trials) for k in range(trials + 1)]
     chances = binom.pmf(np.arange(trials + 1), trials, rate)
-    return float(sum(c for c, (low, high) in zip(chances, bounds, strict=True) if low <= rate <= high))
+    return float(
+        sum(c for c, (low, high) in zip(chances, bounds, strict=True) if low <= rate <= high)
+    )
 
 
 def draw_rates(rng: np.random.Generator, seeds: int, rate: float, correlation: float) -> np.ndarray:
@@ -71,12 +77,21 @@ def count(draws: Iterator[tuple[float, Interval]]) -> tuple[float, float]:
     """Return how often the interval held the truth, and its mean width."""
     held, width, total = 0, 0.0, 0
     for truth, (low, high) in draws:
-        held, width, total = held + (low - 1e-12 <= truth <= high + 1e-12), width + high - low, total + 1
+        held, width, total = (
+            held + (low - 1e-12 <= truth <= high + 1e-12),
+            width + high - low,
+            total + 1,
+        )
     return held / total, width / total
 
 
 def successes(
-    seeds: int, episodes: int, rate: float, correlation: float, repeats: int, interval: Callable[..., Interval]
+    seeds: int,
+    episodes: int,
+    rate: float,
+    correlation: float,
+    repeats: int,
+    interval: Callable[..., Interval],
 ) -> Iterator[tuple[float, Interval]]:
     """Draw evaluations of `seeds` policies and their intervals."""
     rng = np.random.default_rng((seeds, episodes, round(1000 * rate), round(1000 * correlation)))
@@ -97,19 +112,32 @@ def lengths(
 
 
 def areas(starts: int, spread: float, repeats: int) -> Iterator[tuple[float, Interval]]:
-    """Draw curves of successes and the intervals of their areas; a start fails from Beta(spread, spread) on."""
+    """Draw curves of successes and the intervals of their areas; a start fails from Beta(spread,
+    spread) on.
+    """
     rng = np.random.default_rng((starts, round(100 * spread)))
-    curves = [area_under_curve(STRENGTHS, np.array(STRENGTHS) < limit) for limit in rng.beta(spread, spread, 200_000)]
+    curves = [
+        area_under_curve(STRENGTHS, np.array(STRENGTHS) < limit)
+        for limit in rng.beta(spread, spread, 200_000)
+    ]
     truth = float(np.mean(curves))
     for _ in range(repeats):
-        yield truth, area_interval([curves[index] for index in rng.integers(len(curves), size=starts)])
+        yield (
+            truth,
+            area_interval([curves[index] for index in rng.integers(len(curves), size=starts)]),
+        )
 
 
 def table(rows: list[dict[str, Any]], repeats: int) -> dict[str, Any]:
     """Return the rows with their smallest coverage and the verdict."""
     worst = min(row["coverage"] for row in rows)
     allowance = 3 * math.sqrt(LEVEL * (1 - LEVEL) / repeats) if repeats else 1e-9
-    return {"worst": round(worst, 4), "held": worst >= LEVEL - allowance, "repeats": repeats, "rows": rows}
+    return {
+        "worst": round(worst, 4),
+        "held": worst >= LEVEL - allowance,
+        "repeats": repeats,
+        "rows": rows,
+    }
 
 
 def measure(repeats: int, resamples: int) -> dict[str, Any]:
@@ -120,7 +148,9 @@ def measure(repeats: int, resamples: int) -> dict[str, Any]:
         for p in range(1, 100)
     ]
     kinds: dict[str, Callable[..., Interval]] = {
-        "bootstrap": lambda values, rng: hierarchical_bootstrap(values.tolist(), rng, resamples=resamples),
+        "bootstrap": lambda values, rng: hierarchical_bootstrap(
+            values.tolist(), rng, resamples=resamples
+        ),
         "percentile": lambda values, rng: percentile(values, rng, resamples),
     }
     result = {"clopper_pearson": table(exact, 0)}
@@ -136,18 +166,32 @@ def measure(repeats: int, resamples: int) -> dict[str, Any]:
     rows = []
     for seeds, scatter in ((3, 0.0), (3, 10.0), (5, 0.0), (5, 3.0), (5, 10.0)):
         share, width = count(lengths(seeds, 20, scatter, LENGTHS * repeats, resamples))
-        rows.append({"seeds": seeds, "scatter_mm": scatter, "coverage": round(share, 4), "width": round(width, 1)})
+        rows.append(
+            {
+                "seeds": seeds,
+                "scatter_mm": scatter,
+                "coverage": round(share, 4),
+                "width": round(width, 1),
+            }
+        )
     result["lengths"] = table(rows, LENGTHS * repeats)
     shares = {spread: count(areas(20, spread, repeats)) for spread in (0.1, 0.3, 1.0, 5.0)}
-    rows = [{"spread": key, "coverage": round(c, 4), "width": round(w, 3)} for key, (c, w) in shares.items()]
+    rows = [
+        {"spread": key, "coverage": round(c, 4), "width": round(w, 3)}
+        for key, (c, w) in shares.items()
+    ]
     result["area"] = table(rows, repeats)
     return result
 
 
 def main() -> None:
     """Measure and print one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=2000, help="simulated evaluations of each row")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=2000, help="simulated evaluations of each row"
+    )
     parser.add_argument("--resamples", type=int, default=1000, help="of each bootstrap")
     chosen = parser.parse_args()
     emit("coverage", {"resamples": chosen.resamples, **measure(chosen.repeats, chosen.resamples)})

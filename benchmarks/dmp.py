@@ -1,11 +1,14 @@
-"""Count how often movement primitives learned from demonstrations succeed when executed, from starts not shown.
+"""Count how often movement primitives learned from demonstrations succeed when executed, from
+starts not shown.
 
-    python benchmarks/dmp.py                                             # taught by our expert, every subtask
-    python benchmarks/dmp.py --task insert --npz surgicai_insert_v2.npz  # taught by SurgicAI's recordings
+    python benchmarks/dmp.py                                             # taught by our expert,
+    every subtask python benchmarks/dmp.py --task insert --npz surgicai_insert_v2.npz  # taught by
+    SurgicAI's recordings
 
-Every start counts, none is drawn again. Prints one JSON object: per task the successes, the starts, the share with its
-95 % Clopper-Pearson interval, the median steps, and what was learned from (`bent`: demonstrations that were put onto
-the path through the holes; see `surgicai_vision/demos/dmp/fit.py`).
+Every start counts, none is drawn again. Prints one JSON object: per task the successes, the starts,
+the share with its 95 % Clopper-Pearson interval, the median steps, and what was learned from
+(`bent`: demonstrations that were put onto the path through the holes; see
+`surgicai_vision/demos/dmp/fit.py`).
 """
 
 import argparse
@@ -25,7 +28,7 @@ from surgicai_vision.demos.rollout import roll
 from surgicai_vision.demos.store import write_demo
 from surgicai_vision.evaluation.statistics import clopper_pearson
 
-TAUGHT = 0
+LEARNING = 0
 """Seed of the expert's first demonstration; the starts begin at `--seed`."""
 
 
@@ -33,7 +36,7 @@ def demonstrate(task: str, count: int, folder: Path) -> list[Path]:
     """Record the expert's first `count` successes."""
     env = envs.make(TaskConfig(task))
     paths: list[Path] = []
-    seed = TAUGHT
+    seed = LEARNING
     while len(paths) < count:
         rollout = roll(env, Expert(env), seed)
         if rollout.success:
@@ -63,13 +66,23 @@ def measure(task: str, demos: list[Path], episodes: int, seed: int, scaled: bool
 
 def main() -> None:
     """Teach, execute, count, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", help="one subtask; all of them without it")
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--seed", type=int, default=10_000)
     parser.add_argument("--demos-used", type=int, default=1)
-    parser.add_argument("--scaled", action="store_true", help="scale the shape with g - y0, axis by axis")
-    parser.add_argument("--npz", "--pickle", dest="recording", type=Path, help="a recording of SurgicAI (with --task)")
+    parser.add_argument(
+        "--scaled", action="store_true", help="scale the shape with g - y0, axis by axis"
+    )
+    parser.add_argument(
+        "--npz",
+        "--pickle",
+        dest="recording",
+        type=Path,
+        help="a recording of SurgicAI (with --task)",
+    )
     arguments = parser.parse_args()
     if arguments.recording and not arguments.task:
         parser.error("--npz and --pickle need --task: a recording does not say what it shows")
@@ -77,13 +90,24 @@ def main() -> None:
     for task in [arguments.task] if arguments.task else names.SUBTASKS:
         with tempfile.TemporaryDirectory() as folder:
             if arguments.recording:
-                demos = list(import_demos(arguments.recording, task=task, out=Path(folder) / "demos").paths)
+                demos = list(
+                    import_demos(arguments.recording, task=task, out=Path(folder) / "demos").paths
+                )
             else:
                 demos = demonstrate(task, arguments.demos_used, Path(folder))
             used = demos[: arguments.demos_used]
             tasks[task] = measure(task, used, arguments.episodes, arguments.seed, arguments.scaled)
     source = arguments.recording.name if arguments.recording else "expert"
-    print(json.dumps({"taught_by": source, "demos_used": arguments.demos_used, "scaled": arguments.scaled, **tasks}))
+    print(
+        json.dumps(
+            {
+                "taught_by": source,
+                "demos_used": arguments.demos_used,
+                "scaled": arguments.scaled,
+                **tasks,
+            }
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,15 @@
-"""Measure encoding speed: `Encoder` and the cached `encode` against a bare torch loop of the same network and batch.
+"""Measure encoding speed: `Encoder` and the cached `encode` against a bare torch loop of the same
+network and batch.
 
     python benchmarks/encode.py --json
     python benchmarks/encode.py --encoder random --frames 512 --repeats 3
 
-The bare loop is what one would write by hand: eval mode, bfloat16 where the processor multiplies it, channels_last,
-all cores, `inference_mode`; for each batch uint8 pictures are normalised, passed on and collected as float16. It runs
-with our own batch and with 16, and the faster one counts. `cached` is `surgicai_vision.features.cache.encode` into an empty
-cache; its frames come from memory, as the bare loop's do. `--dataset DIR` adds what decoding our pictures costs.
-The ways take turns within one process; the best of each counts. Prints one JSON line an encoder.
+The bare loop is what one would write by hand: eval mode, bfloat16 where the processor multiplies
+it, channels_last, all cores, `inference_mode`; for each batch uint8 images are normalised, passed
+on and collected as float16. It runs with our own batch and with 16, and the faster one counts.
+`cached` is `surgicai_vision.features.cache.encode` into an empty cache; its frames come from
+memory, as the bare loop's do. `--dataset DIR` adds what decoding our images costs. The ways take
+turns within one process; the best of each counts. Prints one JSON line an encoder.
 """
 
 import argparse
@@ -29,7 +31,9 @@ from surgicai_vision.features import encoders
 from surgicai_vision.features.cache import encode
 
 ENCODERS = ("imagenet-lite", "random", "imagenet")
-"""`random` is the ResNet-50 of `imagenet` without its weights, which make no difference to the speed."""
+"""`random` is the ResNet-50 of `imagenet` without its weights, which make no difference to the
+speed.
+"""
 
 
 class Memory:
@@ -52,17 +56,25 @@ def bare(name: str, weights: str | None) -> Callable[[np.ndarray, int], np.ndarr
     card, network = plugin.build(plugin.card, encoders.find_weights(name, weights))
     device = best_device()
     kind = best_dtype(device)
-    network = network.eval().requires_grad_(False).to(device, kind).to(memory_format=torch.channels_last)
+    network = (
+        network.eval().requires_grad_(False).to(device, kind).to(memory_format=torch.channels_last)
+    )
     low, high = card.input_range
-    mean, std = (torch.tensor(values, device=device)[:, None, None] for values in (card.mean, card.std))
+    mean, std = (
+        torch.tensor(values, device=device)[:, None, None] for values in (card.mean, card.std)
+    )
 
     @torch.inference_mode()
     def loop(frames: np.ndarray, batch: int) -> np.ndarray:
         rows = []
         for at in range(0, len(frames), batch):
-            pictures = torch.from_numpy(frames[at : at + batch]).to(device).permute(0, 3, 1, 2).float()
-            pictures = (pictures / 255 * (high - low) + low - mean) / std
-            rows.append(network(pictures.to(kind).contiguous(memory_format=torch.channels_last)).half().cpu())
+            images = (
+                torch.from_numpy(frames[at : at + batch]).to(device).permute(0, 3, 1, 2).float()
+            )
+            images = (images / 255 * (high - low) + low - mean) / std
+            rows.append(
+                network(images.to(kind).contiguous(memory_format=torch.channels_last)).half().cpu()
+            )
         return torch.cat(rows).numpy()
 
     return loop
@@ -74,7 +86,9 @@ def cached(source: Any, encoder: Any) -> int:
         return len(encode(source, source.views[0], encoder, Path(folder)).rows)
 
 
-def ways(name: str, weights: str | None, frames: np.ndarray, dataset: Any) -> dict[str, Callable[[], int]]:
+def ways(
+    name: str, weights: str | None, frames: np.ndarray, dataset: Any
+) -> dict[str, Callable[[], int]]:
     """Return what is timed, by name; each returns how many frames it encoded."""
     loop, encoder = bare(name, weights), encoders.load_encoder(name, weights)
     batch = CUDA_BATCH if torch.cuda.is_available() else BATCH
@@ -89,7 +103,9 @@ def ways(name: str, weights: str | None, frames: np.ndarray, dataset: Any) -> di
     return made | ({"cached_dataset": lambda: cached(dataset, encoder)} if dataset else {})
 
 
-def measure(name: str, weights: str | None, frames: np.ndarray, dataset: Any, repeats: int) -> dict[str, Any]:
+def measure(
+    name: str, weights: str | None, frames: np.ndarray, dataset: Any, repeats: int
+) -> dict[str, Any]:
     """Return the speeds of one encoder [frames/s]."""
     chosen = ways(name, weights, frames, dataset)
     rates: dict[str, list[float]] = {way: [] for way in chosen}
@@ -114,13 +130,19 @@ def measure(name: str, weights: str | None, frames: np.ndarray, dataset: Any, re
 
 def main() -> None:
     """Measure each encoder."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--encoder", help="one encoder", metavar="NAME")
     parser.add_argument("--weights", help="file with its weights", metavar="FILE")
-    parser.add_argument("--dataset", help="a dataset of ours, to encode from its pictures", metavar="DIR")
+    parser.add_argument(
+        "--dataset", help="a dataset of ours, to encode from its images", metavar="DIR"
+    )
     parser.add_argument("--frames", type=int, default=256)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the output is always JSON")
+    parser.add_argument(
+        "--json", action="store_true", help="accepted for symmetry; the output is always JSON"
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     frames = np.random.default_rng(0).integers(0, 256, (arguments.frames, 224, 224, 3), np.uint8)
@@ -129,7 +151,9 @@ def main() -> None:
         from surgicai_vision.dataset.reader import open_dataset
 
         dataset = open_dataset(Path(arguments.dataset))
-    names = [arguments.encoder] if arguments.encoder else [name for name in ENCODERS if at_hand(name)]
+    names = (
+        [arguments.encoder] if arguments.encoder else [name for name in ENCODERS if at_hand(name)]
+    )
     for name in names:
         emit("encode", measure(name, arguments.weights, frames, dataset, arguments.repeats))
 

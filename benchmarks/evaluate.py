@@ -1,16 +1,18 @@
-"""Measure closed-loop evaluation: what `evaluate` does by default against one env at a time in one process.
+"""Measure closed-loop evaluation: what `evaluate` does by default against one env at a time in one
+process.
 
     python benchmarks/evaluate.py
     python benchmarks/evaluate.py --episodes 8 --steps 40 --repeats 1
 
-The policy sees one view through imagenet-lite; its head is a fixed random matrix, so that no training is needed and
-every episode takes all its steps. One env at a time: one process, one slot (the encoder sees one frame). Default: a
-process for each core, eight slots in each (the encoder sees up to eight frames at once). Start-up of processes and the
-loading of the encoder count on both sides. Both must give the same row for every seed, and the same states.
+The policy sees one view through imagenet-lite; its head is a fixed random matrix, so that no
+training is needed and every episode takes all its steps. One env at a time: one process, one slot
+(the encoder sees one frame). Default: a process for each core, eight slots in each (the encoder
+sees up to eight frames at once). Start-up of processes and the loading of the encoder count on both
+sides. Both must give the same row for every seed, and the same states.
 
-A and B take turns; figures are medians over the turns, ratios medians of the turns' ratios. Beside the wall's time
-stands the CPU time of all processes over their number: what the wall would show if each had a core of its own. On a
-machine that others use too only the latter means something.
+A and B take turns; figures are medians over the turns, ratios medians of the turns' ratios. Beside
+the wall's time stands the CPU time of all processes over their number: what the wall would show if
+each had a core of its own. On a machine that others use too only the latter means something.
 """
 
 import argparse
@@ -52,9 +54,14 @@ def make_agent() -> Agent:
 
 
 def same(one: list[Episode], other: list[Episode]) -> int:
-    """Return how many episodes have the same row (NaN equals NaN) and the same states on both sides."""
+    """Return how many episodes have the same row (NaN equals NaN) and the same states on both
+    sides.
+    """
     pairs = zip(one, other, strict=True)
-    return sum(repr(a.row) == repr(b.row) and np.array_equal(a.film.states, b.film.states) for a, b in pairs)
+    return sum(
+        repr(a.row) == repr(b.row) and np.array_equal(a.film.states, b.film.states)
+        for a, b in pairs
+    )
 
 
 def cpu_time() -> float:
@@ -65,7 +72,10 @@ def cpu_time() -> float:
 
 def measure(episodes: int, steps: int, repeats: int) -> dict[str, Any]:
     """Time both and compare them row by row."""
-    config, seeds = TaskConfig("grasp", max_steps=steps), range(names.TEST_SEED, names.TEST_SEED + episodes)
+    config, seeds = (
+        TaskConfig("grasp", max_steps=steps),
+        range(names.TEST_SEED, names.TEST_SEED + episodes),
+    )
     kinds: tuple[dict[str, Any], ...] = ({"batch": 1, "workers": 1}, {})
     times: tuple[list[float], list[float]] = ([], [])
     cpu: tuple[list[float], list[float]] = ([], [])
@@ -96,7 +106,9 @@ def measure(episodes: int, steps: int, repeats: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and print one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--steps", type=int, default=200, help="of each episode")
     parser.add_argument("--repeats", type=int, default=3)

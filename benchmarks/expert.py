@@ -3,7 +3,8 @@
     python benchmarks/expert.py --task all --episodes 500
     python benchmarks/expert.py --task suture --episodes 200 --thread 10
 
-`all` are the five subtasks. Episodes whose physics diverged count as failures and are counted apart.
+`all` are the five subtasks. Episodes whose physics diverged count as failures and are counted
+apart.
 """
 
 import argparse
@@ -68,13 +69,17 @@ def table(config: TaskConfig, episodes: list[Episode]) -> dict[str, Any]:
         "interval_95": [round(low, 4), round(high, 4)],
         "physics_errors": sum(episode.physics_error for episode in episodes),
         "steps_median": median([episode.steps for episode in successes]) if successes else None,
-        "failed": [f"{episode.seed}: {episode.end}" for episode in episodes if not episode.success][:20],
+        "failed": [f"{episode.seed}: {episode.end}" for episode in episodes if not episode.success][
+            :20
+        ],
     }
 
 
 def main() -> None:
     """Play and print one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", choices=("all", *names.TASKS), default="all")
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--seed", type=int, default=names.TEST_SEED)
@@ -86,13 +91,19 @@ def main() -> None:
     parser.add_argument("--tolerance", default="paper")
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
-    scene = SceneConfig(layout=chosen.layout, hole_pair=chosen.hole_pair, thread=chosen.thread, grasp=chosen.grasp)
+    scene = SceneConfig(
+        layout=chosen.layout, hole_pair=chosen.hole_pair, thread=chosen.thread, grasp=chosen.grasp
+    )
     tasks = names.SUBTASKS if chosen.task == "all" else (chosen.task,)
     configs = [TaskConfig(task, scene, chosen.step, chosen.tolerance) for task in tasks]
-    jobs = [Job(config, seeds) for config in configs for seeds in chunks(chosen.seed, chosen.episodes)]
+    jobs = [
+        Job(config, seeds) for config in configs for seeds in chunks(chosen.seed, chosen.episodes)
+    ]
     done = list(zip(jobs, spread(play, jobs, chosen.workers), strict=True))
     rows = {
-        config.task: table(config, [episode for job, part in done if job.config == config for episode in part])
+        config.task: table(
+            config, [episode for job, part in done if job.config == config for episode in part]
+        )
         for config in configs
     }
     emit("expert", {"seed": chosen.seed, "scene": to_mapping(scene), "tasks": rows})

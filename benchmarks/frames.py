@@ -1,14 +1,17 @@
-"""Render many frames and compare every one with a live picture of its state: none dropped, black or misaligned.
+"""Render many frames and compare every one with a live image of its state: none dropped, black or
+misaligned.
 
     python benchmarks/frames.py --frames 10000 --workers 2 --json
 
-Demonstrations of every subtask are recorded until there are so many frames (a step seen by one view is a frame), and
-rendered by `render-demos`, two views with depth. Then, in this process, an environment of its own steps through each
-demonstration's executed actions from its seed, and what it sees live after each step is compared with the dataset's
-frame of that step, bit by bit: colours and depth. A frame is
+Demonstrations of every subtask are recorded until there are so many frames (a step seen by one view
+is a frame), and rendered by `render-demos`, two views with depth. Then, in this process, an
+environment of its own steps through each demonstration's executed actions from its seed, and what
+it sees live after each step is compared with the dataset's frame of that step, bit by bit: colours
+and depth. A frame is
  dropped     where the dataset has none for a step,
  black       where no pixel is above 8 of 255, or all are equal,
- misaligned  where it is not the live picture of its step; `shifted` says how many equal the step before or after.
+ misaligned  where it is not the live image of its step; `shifted` says how many equal the step
+ before or after.
 Prints one JSON object last; exits with 1 unless all are 0.
 """
 
@@ -26,32 +29,44 @@ import numpy as np
 VIEWS = ("front", "back")
 
 
-def compare(demos: Path, dataset_folder: Path, size: int, every: int) -> dict:
-    """Count what is wrong with a dataset's frames; `every` so many episodes one is stepped through live."""
+def compare(demos: Path, dataset_folder: Path, size: int, frame_stride: int) -> dict:
+    """Count what is wrong with a dataset's frames; `every` so many episodes one is stepped through
+    live.
+    """
     from surgicai_vision import envs
     from surgicai_vision.dataset import open_dataset
     from surgicai_vision.demos.store import list_demos, read_demo
 
     dataset = open_dataset(dataset_folder)
-    bounds, found = dataset.bounds(), {"dropped": 0, "black": 0, "misaligned": 0, "shifted": 0, "compared": 0}
+    bounds, found = (
+        dataset.bounds(),
+        {"dropped": 0, "black": 0, "misaligned": 0, "shifted": 0, "compared": 0},
+    )
     env = None
     for number, path in enumerate(list_demos(demos)):
         demo = read_demo(path)
         start, stop = bounds[number] if number < len(bounds) else (0, 0)
         found["dropped"] += len(VIEWS) * abs(len(demo) - (stop - start))
-        stored = {view: (dataset.frames(view, start, stop), dataset.depth(view, start, stop)) for view in VIEWS}
+        stored = {
+            view: (dataset.frames(view, start, stop), dataset.depth(view, start, stop))
+            for view in VIEWS
+        }
         for colours, _ in stored.values():
             flat = colours.reshape(len(colours), -1)
             found["black"] += int(((flat.max(1) <= 8) | (flat.max(1) == flat.min(1))).sum())
-        if number % every:
+        if number % frame_stride:
             continue
-        env = env or envs.make(demo.config, obs_type="pixels", cameras=VIEWS, image_size=size, depth=True)
+        env = env or envs.make(
+            demo.config, obs_type="pixels", cameras=VIEWS, image_size=size, depth=True
+        )
         seen, _ = env.reset(seed=demo.seed)
         assert np.array_equal(env.get_state(), demo.state[0]), "the start is not the one recorded"
         for step in range(min(len(demo), stop - start)):
             for view, (colours, depth) in stored.items():
                 live = seen["pixels"][view]
-                good = np.array_equal(live, colours[step]) and np.array_equal(seen["depth"][view], depth[step])
+                good = np.array_equal(live, colours[step]) and np.array_equal(
+                    seen["depth"][view], depth[step]
+                )
                 found["compared"] += 1
                 if not good:
                     near = colours[max(0, step - 1) : step + 2]
@@ -66,12 +81,18 @@ def compare(demos: Path, dataset_folder: Path, size: int, every: int) -> dict:
 
 def main() -> int:
     """Record, render and compare every subtask; exit 1 where a frame is wrong."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=10_000, help="pictures to render, at least")
-    parser.add_argument("--every", type=int, default=1, help="step live through one of so many episodes")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--frames", type=int, default=10_000, help="images to render, at least")
+    parser.add_argument(
+        "--frame-stride", type=int, default=1, help="step live through one of so many episodes"
+    )
     parser.add_argument("--size", type=int, default=224)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the last line is always JSON")
+    parser.add_argument(
+        "--json", action="store_true", help="accepted for symmetry; the last line is always JSON"
+    )
     arguments = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
     from surgicai_vision.core import names
@@ -81,7 +102,14 @@ def main() -> int:
     from surgicai_vision.demos.store import list_demos, read_demo
 
     root, began = Path(tempfile.mkdtemp(prefix="surgicai-vision-frames-")), time.monotonic()
-    total: dict[str, int] = {"frames": 0, "dropped": 0, "black": 0, "misaligned": 0, "shifted": 0, "compared": 0}
+    total: dict[str, int] = {
+        "frames": 0,
+        "dropped": 0,
+        "black": 0,
+        "misaligned": 0,
+        "shifted": 0,
+        "compared": 0,
+    }
     for task in names.SUBTASKS:
         wanted = -(-arguments.frames // (len(names.SUBTASKS) * len(VIEWS)))
         demos, episodes, steps = root / task, 1, 0
@@ -91,8 +119,10 @@ def main() -> int:
             record(TaskConfig(task), episodes=episodes, out=demos, workers=arguments.workers)
             steps = sum(len(read_demo(path)) for path in list_demos(demos))
         out = root / f"{task}-set"
-        render_demos(demos, out, views=VIEWS, size=arguments.size, depth=True, workers=arguments.workers)
-        found = compare(demos, out, arguments.size, arguments.every)
+        render_demos(
+            demos, out, views=VIEWS, size=arguments.size, depth=True, workers=arguments.workers
+        )
+        found = compare(demos, out, arguments.size, arguments.frame_stride)
         print(f"{task}: {episodes} episodes, {len(VIEWS) * steps} frames, {found}", flush=True)
         total["frames"] += len(VIEWS) * steps
         for key, number in found.items():
@@ -100,7 +130,9 @@ def main() -> int:
         shutil.rmtree(out)
     shutil.rmtree(root)
     print(json.dumps({**total, "size": arguments.size, "seconds": round(time.monotonic() - began)}))
-    return int(bool(total["dropped"] or total["black"] or total["misaligned"]) or total["compared"] == 0)
+    return int(
+        bool(total["dropped"] or total["black"] or total["misaligned"]) or total["compared"] == 0
+    )
 
 
 if __name__ == "__main__":

@@ -2,8 +2,9 @@
 
     python benchmarks/grasp_ceiling.py --episodes 200
 
-`once`: the expert takes the needle in the middle of the range of goals, seeing everything else. `search`: it tries
-again elsewhere (`surgicai_vision.demos.search_expert`). Both bound what a policy can reach that sees pictures alone.
+`once`: the expert takes the needle in the middle of the range of goals, seeing everything else.
+`search`: it tries again elsewhere (`surgicai_vision.demos.search_expert`). Both bound what a policy
+can reach that sees images alone.
 """
 
 import argparse
@@ -43,7 +44,9 @@ def play(seeds: range, way: str) -> list[tuple[bool, int]]:
 
 def main() -> None:
     """Measure both ways and print one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=900_000)
     parser.add_argument("--workers", type=int, default=2)

@@ -1,10 +1,12 @@
-"""Measure how far the needle drifts in PSM2's jaws: 10 s of motion at 30 mm/s and 60 °/s, friction only.
+"""Measure how far the needle drifts in PSM2's jaws: 10 s of motion at 30 mm/s and 60 °/s, friction
+only.
 
     python benchmarks/grip.py --json
 
-Each trial draws a grasp as the subtask `place` does (angle 5°–20°, off by up to 1.5 mm and 12°) with the needle in
-free air, then swings the tool on smooth closed paths. Drift is the way of the grasped point in the jaws [mm] and
-the turn of the needle in them [deg] between the start and the end.
+Each trial draws a grasp as the subtask `place` does (angle 5°–20°, off by up to 1.5 mm and 12°)
+with the needle in free air, then swings the tool on smooth closed paths. Drift is the way of the
+grasped point in the jaws [mm] and the turn of the needle in them [deg] between the start and the
+end.
 """
 
 import argparse
@@ -46,7 +48,9 @@ def swing(simulation: Simulation) -> tuple[float, float] | None:
 
 def main() -> None:
     """Run the trials and print one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--trials", type=int, default=40)
     parser.add_argument("--seed", type=int, default=900_000)
     parser.add_argument("--thread", type=int, default=0)
@@ -60,7 +64,9 @@ def main() -> None:
     needle_pose[:3, 3] = PLACE
     while len(drifts) + lost < arguments.trials:
         simulation.reset()
-        if not hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch)):
+        if not hold_needle(
+            simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch)
+        ):
             continue
         drift = swing(simulation)
         if drift is None or not simulation.holds(PSM2):
@@ -68,7 +74,12 @@ def main() -> None:
         else:
             drifts.append(drift)
     table = np.array(drifts).reshape(-1, 2)
-    row = {"trials": arguments.trials, "lost": lost, "seed": arguments.seed, "thread": arguments.thread}
+    row = {
+        "trials": arguments.trials,
+        "lost": lost,
+        "seed": arguments.seed,
+        "thread": arguments.thread,
+    }
     for column, name in enumerate(("drift_mm", "drift_deg")):
         values = table[:, column]
         row[name] = {key: round(float(value), 3) for key, value in (

@@ -1,11 +1,13 @@
-"""Kill `render-demos` with SIGKILL at random moments, run it again to the end, and compare with an undisturbed run.
+"""Kill `render-demos` with SIGKILL at random moments, run it again to the end, and compare with an
+undisturbed run.
 
     python benchmarks/kill.py --kills 100 --together 2 --json
 
-Each trial renders the same short demonstrations into a new folder, is killed once, and is run again. The moments are
-spread evenly over the time an undisturbed run takes under the same load (one in each hundredth, so that start, work
-and assembly are all met). Prints a line a trial and one JSON object last: how many datasets were identical (digest and
-file fingerprint), the most episodes that a kill cost, and what was left beside them. Exits with 1 unless all are.
+Each trial renders the same short demonstrations into a new folder, is killed once, and is run
+again. The moments are spread evenly over the time an undisturbed run takes under the same load (one
+in each hundredth, so that start, work and assembly are all met). Prints a line a trial and one JSON
+object last: how many datasets were identical (digest and file fingerprint), the most episodes that
+a kill cost, and what was left beside them. Exits with 1 unless all are.
 """
 
 import argparse
@@ -45,7 +47,9 @@ def make_demos(folder: Path, episodes: int) -> None:
     record(TaskConfig("grasp"), episodes=episodes, out=folder, workers=0)
 
 
-def start(script: Path, demos: Path, out: Path, workers: int, address: str = "") -> subprocess.Popen:
+def start(
+    script: Path, demos: Path, out: Path, workers: int, address: str = ""
+) -> subprocess.Popen:
     """Start one rendering, in this machine's processes or on the Ray cluster at `address`."""
     command = [sys.executable, script, demos, out, str(workers), str(SIZE), address]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -63,7 +67,9 @@ def committed(out: Path) -> int:
     """Return the number of finished episodes in the store beside `out`."""
     work = out.with_name(f"{out.name}.work")
     try:
-        return len([path for path in os.listdir(work) if not path.startswith(".") and path != "result"])
+        return len(
+            [path for path in os.listdir(work) if not path.startswith(".") and path != "result"]
+        )
     except OSError:
         return 0
 
@@ -86,7 +92,10 @@ class Trials:
         self.script.write_text(RENDER)
         make_demos(root / "demos", episodes)
         began = time.monotonic()
-        runs = [start(self.script, root / "demos", root / f"reference{n}", workers) for n in range(together)]
+        runs = [
+            start(self.script, root / "demos", root / f"reference{n}", workers)
+            for n in range(together)
+        ]
         results = [finish(process) for process in runs]
         self.duration, self.reference = time.monotonic() - began, results[0]
         assert all(result == self.reference for result in results)
@@ -102,7 +111,12 @@ class Trials:
         kept, lost, whole = committed(out), half_done(out), out.exists()
         result = finish(start(self.script, self.root / "demos", out, self.workers))
         left = sorted(path.name for path in self.root.glob(f"*set{trial}[!0-9]*"))
-        row = {"identical": result == self.reference and not left, "kept": kept, "redone": lost, "left": left}
+        row = {
+            "identical": result == self.reference and not left,
+            "kept": kept,
+            "redone": lost,
+            "left": left,
+        }
         state = "complete" if whole else f"{kept} episodes kept, {lost} lost"
         verdict = "identical" if row["identical"] else "DIFFERENT"
         print(f"trial {trial}: killed after {moment:.2f} s, {state}: {verdict}", flush=True)
@@ -112,20 +126,26 @@ class Trials:
 
 def main() -> int:
     """Run the trials; exit 1 unless every dataset is identical."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--workers", type=int, default=1, help="processes of each rendering")
     parser.add_argument("--together", type=int, default=2, help="trials at a time")
     parser.add_argument("--episodes", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the last line is always JSON")
+    parser.add_argument(
+        "--json", action="store_true", help="accepted for symmetry; the last line is always JSON"
+    )
     arguments = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
     root = Path(tempfile.mkdtemp(prefix="surgicai-vision-kill-"))
     began = time.monotonic()
     trials = Trials(root, arguments.episodes, arguments.workers, arguments.together)
     draw = random.Random(arguments.seed)
-    moments = [trials.duration * (at + draw.random()) / arguments.kills for at in range(arguments.kills)]
+    moments = [
+        trials.duration * (at + draw.random()) / arguments.kills for at in range(arguments.kills)
+    ]
     draw.shuffle(moments)
     with ThreadPoolExecutor(arguments.together) as pool:
         rows = list(pool.map(trials.run, range(arguments.kills), moments))
@@ -133,7 +153,9 @@ def main() -> int:
         "kills": arguments.kills,
         "identical": sum(row["identical"] for row in rows),
         "most_redone": max(row["redone"] for row in rows),
-        "met_unfinished": sum(0 < row["kept"] < arguments.episodes or row["redone"] > 0 for row in rows),
+        "met_unfinished": sum(
+            0 < row["kept"] < arguments.episodes or row["redone"] > 0 for row in rows
+        ),
         "workers": arguments.workers,
         "episodes": trials.reference[3],
         "frames": trials.reference[2],

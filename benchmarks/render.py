@@ -1,11 +1,13 @@
-"""Measure two-view steps/s written: `render-demos` with 1 and 2 workers against LeRobot's own writer in one process.
+"""Measure two-view steps/s written: `render-demos` with 1 and 2 workers against LeRobot's own
+writer in one process.
 
     python benchmarks/render.py --episodes 12 --repeats 3 --json
 
-The same demonstrations, 224 × 224, lossless pictures, each way in a process of its own. The other way sets every state
-in the same environment, renders both views and writes with `LeRobotDataset.add_frame` and `save_episode`
-(`use_videos=False`); its clock starts after LeRobot's imports, ours before the workers start. The ways take turns;
-the best counts. Prints one JSON object last.
+The same demonstrations, 224 × 224, lossless images, each way in a process of its own. The other way
+sets every state in the same environment, renders both views and writes with
+`LeRobotDataset.add_frame` and `save_episode` (`use_videos=False`); its clock starts after LeRobot's
+imports, ours before the workers start. The ways take turns; the best counts. Prints one JSON object
+last.
 """
 
 import argparse
@@ -38,9 +40,9 @@ if __name__ == "__main__":
     demos, out, _, size = sys.argv[1:]
     size = int(size)
     began = time.monotonic()
-    picture = {"dtype": "image", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
+    image = {"dtype": "image", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
     features = {
-        **{names.image_key(view): picture for view in ("front", "back")},
+        **{names.image_key(view): image for view in ("front", "back")},
         names.STATE: {"dtype": "float32", "shape": (7,), "names": None},
         names.ACTION: {"dtype": "float32", "shape": (7,), "names": None},
     }
@@ -78,18 +80,26 @@ def measure(root: Path, name: str, size: int) -> float:
         raise SystemExit(f"{name} failed:\n{done.stderr}")
     frames, seconds = json.loads(done.stdout.splitlines()[-1])
     shutil.rmtree(out)
-    print(f"{name}: {frames} steps in {seconds:.1f} s, {frames / seconds:.1f} steps/s", file=sys.stderr, flush=True)
+    print(
+        f"{name}: {frames} steps in {seconds:.1f} s, {frames / seconds:.1f} steps/s",
+        file=sys.stderr,
+        flush=True,
+    )
     return frames / seconds
 
 
 def main() -> None:
     """Measure every way in turns and print one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", default="place")
     parser.add_argument("--episodes", type=int, default=12)
     parser.add_argument("--size", type=int, default=224)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the last line is always JSON")
+    parser.add_argument(
+        "--json", action="store_true", help="accepted for symmetry; the last line is always JSON"
+    )
     arguments = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
     from surgicai_vision.core.config import TaskConfig

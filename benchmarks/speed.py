@@ -1,19 +1,26 @@
-"""Measure speed: physics, pictures, resets and workers, each against the bare thing at equal settings.
+"""Measure speed: physics, images, resets and workers, each against the bare thing at equal
+settings.
 
     python benchmarks/speed.py
     python benchmarks/speed.py --only step --repeats 40
 
-step     `env.step` (obs_type state) along an expert's whole procedure, against a loop of `mj_step(…, nstep)` over the
-         same model, states and commands; both must end in the same positions. Without thread and with 10 segments.
-frames   `FrameRenderer.render` against `mujoco.Renderer` with shadows, multisampling and triangles set alike, on the
-         same states; both must give the same pixels. One core: llvmpipe draws in the calling thread.
+step     `env.step` (obs_type state) along an expert's whole procedure, against a loop of
+`mj_step(…, nstep)` over the
+         same model, states and commands; both must end in the same positions. Without thread and
+         with 10 segments.
+frames   `FrameRenderer.render` against `mujoco.Renderer` with shadows, multisampling and triangles
+set alike, on the
+         same states; both must give the same pixels. One core: llvmpipe draws in the calling
+         thread.
 reset    per task [ms].
-workers  two worker processes against one, steps of all envs a second: gymnasium's asynchronous vector env (`async_…`:
-         an env a worker) and ours (`shares_…`: `--share` envs a worker), with state and with pictures.
+workers  two worker processes against one, steps of all envs a second: gymnasium's asynchronous
+vector env (`async_…`:
+         an env a worker) and ours (`shares_…`: `--share` envs a worker), with state and with
+         images.
 
-A and B take turns; figures are medians over the turns, and ratios are medians of the turns' ratios. `--clock cpu`
-counts the process's own CPU time instead of the wall's, for a machine that others use too; workers are timed by the
-wall in any case.
+A and B take turns; figures are medians over the turns, and ratios are medians of the turns' ratios.
+`--clock cpu` counts the process's own CPU time instead of the wall's, for a machine that others use
+too; workers are timed by the wall in any case.
 """
 
 import argparse
@@ -42,7 +49,9 @@ SIZE, CAMERA, POSES = 224, "front", 16
 
 
 class Recording(NamedTuple):
-    """An expert's episode: the env, its first state, the actions, and the servo commands they became."""
+    """An expert's episode: the env, its first state, the actions, and the servo commands they
+    became.
+    """
 
     env: envs.SuturingEnv
     start: np.ndarray
@@ -66,8 +75,12 @@ def timed(function: Callable[[], Any]) -> float:
     return Clock.now() - start
 
 
-def in_turns(one: Callable[[], None], other: Callable[[], None], repeats: int) -> tuple[list[float], list[float]]:
-    """Return the times of two calls [s] that take turns, first one first, then the other; the first turn is lost."""
+def in_turns(
+    one: Callable[[], None], other: Callable[[], None], repeats: int
+) -> tuple[list[float], list[float]]:
+    """Return the times of two calls [s] that take turns, first one first, then the other; the first
+    turn is lost.
+    """
     times: tuple[list[float], list[float]] = ([], [])
     for turn in range(repeats + 1):
         for index in (0, 1) if turn % 2 else (1, 0):
@@ -116,7 +129,9 @@ def measure_step(thread: int, repeats: int) -> dict[str, Any]:
 
     both()
     if not np.array_equal(env.data.qpos, data.qpos):
-        raise SystemExit("env.step and the bare loop ended in different positions; the comparison is void.")
+        raise SystemExit(
+            "env.step and the bare loop ended in different positions; the comparison is void."
+        )
     times = np.array([both() for _ in range(repeats)])
     return {
         "control_steps": len(actions),
@@ -127,7 +142,7 @@ def measure_step(thread: int, repeats: int) -> dict[str, Any]:
 
 
 def measure_frames(repeats: int, frames: int) -> dict[str, Any]:
-    """Time our pictures against MuJoCo's own renderer."""
+    """Time our images against MuJoCo's own renderer."""
     env, start, actions, _ = record(0)
     env.set_state_vector(start)
     states = []
@@ -156,7 +171,9 @@ def measure_frames(repeats: int, frames: int) -> dict[str, Any]:
 
     first, second = in_turns(through_ours, through_bare, repeats)
     default = mujoco.Renderer(env.model, SIZE, SIZE)
-    slow = timed(lambda: [(default.update_scene(state, CAMERA), default.render()) for state in states])
+    slow = timed(
+        lambda: [(default.update_scene(state, CAMERA), default.render()) for state in states]
+    )
     for renderer in (default, bare, ours):
         renderer.close()
     return {
@@ -173,7 +190,11 @@ def measure_frames(repeats: int, frames: int) -> dict[str, Any]:
 def _set_quality(model: mujoco.MjModel) -> None:
     """Set a model to the settings of our quality "fast"."""
     quality, visual = QUALITIES["fast"], model.vis.quality
-    visual.offsamples, visual.numslices, visual.numstacks = quality.samples, quality.slices, quality.stacks
+    visual.offsamples, visual.numslices, visual.numstacks = (
+        quality.samples,
+        quality.slices,
+        quality.stacks,
+    )
     visual.numquads = quality.quads
 
 
@@ -183,7 +204,10 @@ def measure_reset(repeats: int) -> dict[str, float]:
     for task in names.TASKS:
         env = envs.make(TaskConfig(task))
         env.reset(seed=0)
-        times = [timed(lambda seed=seed, env=env: env.reset(seed=seed)) for seed in range(1, 5 * repeats + 1)]
+        times = [
+            timed(lambda seed=seed, env=env: env.reset(seed=seed))
+            for seed in range(1, 5 * repeats + 1)
+        ]
         row[task] = median([seconds * 1e3 for seconds in times], 2)
     return row
 
@@ -197,7 +221,10 @@ def measure_workers(repeats: int, steps: int, obs_type: str, share: int) -> dict
         obs_type: what the envs show.
         share: envs of a worker of ours; 0 for gymnasium's asynchronous vector env.
     """
-    chosen = {"obs_type": obs_type, **({"cameras": (CAMERA,), "image_size": SIZE} if obs_type == "pixels" else {})}
+    chosen = {
+        "obs_type": obs_type,
+        **({"cameras": (CAMERA,), "image_size": SIZE} if obs_type == "pixels" else {}),
+    }
     vectors = [_vector(workers, share, chosen) for workers in (1, 2)]
     rng = np.random.default_rng(0)
     for vector in vectors:
@@ -229,7 +256,9 @@ def _vector(workers: int, share: int, chosen: dict[str, Any]) -> gymnasium.vecto
 def main() -> None:
     """Measure and print one JSON line."""
     parts = ("step", "frames", "reset", "workers")
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", choices=parts, nargs="+", default=parts)
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--frames", type=int, default=100, help="frames or vector steps in a turn")
@@ -239,7 +268,9 @@ def main() -> None:
     Clock.now = staticmethod(CLOCKS[chosen.clock])
     row: dict[str, Any] = {"repeats": chosen.repeats, "clock": chosen.clock}
     if "step" in chosen.only:
-        row["step"] = {f"thread_{thread}": measure_step(thread, chosen.repeats) for thread in (0, 10)}
+        row["step"] = {
+            f"thread_{thread}": measure_step(thread, chosen.repeats) for thread in (0, 10)
+        }
     if "frames" in chosen.only:
         row["frames"] = measure_frames(chosen.repeats, chosen.frames)
     if "reset" in chosen.only:

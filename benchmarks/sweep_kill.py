@@ -1,12 +1,14 @@
-"""Run a sweep of many small cells while its workers, its driver and a node are killed; compare with a quiet run.
+"""Run a sweep of many small cells while its workers, its driver and a node are killed; compare with
+a quiet run.
 
     python benchmarks/sweep_kill.py --cells 300 --json
 
-Three runs of the same grid: a quiet one; one by local processes, of which ten workers and once the driver are killed;
-one on a Ray cluster of two nodes on loopback, where a node is lost too. The sweep is started again after its driver's
-death, which is all the repair there is. A last call of the quiet run's command shows what a finished sweep costs.
-A cell is a policy without pictures: two epochs, one episode. Prints one JSON object last; exits with 1 unless every
-run has every cell once and the quiet run's digest.
+Three runs of the same grid: a quiet one; one by local processes, of which ten workers and once the
+driver are killed; one on a Ray cluster of two nodes on loopback, where a node is lost too. The
+sweep is started again after its driver's death, which is all the repair there is. A last call of
+the quiet run's command shows what a finished sweep costs. A cell is a policy without images: two
+epochs, one episode. Prints one JSON object last; exits with 1 unless every run has every cell once
+and the quiet run's digest.
 """
 
 import argparse
@@ -48,7 +50,16 @@ class Sweep:
     """
 
     def __init__(self, grid: Path, out: Path, *options: str):
-        command = [sys.executable, "-m", "surgicai_vision", "sweep", str(grid), "--out", str(out), "--json"]
+        command = [
+            sys.executable,
+            "-m",
+            "surgicai_vision",
+            "sweep",
+            str(grid),
+            "--out",
+            str(out),
+            "--json",
+        ]
         self.command, self.out, self.starts = [*command, "--workers", "2", *options], out, 0
         self.process: subprocess.Popen | None = None
 
@@ -83,7 +94,10 @@ class Sweep:
         output, errors = self.process.communicate()
         if self.process.returncode:
             raise SystemExit(f"the sweep failed:\n{output}\n{errors}")
-        return {**json.loads(output.splitlines()[-1]), "seconds": round(time.monotonic() - began, 1)}
+        return {
+            **json.loads(output.splitlines()[-1]),
+            "seconds": round(time.monotonic() - began, 1),
+        }
 
     def verdict(self, result: dict, digest: str, cells: int) -> dict:
         """Return what is in the folder beside what should be."""
@@ -104,12 +118,16 @@ class Sweep:
 
 def main() -> int:
     """Run the sweeps; exit 1 unless each is whole."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cells", type=int, default=300)
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--skip-ray", action="store_true", help="local processes alone")
-    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the last line is always JSON")
+    parser.add_argument(
+        "--json", action="store_true", help="accepted for symmetry; the last line is always JSON"
+    )
     arguments = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
     root = Path(tempfile.mkdtemp(prefix="surgicai-vision-sweep-"))
@@ -120,7 +138,11 @@ def main() -> int:
     result, again = quiet.run([]), quiet.run([])
     digest = result["digest"]
     row = {"cells": arguments.cells, "kills": arguments.kills, "quiet_seconds": result["seconds"]}
-    row["second_run"] = {"seconds": again["seconds"], "done": again["done"], "same": again["digest"] == digest}
+    row["second_run"] = {
+        "seconds": again["seconds"],
+        "done": again["done"],
+        "same": again["digest"] == digest,
+    }
     good = result["done"] == arguments.cells and again["done"] == 0 and again["digest"] == digest
 
     local = Sweep(grid, root / "local")
@@ -132,7 +154,9 @@ def main() -> int:
         with two_nodes() as cluster:
             ray = Sweep(grid, root / "ray", "--executor", "ray", "--address", cluster.address)
             kills = [functools.partial(cluster.kill_worker, moments)] * arguments.kills
-            events = spread([*kills, cluster.lose_node, ray.kill_driver], arguments.cells - 1, moments)
+            events = spread(
+                [*kills, cluster.lose_node, ray.kill_driver], arguments.cells - 1, moments
+            )
             row["ray"] = ray.verdict(ray.run(events), digest, arguments.cells)
         good = good and row["ray"]["good"] and not events
     shutil.rmtree(root)

@@ -1,10 +1,12 @@
-"""Measure training from the feature cache: 30 epochs of 5,000 transitions by the recipe `paper`, two views of 2,048.
+"""Measure training from the feature cache: 30 epochs of 5,000 transitions by the recipe `paper`,
+two views of 2,048.
 
     python benchmarks/training.py --json
     python benchmarks/training.py --views 1 --dim 1280
 
-The features are noise in a cache entry of their own (their values make no difference to the time); data, split,
-policy, checkpoint and its training states are those of `surgicai_vision.training.train.train`. Prints one JSON line.
+The features are noise in a cache entry of their own (their values make no difference to the time);
+data, split, policy, checkpoint and its training states are those of
+`surgicai_vision.training.train.train`. Prints one JSON line.
 """
 
 import argparse
@@ -52,20 +54,30 @@ def encoder(dim: int) -> Any:
     def answer(frames: np.ndarray) -> np.ndarray:
         return generator.normal(size=(len(frames), dim)).astype(np.float32)
 
-    about = {"pool": "global", "dim": dim, "shape": (dim,), "fingerprint": f"noise{dim}", "weights_sha256": ""}
+    about = {
+        "pool": "global",
+        "dim": dim,
+        "shape": (dim,),
+        "fingerprint": f"noise{dim}",
+        "weights_sha256": "",
+    }
     vars(answer).update(about, card=encoders.encoder_card("random"))
     return answer
 
 
 def main() -> None:
     """Train once per repetition and print the times."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--transitions", type=int, default=5000)
     parser.add_argument("--epochs", type=int, default=30)
     parser.add_argument("--views", type=int, default=2)
     parser.add_argument("--dim", type=int, default=2048)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--json", action="store_true", help="accepted for symmetry; the output is always JSON")
+    parser.add_argument(
+        "--json", action="store_true", help="accepted for symmetry; the output is always JSON"
+    )
     arguments = parser.parse_args()
     dataset, network = Noise(arguments.transitions, arguments.views), encoder(arguments.dim)
     recipe = policies.load_recipe("bc", "paper", {"epochs": arguments.epochs})
@@ -75,7 +87,12 @@ def main() -> None:
         for repeat in range(arguments.repeats):
             began = time.perf_counter()
             checkpoint = train(
-                dataset, features, policies.policy_plugin("bc"), recipe, seed=repeat, out=Path(folder) / str(repeat)
+                dataset,
+                features,
+                policies.policy_plugin("bc"),
+                recipe,
+                seed=repeat,
+                out=Path(folder) / str(repeat),
             )
             seconds.append(round(time.perf_counter() - began, 2))
     row = {

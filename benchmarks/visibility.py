@@ -1,10 +1,11 @@
-"""Count the needle's pixels at the end of successful expert episodes, in the views a policy learns from.
+"""Count the needle's pixels at the end of successful expert episodes, in the views a policy learns
+from.
 
     python benchmarks/visibility.py --episodes 100
 
-Per task and view: the share of starts at whose successful end the needle covers at least 25 pixels of 224 × 224 in
-the segmentation picture (with the exact 95 % interval), and the fewest, the 5 %, and the median number of pixels.
-Starts that the expert fails are counted apart.
+Per task and view: the share of starts at whose successful end the needle covers at least 25 pixels
+of 224 × 224 in the segmentation image (with the exact 95 % interval), and the fewest, the 5 %, and
+the median number of pixels. Starts that the expert fails are counted apart.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from surgicai_vision.scene.rendering import FrameRenderer
 
 TASKS = ("grasp", "place", "insert", "handoff")
 SIZE, PIXELS, GOAL = 224, 25, 0.95
-"""Side of a picture, fewest needle pixels in it, share of the starts that must show as many."""
+"""Side of an image, fewest needle pixels in it, share of the starts that must show as many."""
 
 
 class Job(NamedTuple):
@@ -35,13 +36,17 @@ class Job(NamedTuple):
 
 
 def count(job: Job) -> list[list[int] | None]:
-    """Return the needle's pixels per view at the end of each episode, None where the expert failed."""
+    """Return the needle's pixels per view at the end of each episode, None where the expert
+    failed.
+    """
     env = envs.make(job.config)
     with FrameRenderer(env.model, SIZE, SIZE) as renderer:
         return [_pixels(env, seed, renderer, job.views) for seed in job.seeds]
 
 
-def _pixels(env: envs.SuturingEnv, seed: int, renderer: FrameRenderer, views: tuple[str, ...]) -> list[int] | None:
+def _pixels(
+    env: envs.SuturingEnv, seed: int, renderer: FrameRenderer, views: tuple[str, ...]
+) -> list[int] | None:
     expert, needle = Expert(env), names.PARTS.index("needle")
     try:
         env.reset(seed=seed)
@@ -53,7 +58,9 @@ def _pixels(env: envs.SuturingEnv, seed: int, renderer: FrameRenderer, views: tu
         return None
     if not info["is_success"]:
         return None
-    return [int((renderer.render(env.data, view, names.SEGMENTATION) == needle).sum()) for view in views]
+    return [
+        int((renderer.render(env.data, view, names.SEGMENTATION) == needle).sum()) for view in views
+    ]
 
 
 def table(pixels: list[int]) -> dict[str, Any]:
@@ -64,13 +71,19 @@ def table(pixels: list[int]) -> dict[str, Any]:
         "share": round(seen / len(pixels), 4),
         "interval_95": [round(low, 4), round(high, 4)],
         "enough": seen / len(pixels) >= GOAL,
-        "pixels": {"min": min(pixels), "p5": int(np.quantile(pixels, 0.05)), "median": int(np.median(pixels))},
+        "pixels": {
+            "min": min(pixels),
+            "p5": int(np.quantile(pixels, 0.05)),
+            "median": int(np.median(pixels)),
+        },
     }
 
 
 def main() -> None:
     """Play, look, and print one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", choices=TASKS, nargs="+", default=TASKS)
     parser.add_argument("--view", choices=names.CAMERAS, nargs="+", default=("front", "back"))
     parser.add_argument("--episodes", type=int, default=100)
@@ -87,8 +100,14 @@ def main() -> None:
         ends = [end for job, part in done if job.config.task == task for end in part]
         shown = [end for end in ends if end is not None]
         rows[task] = {"episodes": len(ends), "successes": len(shown)}
-        rows[task] |= {view: table([end[index] for end in shown]) for index, view in enumerate(views) if shown}
-    emit("visibility", {"seed": chosen.seed, "size": SIZE, "at_least": PIXELS, "tasks": rows}, render=True)
+        rows[task] |= {
+            view: table([end[index] for end in shown]) for index, view in enumerate(views) if shown
+        }
+    emit(
+        "visibility",
+        {"seed": chosen.seed, "size": SIZE, "at_least": PIXELS, "tasks": rows},
+        render=True,
+    )
 
 
 if __name__ == "__main__":

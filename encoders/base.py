@@ -2,24 +2,27 @@
 
 Interface:
 
-* `EncoderCard`, `Plugin` (from encoders.card): what a member file offers. `plugin.build(card, path)` returns
-  the final card (a variant of the weights may change it) and a `torch.nn.Module` of (B, 3, S, S)
-  normalised pictures → (B, dim).
-* `Encoder(card, network, pool)`: the final class. `encoder(frames (B, H, W, 3) uint8 RGB) -> (B, dim)
-  float32`, frozen for good: eval mode, no gradient, and nothing can put it back into training.
+* `EncoderCard`, `Plugin` (from encoders.card): what a member file offers. `plugin.build(card,
+  path)` returns the final card (a variant of the weights may change it) and a `torch.nn.Module` of
+  (B, 3, S, S) normalised images → (B, dim).
+* `Encoder(card, network, pool)`: the final class. `encoder(frames (B, H, W, 3) uint8 RGB) -> (B,
+  dim) float32`, frozen for good: eval mode, no gradient, and nothing can put it back into training.
 * `state_sha256(module)`: one hash over all parameters and buffers.
 * `read_tensors(path)`: safetensors, or a torch file read with `weights_only=True`.
 * `load_exactly(network, tensors, where)`: load; names and shapes must fit to the last.
 
-The same picture gives the same feature, whatever batch it is in, so that a live evaluation sees what the
-cache holds. Measured on a Xeon with AMX (bf16, channels_last): convolutions give the same bits for any
-batch and thread count; transformers and attention pools do not (up to 1 % between batch sizes, and between
-one and two threads), but do for a fixed batch on one thread, at any position and beside any neighbours. So:
+The same image gives the same feature, whatever batch it is in, so that a live evaluation sees what
+the cache holds. Measured on a Xeon with AMX (bf16, channels_last): convolutions give the same bits
+for any batch and thread count; transformers and attention pools do not (up to 1 % between batch
+sizes, and between one and two threads), but do for a fixed batch on one thread, at any position and
+beside any neighbours. So:
 
-* every piece holds exactly as many pictures as the card says (`CUDA_BATCH`). What is left over is padded, unless
-  this network on this machine is found to give the same bits in smaller pieces: then it is cut into those of `SMALL`;
-* on a CPU each piece is computed by one thread, and pieces run side by side, one per core. That is also
-  faster where others use the cores: 4 to 5 times at a load of 5 on 2 cores, ResNet-50 and EfficientNet;
+* every piece holds exactly as many images as the card says (`CUDA_BATCH`). What is left over is
+  padded, unless this network on this machine is found to give the same bits in smaller pieces: then
+  it is cut into those of `SMALL`;
+* on a CPU each piece is computed by one thread, and pieces run side by side, one per core. That is
+  also faster where others use the cores: 4 to 5 times at a load of 5 on 2 cores, ResNet-50 and
+  EfficientNet;
 * features are rounded to the values float16 can hold.
 
 BatchNorms are folded into the convolutions before them (`encoders.folding`).
@@ -61,21 +64,23 @@ __all__ = [
 
 POOLS = ("global", "spatial", "tokens")
 CUDA_BATCH = 64
-SMALL = (4, 2, 1)  # smaller pieces that are tried; each costs as much a picture as a whole one
+SMALL = (4, 2, 1)  # smaller pieces that are tried; each costs as much an image as a whole one
 PROBE_SEED = 0
 FINGERPRINT_VERSION = 2  # raise when the same weights and card begin to give other features
 
 
 class MapNetwork(nn.Sequential):
-    """Layers whose answer is a feature map (B, C, h, w); the global feature is its mean over places."""
+    """Layers whose answer is a feature map (B, C, h, w); the global feature is its mean over
+    places.
+    """
 
-    def forward_features(self, pictures: torch.Tensor) -> torch.Tensor:
+    def forward_features(self, images: torch.Tensor) -> torch.Tensor:
         """Return the feature map (B, C, h, w)."""
-        return super().forward(pictures)
+        return super().forward(images)
 
-    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Return the mean feature (B, C)."""
-        return self.forward_features(pictures).mean((2, 3))
+        return self.forward_features(images).mean((2, 3))
 
 
 def state_sha256(module: nn.Module) -> str:
@@ -122,7 +127,7 @@ def _workers(threads: int) -> ThreadPoolExecutor:
 
 @final
 class Encoder:
-    """A frozen picture encoder: uint8 RGB frames in, one float32 feature row each out.
+    """A frozen image encoder: uint8 RGB frames in, one float32 feature row each out.
 
     Attributes:
         card: the encoder's card.
@@ -147,7 +152,9 @@ class Encoder:
         self._device = device or best_device()
         self._dtype = dtype or best_dtype(self._device)
         self._batch = CUDA_BATCH if self._device.type == "cuda" else card.batch
-        network = freeze(fold_batch_norms(network.eval(), card.input_size)).to(self._device, self._dtype)
+        network = freeze(fold_batch_norms(network.eval(), card.input_size)).to(
+            self._device, self._dtype
+        )
         self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         low, high = card.input_range
         mean, std = torch.tensor(card.mean), torch.tensor(card.std)
@@ -160,10 +167,11 @@ class Encoder:
         self.fingerprint = digest(self._identity())
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
-        """Encode pictures.
+        """Encode images.
 
         Args:
-            frames: (B, H, W, 3) uint8 RGB; any size, resized to the network's own with antialiasing.
+            frames: (B, H, W, 3) uint8 RGB; any size, resized to the network's own with
+                antialiasing.
 
         Returns:
             (B, dim) float32, every value exactly representable in float16.
@@ -175,7 +183,7 @@ class Encoder:
         frames = np.asarray(frames)
         if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
             raise InputError(
-                f"Encoder '{self.card.name}' takes (batch, height, width, 3) uint8 RGB pictures, "
+                f"Encoder '{self.card.name}' takes (batch, height, width, 3) uint8 RGB images, "
                 f"got {frames.shape} {frames.dtype}."
             )
         if not len(frames):
@@ -190,15 +198,22 @@ class Encoder:
         return features
 
     def preprocess(self, frames: np.ndarray) -> torch.Tensor:
-        """Return uint8 RGB (B, H, W, 3) frames as normalised float32 (B, 3, S, S) pictures."""
-        pictures = torch.from_numpy(np.ascontiguousarray(frames)).to(self._device).permute(0, 3, 1, 2).float()
+        """Return uint8 RGB (B, H, W, 3) frames as normalised float32 (B, 3, S, S) images."""
+        images = (
+            torch.from_numpy(np.ascontiguousarray(frames))
+            .to(self._device)
+            .permute(0, 3, 1, 2)
+            .float()
+        )
         if self._channels:
-            pictures = pictures[:, self._channels]
+            images = images[:, self._channels]
         size = (self.card.input_size, self.card.input_size)
-        if pictures.shape[-2:] != size:
+        if images.shape[-2:] != size:
             mode = self.card.interpolation
-            pictures = nn.functional.interpolate(pictures, size, mode=mode, antialias=True).clamp(0, 255)
-        return pictures * self._scale[:, None, None] + self._shift[:, None, None]
+            images = nn.functional.interpolate(images, size, mode=mode, antialias=True).clamp(
+                0, 255
+            )
+        return images * self._scale[:, None, None] + self._shift[:, None, None]
 
     def state_sha256(self) -> str:
         """Hash the live network: weights and buffers, as they stand in memory now."""
@@ -222,11 +237,15 @@ class Encoder:
 
     @functools.cached_property
     def _any_size(self) -> bool:
-        """Whether pieces of `SMALL` give the bits of whole ones; asked of the network itself, once."""
+        """Whether pieces of `SMALL` give the bits of whole ones; asked of the network itself,
+        once.
+        """
         if self._device.type == "cuda":
             return False
         side = self.card.input_size
-        frames = np.random.default_rng(PROBE_SEED).integers(0, 256, (self._batch, side, side, 3), np.uint8)
+        frames = np.random.default_rng(PROBE_SEED).integers(
+            0, 256, (self._batch, side, side, 3), np.uint8
+        )
         (whole,) = self._map([frames])
         small = self._map([frames[-size:] for size in self._small], pad=False)
         return all(torch.equal(piece, whole[-len(piece) :]) for piece in small)
@@ -240,31 +259,50 @@ class Encoder:
 
     @torch.inference_mode()
     def _run(self, frames: np.ndarray, pad: bool | None = None) -> torch.Tensor:
-        """Encode one piece of at most a batch, padded unless it need not be; (b, *shape) float32 on the device."""
+        """Encode one piece of at most a batch, padded unless it need not be; (b, *shape) float32 on
+        the device.
+        """
         count = len(frames)
         if count < self._batch and (not self._any_size if pad is None else pad):
-            frames = np.concatenate([frames, np.zeros((self._batch - count, *frames.shape[1:]), np.uint8)])
-        pictures = self.preprocess(frames).to(self._dtype).contiguous(memory_format=torch.channels_last)
-        return self._pooled(pictures)[:count].float()
+            frames = np.concatenate(
+                [frames, np.zeros((self._batch - count, *frames.shape[1:]), np.uint8)]
+            )
+        images = (
+            self.preprocess(frames).to(self._dtype).contiguous(memory_format=torch.channels_last)
+        )
+        return self._pooled(images)[:count].float()
 
-    def _pooled(self, pictures: torch.Tensor) -> torch.Tensor:
+    def _pooled(self, images: torch.Tensor) -> torch.Tensor:
         """Return the network's answer as `pool` asks: vector, feature map or tokens."""
         if self.pool == "global":
-            return self._network(pictures)
+            return self._network(images)
         take = getattr(self._network, "forward_features", None)
         if take is None:
-            raise InputError(f"Encoder '{self.card.name}' offers its global feature only; use pool 'global'.")
-        features = take(pictures)
+            raise InputError(
+                f"Encoder '{self.card.name}' offers its global feature only; use pool 'global'."
+            )
+        features = take(images)
         if self.pool == "spatial":
             if features.ndim != 4:
-                raise InputError(f"Encoder '{self.card.name}' has tokens, no feature map; use pool 'tokens'.")
+                raise InputError(
+                    f"Encoder '{self.card.name}' has tokens, no feature map; use pool 'tokens'."
+                )
             return features
         return features.flatten(2).transpose(1, 2) if features.ndim == 4 else features
 
     def _identity(self) -> dict[str, Any]:
         """Everything a feature depends on, as plain data."""
         card = asdict(self.card)
-        keys = ("architecture", "input_size", "input_range", "mean", "std", "interpolation", "channel_order", "batch")
+        keys = (
+            "architecture",
+            "input_size",
+            "input_range",
+            "mean",
+            "std",
+            "interpolation",
+            "channel_order",
+            "batch",
+        )
         return {
             "version": FINGERPRINT_VERSION,
             "weights": self.weights_sha256,
@@ -274,8 +312,18 @@ class Encoder:
         }
 
 
-DAMAGED = (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, zipfile.BadZipFile)
-"""What `torch.load` raises on a file that is no torch file, cut short, or holds more than tensors."""
+DAMAGED = (
+    pickle.UnpicklingError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    ValueError,
+    KeyError,
+    zipfile.BadZipFile,
+)
+"""What `torch.load` raises on a file that is no torch file, cut short, or holds more than
+tensors.
+"""
 
 
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -293,7 +341,9 @@ def read_torch(path: Path) -> dict[str, torch.Tensor]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except DAMAGED as error:
-        raise BadFile(f"{path} is not a whole torch file of weights alone ({_one_line(error)}).") from None
+        raise BadFile(
+            f"{path} is not a whole torch file of weights alone ({_one_line(error)})."
+        ) from None
     for wrapper in ("state_dict", "model", "r3m"):
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
@@ -303,14 +353,22 @@ def read_torch(path: Path) -> dict[str, torch.Tensor]:
 
 
 def load_exactly(network: nn.Module, tensors: Mapping[str, torch.Tensor], where: object) -> None:
-    """Load `tensors` into `network`; refuse a missing, an unexpected or a misshapen tensor by name."""
+    """Load `tensors` into `network`; refuse a missing, an unexpected or a misshapen tensor by
+    name.
+    """
     wanted = network.state_dict()
     missing = sorted(wanted.keys() - tensors.keys())
     # Old checkpoints lack BatchNorm's counter, which nothing reads in eval mode.
     missing = [name for name in missing if not name.endswith("num_batches_tracked")]
     unexpected = sorted(tensors.keys() - wanted.keys())
-    shapes = [name for name in wanted.keys() & tensors.keys() if wanted[name].shape != tensors[name].shape]
-    for problem, names in (("lacks", missing), ("holds unexpected", unexpected), ("has the wrong shape of", shapes)):
+    shapes = [
+        name for name in wanted.keys() & tensors.keys() if wanted[name].shape != tensors[name].shape
+    ]
+    for problem, names in (
+        ("lacks", missing),
+        ("holds unexpected", unexpected),
+        ("has the wrong shape of", shapes),
+    ):
         if names:
             raise BadFile(
                 f"{where} {problem} {len(names)} of {len(wanted)} tensors ('{names[0]}' first): "

@@ -1,4 +1,6 @@
-"""An encoder's card, and what a member file offers: plain data, so that listing encoders loads no torch."""
+"""An encoder's card, and what a member file offers: plain data, so that listing encoders loads no
+torch.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,17 +25,18 @@ class EncoderCard:
         sha256: the file's hash; None is said as "unpinned": the hub's own hash is taken.
         licence: SPDX name of the weights' licence.
         offline: True when no download is ever needed.
-        input_size: side of the square picture the network takes [px].
+        input_size: side of the square image the network takes [px].
         input_range: what 0 and 255 become before mean and std are applied.
         mean: per-channel mean (R, G, B), in units of `input_range`.
         std: per-channel standard deviation, in units of `input_range`.
-        interpolation: "bilinear" or "bicubic", always antialiased, for pictures of another size.
+        interpolation: "bilinear" or "bicubic", always antialiased, for images of another size.
         dim: length of the global feature.
         paper: where the encoder was published.
         note: what a user must know before comparing it with others.
         layers: where each pool's feature is taken.
         channel_order: order in which the channels are handed to the network, "RGB" or "BGR".
-        batch: pictures a CPU thread computes at once; few where maps are large, lest they leave its cache.
+        batch: images a CPU thread computes at once; few where maps are large, lest they leave its
+            cache.
     """
 
     name: str
@@ -62,7 +65,8 @@ class Released:
     """How SurgicAI's released code used an encoder where it departs from the paper.
 
     Attributes:
-        action_noise: half width of the uniform noise its evaluation adds to each translation of the action.
+        action_noise: half width of the uniform noise its evaluation adds to each translation of the
+            action.
         card: entries of the card that its own preprocessing amounts to.
     """
 

@@ -1,8 +1,8 @@
-"""`clip`: OpenAI's CLIP picture towers through open_clip (ViT-B/32 as in the released code; RN50).
+"""`clip`: OpenAI's CLIP image towers through open_clip (ViT-B/32 as in the released code; RN50).
 
-The feature is the projected picture embedding before it is scaled to unit length. OpenAI's own `.pt` files
-are TorchScript archives, which `weights_only` cannot read; they are opened as such only when their hash is
-the published one.
+The feature is the projected image embedding before it is scaled to unit length. OpenAI's own `.pt`
+files are TorchScript archives, which `weights_only` cannot read; they are opened as such only when
+their hash is the published one.
 """
 
 from dataclasses import replace
@@ -36,7 +36,7 @@ CARD = EncoderCard(
     interpolation="bicubic",
     dim=512,
     paper="Radford et al., CLIP, ICML 2021",
-    layers="the projected picture embedding (global)",
+    layers="the projected image embedding (global)",
 )
 RN50 = replace(
     CARD,
@@ -58,7 +58,7 @@ ARCHIVES = MappingProxyType(
 
 
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
-    """Build the picture tower; the text tower is left out."""
+    """Build the image tower; the text tower is left out."""
     import logging
 
     import open_clip
@@ -68,7 +68,11 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
 
     if path is None:
         raise BadFile(f"Encoder '{card.name}' needs a weights file.")
-    tensors = {key.removeprefix(PREFIX): value.float() for key, value in _read(path).items() if key.startswith(PREFIX)}
+    tensors = {
+        key.removeprefix(PREFIX): value.float()
+        for key, value in _read(path).items()
+        if key.startswith(PREFIX)
+    }
     name = card.architecture.removeprefix("open_clip ").partition(",")[0]
     level = logging.root.level
     logging.root.setLevel(logging.ERROR)  # open_clip warns that it loads nothing; we do
@@ -93,7 +97,8 @@ def _read(path: Path) -> "dict[str, torch.Tensor]":
 
 
 RELEASED = Released(
-    action_noise=0.4, card=MappingProxyType({"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)})
+    action_noise=0.4,
+    card=MappingProxyType({"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}),
 )
 """The released code fed CLIP ImageNet's statistics."""
 

@@ -1,7 +1,9 @@
-"""Downloads of weights: one file, resumed where it was broken off, taken only when its hash is right.
+"""Downloads of weights: one file, resumed where it was broken off, taken only when its hash is
+right.
 
-`fetch(source, revision, filename, sha256, folder) -> Path`. The hub's own client starts a file anew after a killed
-process, so the bytes are fetched here: into `<filename>.<identity>.partial`, by HTTP ranges, renamed when whole.
+`fetch(source, revision, filename, sha256, folder) -> Path`. The hub's own client starts a file anew
+after a killed process, so the bytes are fetched here: into `<filename>.<identity>.partial`, by HTTP
+ranges, renamed when whole.
 """
 
 import fcntl
@@ -80,7 +82,9 @@ def _complete(url: str, file: BinaryIO, size: int | None, name: str) -> None:
             if size is None and problem.startswith("the server"):
                 return
             if file.tell() == before:
-                raise BrokenOff(f"the download of {url} broke off after {before} of {size} bytes ({problem})")
+                raise BrokenOff(
+                    f"the download of {url} broke off after {before} of {size} bytes ({problem})"
+                )
     if file.tell() != size:
         file.truncate(0)
         raise BrokenOff(f"{url} gave more than the {size} bytes it announced")
@@ -92,7 +96,9 @@ def _append(url: str, file: BinaryIO, show: Any) -> None:
 
     start = file.tell()
     headers = {"Range": f"bytes={start}-", "Accept-Encoding": "identity"}
-    with get_session().stream("GET", url, headers=headers, timeout=TIMEOUT, follow_redirects=True) as answer:
+    with get_session().stream(
+        "GET", url, headers=headers, timeout=TIMEOUT, follow_redirects=True
+    ) as answer:
         answer.raise_for_status()
         if answer.status_code != 206:
             file.truncate(0)
@@ -111,7 +117,12 @@ def _bar(name: str, size: int | None) -> Iterator[Any]:
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
-    columns = (TextColumn("{task.description:<38}"), BarColumn(bar_width=20), DownloadColumn(), TransferSpeedColumn())
+    columns = (
+        TextColumn("{task.description:<38}"),
+        BarColumn(bar_width=20),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), refresh_per_second=4) as bars:
         bar = bars.add_task(f"downloading {name}", total=size)
         yield lambda done: bars.update(bar, completed=done)

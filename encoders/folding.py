@@ -2,10 +2,10 @@
 
     folded = fold_batch_norms(network, 224)    # answers as the network does, up to rounding
 
-A frozen BatchNorm is one scale and one shift a channel, which the convolution's own weights can hold. Left as a layer
-of its own it is one more pass over the whole map: a picture takes 33 and not 24 ms (ResNet-50), 13 and not 10
-(EfficientNet-Lite0; one thread of a Xeon with AMX, bfloat16). `benchmarks/encode.py` compares with networks as they
-are published.
+A frozen BatchNorm is one scale and one shift a channel, which the convolution's own weights can
+hold. Left as a layer of its own it is one more pass over the whole map: an image takes 33 and not
+24 ms (ResNet-50), 13 and not 10 (EfficientNet-Lite0; one thread of a Xeon with AMX, bfloat16).
+`benchmarks/encode.py` compares with networks as they are published.
 """
 
 import copy
@@ -21,35 +21,49 @@ SEED = 0
 
 
 def fold_batch_norms(network: nn.Module, side: int) -> nn.Module:
-    """Return the network with each BatchNorm in the convolution that stands before it among its parent's parts.
+    """Return the network with each BatchNorm in the convolution that stands before it among its
+    parent's parts.
 
-    What stands in order need not run in order, so both networks are shown the same noise; where they do not agree, or
-    no BatchNorm is there, the network that was given is returned, untouched.
+    What stands in order need not run in order, so both networks are shown the same noise; where
+    they do not agree, or no BatchNorm is there, the network that was given is returned, untouched.
 
     Args:
         network: in eval mode, float32.
-        side: height and width of the pictures (B, 3, side, side) it takes.
+        side: height and width of the images (B, 3, side, side) it takes.
     """
     if not any(isinstance(part, nn.BatchNorm2d) for part in network.modules()):
         return network  # a transformer: neither copied nor asked
     folded = copy.deepcopy(network)
     _fold(folded)
-    pictures = torch.randn(1, 3, side, side, generator=torch.Generator().manual_seed(SEED))
+    images = torch.randn(1, 3, side, side, generator=torch.Generator().manual_seed(SEED))
     with torch.inference_mode():
-        before, after = network(pictures), folded(pictures)
-    return folded if float((after - before).abs().max()) <= TOLERANCE * float(before.abs().max()) else network
+        before, after = network(images), folded(images)
+    return (
+        folded
+        if float((after - before).abs().max()) <= TOLERANCE * float(before.abs().max())
+        else network
+    )
 
 
 def _fold(parent: nn.Module) -> None:
     """Fold what is in `parent`."""
     before = None
     for name, part in list(parent.named_children()):
-        if isinstance(before, nn.Conv2d) and isinstance(part, nn.BatchNorm2d) and part.track_running_stats:
-            mean, variance = cast(torch.Tensor, part.running_mean), cast(torch.Tensor, part.running_var)
+        if (
+            isinstance(before, nn.Conv2d)
+            and isinstance(part, nn.BatchNorm2d)
+            and part.track_running_stats
+        ):
+            mean, variance = (
+                cast(torch.Tensor, part.running_mean),
+                cast(torch.Tensor, part.running_var),
+            )
             before.weight, before.bias = fuse_conv_bn_weights(
                 before.weight, before.bias, mean, variance, part.eps, part.weight, part.bias
             )
-            parent.register_module(name, getattr(part, "act", nn.Identity()))  # timm's BatchNorm holds what follows it
+            parent.register_module(
+                name, getattr(part, "act", nn.Identity())
+            )  # timm's BatchNorm holds what follows it
         else:
             _fold(part)
         before = part

@@ -1,8 +1,8 @@
 """`imagenet`: ResNet-50 supervised on ImageNet-1k; the variant is known by its file's hash.
 
-The paper's code took torchvision's first weights (V1), which timm hosts as `resnet50.tv_in1k`. Other files
-of the same names and shapes differ in ways that fail silently: `VARIANTS` says for each known file what it
-is, where its stride stands and what its statistics are.
+The paper's code took torchvision's first weights (V1), which timm hosts as `resnet50.tv_in1k`.
+Other files of the same names and shapes differ in ways that fail silently: `VARIANTS` says for each
+known file what it is, where its stride stands and what its statistics are.
 """
 
 from dataclasses import dataclass, replace
@@ -49,7 +49,8 @@ class Variant:
         source: what the file is.
         licence: SPDX name.
         mean: per-channel mean in [0, 1].
-        stride_on_first: the stride of 2 stands on the 1×1 `conv1` of a stage's first block, not on `conv2`.
+        stride_on_first: the stride of 2 stands on the 1×1 `conv1` of a stage's first block, not on
+            `conv2`.
         interpolation: how its own evaluation resized.
     """
 
@@ -64,10 +65,23 @@ class Variant:
 
 VARIANTS = (
     Variant(
-        "model.safetensors", str(CARD.sha256), "timm resnet50.tv_in1k (torchvision IMAGENET1K_V1)", "BSD-3-Clause"
+        "model.safetensors",
+        str(CARD.sha256),
+        "timm resnet50.tv_in1k (torchvision IMAGENET1K_V1)",
+        "BSD-3-Clause",
     ),
-    Variant("resnet50-0676ba61.pth", "0676ba61", "torchvision ResNet50_Weights.IMAGENET1K_V1", "BSD-3-Clause"),
-    Variant("resnet50-11ad3fa6.pth", "11ad3fa6", "torchvision ResNet50_Weights.IMAGENET1K_V2", "BSD-3-Clause"),
+    Variant(
+        "resnet50-0676ba61.pth",
+        "0676ba61",
+        "torchvision ResNet50_Weights.IMAGENET1K_V1",
+        "BSD-3-Clause",
+    ),
+    Variant(
+        "resnet50-11ad3fa6.pth",
+        "11ad3fa6",
+        "torchvision ResNet50_Weights.IMAGENET1K_V2",
+        "BSD-3-Clause",
+    ),
     Variant(
         "resnet50.a1_in1k.safetensors",
         "773525d5821de224f8f30c33377b7a795d7863e08522698200d3217d3f2a41bb",
@@ -87,7 +101,9 @@ VARIANTS = (
 
 
 def classifier(card: EncoderCard, path: Path) -> "tuple[EncoderCard, nn.Module]":
-    """Build the network with its classifier, where the file holds one, and the card of its variant."""
+    """Build the network with its classifier, where the file holds one, and the card of its
+    variant.
+    """
     import timm
 
     from encoders.base import load_exactly, read_tensors

@@ -1,7 +1,8 @@
-"""`imagenet-lite-early`: the first three stages of `imagenet-lite`, for a trained head on its map (`--pool spatial`).
+"""`imagenet-lite-early`: the first three stages of `imagenet-lite`, for a trained head on its map
+(`--pool spatial`).
 
-A map of 28 × 28 places still says where a thin needle lies, which the last layer's 7 × 7 and a global feature lose
-(docs/results/best.md compares), at a third of the whole network's arithmetic.
+A map of 28 × 28 places still says where a thin needle lies, which the last layer's 7 × 7 and a
+global feature lose (docs/results/best.md compares), at a third of the whole network's arithmetic.
 """
 
 from dataclasses import replace
@@ -28,7 +29,9 @@ CARD = replace(
 
 
 def early_of(network: Any) -> "nn.Module":
-    """Return the network (B, 3, 224, 224) → (B, 40), map (B, 40, 28, 28), of timm's EfficientNet-Lite0."""
+    """Return the network (B, 3, 224, 224) → (B, 40), map (B, 40, 28, 28), of timm's
+    EfficientNet-Lite0.
+    """
     from encoders.base import MapNetwork
 
     return MapNetwork(network.conv_stem, network.bn1, *network.blocks[:STAGES])

@@ -1,8 +1,9 @@
-"""EfficientNet-Lite0 whose weights are installed by pip: what `imagenet-lite` and `imagenet-lite-early` share.
+"""EfficientNet-Lite0 whose weights are installed by pip: what `imagenet-lite` and
+`imagenet-lite-early` share.
 
-The package ships one torch file whose tensors stand in the same order, with the same shapes, as those of
-timm's `tf_efficientnet_lite0`; only the names differ, so they are mapped by position. Checked by
-classification in tests/test_encoders.py.
+The package ships one torch file whose tensors stand in the same order, with the same shapes, as
+those of timm's `tf_efficientnet_lite0`; only the names differ, so they are mapped by position.
+Checked by classification in tests/test_encoders.py.
 """
 
 import importlib.util
@@ -42,7 +43,9 @@ def packaged_file() -> Path:
     """Return where pip put the weights, without importing their package."""
     spec = importlib.util.find_spec(PACKAGE)
     if spec is None or not spec.submodule_search_locations:
-        raise MissingWeights(f"Encoder 'imagenet-lite' needs the package {PACKAGE}; run `make setup`.")
+        raise MissingWeights(
+            f"Encoder 'imagenet-lite' needs the package {PACKAGE}; run `make setup`."
+        )
     return Path(spec.submodule_search_locations[0]) / "models" / str(CARD.filename)
 
 
@@ -54,7 +57,9 @@ def network_from(tensors: dict, where: object) -> "nn.Module":
     wanted = network.state_dict()
     shapes = [tuple(tensor.shape) for tensor in tensors.values()]
     if shapes != [tuple(tensor.shape) for tensor in wanted.values()]:
-        raise BadFile(f"{where} does not hold EfficientNet-Lite0: {len(shapes)} tensors, {len(wanted)} wanted.")
+        raise BadFile(
+            f"{where} does not hold EfficientNet-Lite0: {len(shapes)} tensors, {len(wanted)} wanted."
+        )
     network.load_state_dict(dict(zip(wanted, tensors.values(), strict=True)))
     network.reset_classifier(0)
     return network

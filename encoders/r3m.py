@@ -1,8 +1,8 @@
 """`r3m`: ResNets trained on Ego4D by time contrast and language (Nair et al., CoRL 2022).
 
-R3M takes pictures in 0–255, divides by 255 and normalises with ImageNet's statistics itself; the card
-writes that as a mean and a standard deviation in units of 0–255. The released SurgicAI code normalised a
-second time before it (`RELEASED`).
+R3M takes images in 0–255, divides by 255 and normalises with ImageNet's statistics itself; the card
+writes that as a mean and a standard deviation in units of 0–255. The released SurgicAI code
+normalised a second time before it (`RELEASED`).
 """
 
 from dataclasses import replace
@@ -47,7 +47,9 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     if path is None:
         raise BadFile(f"Encoder '{card.name}' needs a weights file.")
     named = {key.removeprefix("module."): value for key, value in read_tensors(path).items()}
-    tensors = {key.removeprefix(PREFIX): value for key, value in named.items() if key.startswith(PREFIX)}
+    tensors = {
+        key.removeprefix(PREFIX): value for key, value in named.items() if key.startswith(PREFIX)
+    }
     network = timm.create_model(card.architecture.removeprefix("timm "), num_classes=0)
     load_exactly(network, {k: v for k, v in tensors.items() if not k.startswith("fc.")}, path)
     return card, network
@@ -66,8 +68,9 @@ def _smaller(depth: int) -> EncoderCard:
     )
 
 
-# The released code normalised pictures in [0, 1] with ImageNet's statistics and handed them to a network that does
-# the same once more to pictures in 0–255: ((x - m) / s / 255 - m) / s = (x - m (1 + 255 s)) / (255 s²).
+# The released code normalised images in [0, 1] with ImageNet's statistics and handed them to a
+# network that does the same once more to images in 0–255: ((x - m) / s / 255 - m) / s = (x - m (1 +
+# 255 s)) / (255 s²).
 _TWICE = {
     "input_range": (0.0, 1.0),
     "mean": tuple(m / 255 * (1 + s) for m, s in zip(CARD.mean, CARD.std, strict=True)),

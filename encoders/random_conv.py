@@ -1,8 +1,10 @@
-"""`random-conv`: four convolutions that were never trained, for a trained pooling on top (`--pool spatial`).
+"""`random-conv`: four convolutions that were never trained, for a trained pooling on top (`--pool
+spatial`).
 
-A map of 28 × 28 places keeps where things are, which a global feature loses, at a fiftieth of a ResNet-50's
-arithmetic. Random filters followed by a trained choice among their answers are an old and strong baseline where
-pictures come from one scene (Jarrett et al., What is the best multi-stage architecture for object recognition?, 2009).
+A map of 28 × 28 places keeps where things are, which a global feature loses, at a fiftieth of a
+ResNet-50's arithmetic. Random filters followed by a trained choice among their answers are an old
+and strong baseline where images come from one scene (Jarrett et al., What is the best multi-stage
+architecture for object recognition?, 2009).
 """
 
 from pathlib import Path
@@ -39,7 +41,9 @@ CARD = EncoderCard(
 
 
 def network_from(seed: int) -> "nn.Module":
-    """Build the network (B, 3, 224, 224) → (B, 48), map (B, 48, 28, 28); the global random state stays as it was."""
+    """Build the network (B, 3, 224, 224) → (B, 48), map (B, 48, 28, 28); the global random state
+    stays as it was.
+    """
     import torch
     from torch import nn
 
@@ -61,7 +65,9 @@ def network_from(seed: int) -> "nn.Module":
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
     """Build the network from its seed."""
     if path is not None:
-        raise InputError(f"Encoder 'random-conv' takes no weights file, got {path}; leave --weights out.")
+        raise InputError(
+            f"Encoder 'random-conv' takes no weights file, got {path}; leave --weights out."
+        )
     return card, network_from(int(card.revision))
 
 

@@ -1,7 +1,8 @@
-"""`random`: the paper's control, a randomly initialised ResNet-50; the same seed gives the same network.
+"""`random`: the paper's control, a randomly initialised ResNet-50; the same seed gives the same
+network.
 
-torchvision's initialisation (He normal, fan out; BatchNorm at scale 1 and shift 0). timm's default would
-start the last BatchNorm of each block at scale 0, which switches every residual branch off.
+torchvision's initialisation (He normal, fan out; BatchNorm at scale 1 and shift 0). timm's default
+would start the last BatchNorm of each block at scale 0, which switches every residual branch off.
 """
 
 from pathlib import Path
@@ -42,7 +43,9 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     import torch
 
     if path is not None:
-        raise InputError(f"Encoder 'random' takes no weights file, got {path}; leave --weights out.")
+        raise InputError(
+            f"Encoder 'random' takes no weights file, got {path}; leave --weights out."
+        )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(card.revision))
         network = timm.create_model("resnet50", num_classes=0, zero_init_last=False)

@@ -1,13 +1,15 @@
-"""How SurgicAI's released code fed its encoders where it departs from the paper (`config.Deviations`).
+"""How SurgicAI's released code fed its encoders where it departs from the paper
+(`config.Deviations`).
 
 Interface:
 
 * `changed(plugin, card, deviations) -> EncoderCard`: the card that the switches amount to.
-* `drifted(network, batches) -> bytes`: the BatchNorm statistics (safetensors) that a network left under
-  `train()` ends with; `restore(network, path)` puts them into a fresh one.
+* `drifted(network, batches) -> bytes`: the BatchNorm statistics (safetensors) that a network left
+  under `train()` ends with; `restore(network, path)` puts them into a fresh one.
 
-What is reproduced of the drift is its end: one set of statistics, with which features are then cached and policies
-evaluated. The released code also trained on features that changed with each batch.
+What is reproduced of the drift is its end: one set of statistics, with which features are then
+cached and policies evaluated. The released code also trained on features that changed with each
+batch.
 """
 
 from collections.abc import Iterable
@@ -37,23 +39,26 @@ def changed(plugin: Plugin, card: EncoderCard, deviations: Deviations) -> Encode
 
 
 def drifted(network: nn.Module, batches: Iterable[torch.Tensor]) -> bytes:
-    """Pass pictures through a network that is not frozen yet; return its BatchNorm statistics as safetensors.
+    """Pass images through a network that is not frozen yet; return its BatchNorm statistics as
+    safetensors.
 
     Args:
         network: as built, in float32.
-        batches: normalised pictures, (B, 3, S, S) float32 each, of demonstrations.
+        batches: normalised images, (B, 3, S, S) float32 each, of demonstrations.
 
     Raises:
         InputError: a network without BatchNorm, which cannot drift.
     """
     if not _statistics(network):
-        raise InputError("This encoder has no BatchNorm, so nothing of it drifts; leave batch_norm_drift off.")
+        raise InputError(
+            "This encoder has no BatchNorm, so nothing of it drifts; leave batch_norm_drift off."
+        )
     device = best_device()
     network.to(device).to(memory_format=torch.channels_last).train()  # type: ignore[call-overload]
     mixed = best_dtype(device)
     with torch.no_grad(), torch.autocast(device.type, mixed, enabled=mixed != torch.float32):
-        for pictures in batches:
-            network(pictures.to(device).contiguous(memory_format=torch.channels_last))
+        for images in batches:
+            network(images.to(device).contiguous(memory_format=torch.channels_last))
     return save({name: value.cpu().clone() for name, value in _statistics(network).items()})
 
 
@@ -62,13 +67,19 @@ def restore(network: nn.Module, path: Path) -> None:
     try:
         tensors = load_file(path)
     except (SafetensorError, OSError) as error:
-        raise BadFile(f"{path} is not a whole safetensors file ({str(error).splitlines()[0]}).") from None
+        raise BadFile(
+            f"{path} is not a whole safetensors file ({str(error).splitlines()[0]})."
+        ) from None
     wanted = _statistics(network)
-    if {name: value.shape for name, value in tensors.items()} != {name: v.shape for name, v in wanted.items()}:
+    if {name: value.shape for name, value in tensors.items()} != {
+        name: v.shape for name, v in wanted.items()
+    }:
         raise BadFile(f"{path} does not hold the BatchNorm statistics of this encoder.")
     network.load_state_dict(tensors, strict=False)
 
 
 def _statistics(network: nn.Module) -> dict[str, torch.Tensor]:
     """Return the running means and variances of a network."""
-    return {name: value for name, value in network.state_dict().items() if name.endswith(STATISTICS)}
+    return {
+        name: value for name, value in network.state_dict().items() if name.endswith(STATISTICS)
+    }

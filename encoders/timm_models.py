@@ -1,7 +1,7 @@
 """`dinov2`, `siglip2` and `timm:<name>`: any network of timm with its own weights and statistics.
 
-`timm:<name>` takes the card from timm's own table, the licence included; the feature is timm's pooled
-output without a classifier.
+`timm:<name>` takes the card from timm's own table, the licence included; the feature is timm's
+pooled output without a classifier.
 """
 
 from dataclasses import replace
@@ -62,21 +62,28 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     if path is None:
         raise BadFile(f"Encoder '{card.name}' needs a weights file.")
     name = card.architecture.removeprefix("timm ")
-    # A size other than the one trained at has to be told to networks with position embeddings, and only them.
+    # A size other than the one trained at has to be told to networks with position embeddings, and
+    # only them.
     resized = {} if card.input_size == _trained_size(name) else {"img_size": card.input_size}
     with torch.random.fork_rng(devices=[]):
         try:
             network = timm.create_model(
-                name, pretrained=True, pretrained_cfg_overlay={"file": str(path)}, num_classes=0, **resized
+                name,
+                pretrained=True,
+                pretrained_cfg_overlay={"file": str(path)},
+                num_classes=0,
+                **resized,
             )
         except DAMAGED as error:
             reason = " ".join(str(error).split())[:160]
-            raise BadFile(f"{path} does not hold the weights of timm's {name} ({reason}).") from None
+            raise BadFile(
+                f"{path} does not hold the weights of timm's {name} ({reason})."
+            ) from None
     return replace(card, sha256=sha256_file(path)), network
 
 
 def _trained_size(name: str) -> int:
-    """Side of the pictures a timm network was trained on [px]."""
+    """Side of the images a timm network was trained on [px]."""
     import timm
 
     return int(timm.get_pretrained_cfg(name).input_size[-1])
@@ -93,7 +100,9 @@ def plugin_for(name: str) -> Plugin:
     model = name.removeprefix(PREFIX)
     known = timm.list_pretrained()
     if model not in known and model not in timm.list_models(pretrained=True):
-        near = [other for other in known if other.startswith(model[:6])][:20] or ["resnet18.a1_in1k"]
+        near = [other for other in known if other.startswith(model[:6])][:20] or [
+            "resnet18.a1_in1k"
+        ]
         raise UnknownName("timm network (a few of timm.list_pretrained() follow)", model, near)
     config = timm.get_pretrained_cfg(model)
     with_tag = f"{config.architecture}.{config.tag}" if config.tag else config.architecture

@@ -1,7 +1,8 @@
-"""`vc1`: VC-1, a masked autoencoder's ViT-B/16 trained on egocentric video (non-commercial weights).
+"""`vc1`: VC-1, a masked autoencoder's ViT-B/16 trained on egocentric video (non-commercial
+weights).
 
-VC-1 resizes to 256 and crops to 224; here the whole picture is resized to 224, so that no part of a view
-is cut off. The feature is the class token after the last norm.
+VC-1 resizes to 256 and crops to 224; here the whole image is resized to 224, so that no part of a
+view is cut off. The feature is the class token after the last norm.
 """
 
 from dataclasses import replace
@@ -32,7 +33,7 @@ CARD = EncoderCard(
     dim=768,
     paper="Majumdar et al., Where are we in the search for an Artificial Visual Cortex?, NeurIPS 2023",
     layers="class and patch tokens after the last norm (tokens), the class token (global)",
-    note="No centre crop: the whole picture is resized.",
+    note="No centre crop: the whole image is resized.",
 )
 
 

@@ -3,9 +3,10 @@
 Interface:
 
 * `find(card, weights, accept_licence) -> Path | None`: in this order: the file given, the folder of
-  `SURGICAI_VISION_WEIGHTS`, the hub's cache, a download into our own cache (resumed where one was broken off).
-  Whatever was not handed over by name is checked against the card's hash; a card without one ("unpinned") takes
-  the hash the hub itself gives. Without a network it raises `MissingWeights` within seconds.
+  `SURGICAI_VISION_WEIGHTS`, the hub's cache, a download into our own cache (resumed where one was
+  broken off). Whatever was not handed over by name is checked against the card's hash; a card
+  without one ("unpinned") takes the hash the hub itself gives. Without a network it raises
+  `MissingWeights` within seconds.
 
 In the folder of `SURGICAI_VISION_WEIGHTS` a file is looked for as `<encoder>/<filename>`,
 `<encoder>.<suffix>` and `<filename>`.
@@ -66,7 +67,9 @@ def find(
 
 
 def missing_line(card: EncoderCard, offline_encoders: tuple[str, ...], problem: str = "") -> str:
-    """Say in one line which file is wanted, from where, what went wrong, and what works without it."""
+    """Say in one line which file is wanted, from where, what went wrong, and what works without
+    it.
+    """
     return (
         f"Encoder '{card.name}' needs {card.filename} of the hub repository {card.source} "
         f"(revision {card.revision}, sha256 {card.sha256 or 'unpinned'}), and it is neither here nor "
@@ -78,7 +81,9 @@ def missing_line(card: EncoderCard, offline_encoders: tuple[str, ...], problem: 
 def _given(card: EncoderCard, path: Path, known: Mapping[str, str]) -> Path:
     """Accept a file named by the caller; say so when it is not a published one."""
     if not path.is_file():
-        raise BadFile(f"--weights {path} is not a file; give the weights file of encoder '{card.name}'.")
+        raise BadFile(
+            f"--weights {path} is not a file; give the weights file of encoder '{card.name}'."
+        )
     published = [sha256 for sha256 in (card.sha256, *known.values()) if sha256]
     if published and not sha256_file(path).startswith(tuple(published)):
         warnings.warn(
@@ -95,7 +100,11 @@ def _in_folder(card: EncoderCard, wanted: Mapping[str, str | None]) -> Path | No
     if not folder:
         return None
     for filename, sha256 in wanted.items():
-        places = (Path(card.name) / filename, Path(card.name + Path(filename).suffix), Path(filename))
+        places = (
+            Path(card.name) / filename,
+            Path(card.name + Path(filename).suffix),
+            Path(filename),
+        )
         for place in places:
             path = Path(folder) / place
             if path.is_file():
@@ -106,7 +115,9 @@ def _in_folder(card: EncoderCard, wanted: Mapping[str, str | None]) -> Path | No
 def check_hash(path: Path, sha256: str | None) -> Path:
     """Return `path` if its hash is `sha256` begins so (or None is known), else refuse it."""
     if sha256 is not None and not (actual := sha256_file(path)).startswith(sha256):
-        raise BadFile(f"{path} is damaged or another file: sha256 {actual}, expected {sha256}; replace it.")
+        raise BadFile(
+            f"{path} is damaged or another file: sha256 {actual}, expected {sha256}; replace it."
+        )
     return path
 
 
@@ -122,7 +133,9 @@ def _in_hub_cache(card: EncoderCard) -> Path | None:
 
 
 def _downloaded(card: EncoderCard) -> tuple[Path | None, str]:
-    """Return what was downloaded before, or fetch it when the hub answers at all; else None and why."""
+    """Return what was downloaded before, or fetch it when the hub answers at all; else None and
+    why.
+    """
     from encoders.download import BrokenOff, fetch
 
     folder = cache_root() / "weights" / card.source.replace("/", "--") / card.revision

@@ -2,14 +2,14 @@
 
 Interface:
 
-* `Policy`: abstract torch module. `policy.act(features (B, F) float32 | None, agent_pos (B, 7) float32)
-  -> (B, 7) float32` for use; `policy.loss(features, agent_pos, action)` for training.
-* `Plugin(name, recipe, make)`: what a member file offers: its frozen recipe type and the function that
-  builds an untrained policy, `make(recipe, visual)`.
+* `Policy`: abstract torch module. `policy.act(features (B, F) float32 | None, agent_pos (B, 7)
+  float32) -> (B, 7) float32` for use; `policy.loss(features, agent_pos, action)` for training.
+* `Plugin(name, recipe, make)`: what a member file offers: its frozen recipe type and the function
+  that builds an untrained policy, `make(recipe, visual)`.
 * `Inputs`: what a policy is fed.
 
-Actions must not depend on how many environments are asked at once: `act` computes in float64 and rounds to
-float32, which hides the order in which a matrix product was summed.
+Actions must not depend on how many environments are asked at once: `act` computes in float64 and
+rounds to float32, which hides the order in which a matrix product was summed.
 """
 
 import abc
@@ -49,17 +49,22 @@ class Recipe:
         batch_norm: put BatchNorm before each hidden layer.
         learning_rate: Adam's.
         weight_decay: decoupled weight decay (AdamW) [per step, times the learning rate].
-        schedule: "constant", or "one_cycle": up to the learning rate over the first third, then down to nothing
-            (Smith and Topin, Super-convergence, 2017).
+        schedule: "constant", or "one_cycle": up to the learning rate over the first third, then
+            down to nothing (Smith and Topin, Super-convergence, 2017).
         epochs: passes over the training frames; the last one is the checkpoint.
         batch_size: frames per step.
         split: "episode", or "transition" as the released code did (neighbouring frames leak).
         validation: share of the episodes (or transitions) held out of training.
-        proprioception: feed tip pose and jaw too: the active arm's, for a high-level policy both arms'.
-        clock: feed how long the subtask has been on as well (needs proprioception): for demonstrations that act by it.
-        map_head: what takes in a feature map: "softmax" (where each of 32 patterns lies) or "convolutions".
-        every: train on every so-manieth frame of each episode alone, from its first: neighbours say nearly the same.
-        privileged: feed the 21 values of obs_type "state", goal included, in place of all else: a ceiling.
+        proprioception: feed tip pose and jaw too: the active arm's, for a high-level policy both
+            arms'.
+        clock: feed how long the subtask has been on as well (needs proprioception): for
+            demonstrations that act by it.
+        map_head: what takes in a feature map: "softmax" (where each of 32 patterns lies) or
+            "convolutions".
+        frame_stride: train on every so-manieth frame of each episode alone, from its first:
+            neighbours say nearly the same.
+        privileged: feed the 21 values of obs_type "state", goal included, in place of all else: a
+            ceiling.
         deviations: of the released code, outside its training.
     """
 
@@ -75,7 +80,7 @@ class Recipe:
     proprioception: bool = True
     clock: bool = False
     map_head: str = "softmax"
-    every: int = 1
+    frame_stride: int = 1
     privileged: bool = False
     deviations: Deviations = field(default_factory=Deviations)
 
@@ -83,12 +88,16 @@ class Recipe:
         check_name("split", self.split, ("episode", "transition"))
         check_name("schedule", self.schedule, ("constant", "one_cycle"))
         check_name("map_head", self.map_head, ("softmax", "convolutions"))
-        if self.every < 1:
-            raise InputError(f"every is {self.every}; it must be at least 1.")
+        if self.frame_stride < 1:
+            raise InputError(f"frame_stride is {self.frame_stride}; it must be at least 1.")
         if not self.hidden or min(self.hidden) < 1:
-            raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1 or more.")
+            raise InputError(
+                f"hidden is {self.hidden}; give at least one layer of width 1 or more."
+            )
         if self.epochs < 1 or self.batch_size < 2:
-            raise InputError(f"epochs is {self.epochs}, batch_size {self.batch_size}; at least 1 and 2.")
+            raise InputError(
+                f"epochs is {self.epochs}, batch_size {self.batch_size}; at least 1 and 2."
+            )
         if not self.learning_rate > 0:
             raise InputError(f"learning_rate is {self.learning_rate}; it must be above 0.")
         if self.clock and (self.privileged or not self.proprioception):
@@ -104,8 +113,8 @@ class Inputs:
     """What a policy is fed.
 
     Attributes:
-        visual: shape of each view's feature, in the order of the views: (dim,), (C, h, w) or (N, C);
-            rows are flattened; empty without pictures.
+        visual: shape of each view's feature, in the order of the views: (dim,), (C, h, w) or (N,
+            C); rows are flattened; empty without images.
         vector: key of `VECTORS`, what is fed beside the features; None for the features alone.
     """
 
@@ -114,9 +123,13 @@ class Inputs:
 
     def __post_init__(self) -> None:
         if not self.visual and not self.vector:
-            raise InputError("A policy needs at least one view or proprioception; this one would be blind.")
+            raise InputError(
+                "A policy needs at least one view or proprioception; this one would be blind."
+            )
         if self.visual and self.vector == names.PRIVILEGED_STATE:
-            raise InputError("A policy with pictures may not see the privileged state; give one or the other.")
+            raise InputError(
+                "A policy with images may not see the privileged state; give one or the other."
+            )
 
     @property
     def features(self) -> int:
@@ -138,7 +151,8 @@ class Plugin:
         recipe: frozen dataclass of its settings.
         make: (recipe, shape of each view's feature) → untrained policy.
         target: dataset key of what it learns.
-        ahead: frames by which the target is ahead of what is seen; the last frame's at an episode's end.
+        ahead: frames by which the target is ahead of what is seen; the last frame's at an episode's
+            end.
     """
 
     name: str
@@ -169,15 +183,21 @@ class Policy(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return answers (B, n) for normalised inputs (B, inputs.dim): actions, or logits of classes."""
+        """Return answers (B, n) for normalised inputs (B, inputs.dim): actions, or logits of
+        classes.
+        """
 
     @abc.abstractmethod
     def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Return the training loss (scalar) for normalised inputs and demonstrated answers (B, …)."""
+        """Return the training loss (scalar) for normalised inputs and demonstrated answers (B,
+        …).
+        """
 
     @final
     def normalise(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return raw inputs (B, inputs.dim) with zero mean and unit variance over the training frames."""
+        """Return raw inputs (B, inputs.dim) with zero mean and unit variance over the training
+        frames.
+        """
         return (observed - self.input_mean) / self.input_std
 
     @final
@@ -185,9 +205,10 @@ class Policy(nn.Module, abc.ABC):
         """Return the answers to a batch of observations.
 
         Args:
-            features: (B, `inputs.features`) float32, the views' rows side by side; None without views.
-            agent_pos: (B, 7) float32, x y z [m] roll pitch yaw [rad] jaw [rad] of the active tip in its base;
-                the vector of `inputs.vector` where that is another.
+            features: (B, `inputs.features`) float32, the views' rows side by side; None without
+                views.
+            agent_pos: (B, 7) float32, x y z [m] roll pitch yaw [rad] jaw [rad] of the active tip in
+                its base; the vector of `inputs.vector` where that is another.
 
         Returns:
             (B, 7) float32 in [-1, 1]; (B, 5) logits of a high-level policy.
@@ -199,7 +220,9 @@ class Policy(nn.Module, abc.ABC):
         exact = self._exact
         if exact is None:
             exact = copy.deepcopy(self).double().eval().requires_grad_(False)
-            object.__setattr__(self, "_exact", exact)  # not a submodule: it must not enter the state dict
+            object.__setattr__(
+                self, "_exact", exact
+            )  # not a submodule: it must not enter the state dict
         with torch.inference_mode():
             return exact(exact.normalise(torch.from_numpy(observed))).float().numpy()
 
@@ -216,10 +239,14 @@ class Policy(nn.Module, abc.ABC):
         parts = [] if features is None else [np.asarray(features)]
         width = parts[0].shape[1:] if parts else (0,)
         if width != (self.inputs.features,):
-            raise InputError(f"The policy was trained on features of {self.inputs.visual}, got {width}.")
+            raise InputError(
+                f"The policy was trained on features of {self.inputs.visual}, got {width}."
+            )
         key = self.inputs.vector or names.STATE
         if agent_pos.shape[1:] != (VECTORS[key],) or (parts and len(parts[0]) != len(agent_pos)):
-            raise InputError(f"{key} must be (batch, {VECTORS[key]}) with one row a picture, got {agent_pos.shape}.")
+            raise InputError(
+                f"{key} must be (batch, {VECTORS[key]}) with one row an image, got {agent_pos.shape}."
+            )
         if self.inputs.vector:
             parts.append(agent_pos)
         observed = np.concatenate(parts, axis=1).astype(np.float64)

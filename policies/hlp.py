@@ -1,8 +1,8 @@
 """`hlp`: the paper's high-level policy, which says the subtask that is due.
 
-The recipe `paper` (paper, Section 4 and appendix): the network of `bc` with the logits of five classes at its
-end; cross-entropy against the phases of whole procedures, a little ahead (`AHEAD`); visual features beside the
-tip pose and jaw of both arms.
+The recipe `paper` (paper, Section 4 and appendix): the network of `bc` with the logits of five
+classes at its end; cross-entropy against the phases of whole procedures, a little ahead (`AHEAD`);
+visual features beside the tip pose and jaw of both arms.
 """
 
 from typing import final
@@ -17,9 +17,10 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
 
 AHEAD = 10
-"""Frames by which labels are ahead. In our recordings a subtask goes on for 15 frames after its success, while
-hardly anything moves; labelled as they stand, its last frame and the first of the next subtask could not be told
-apart, and a policy asked there would name the old one for ever. What is due there is the next."""
+"""Frames by which labels are ahead. In our recordings a subtask goes on for 15 frames after its
+success, while hardly anything moves; labelled as they stand, its last frame and the first of the
+next subtask could not be told apart, and a policy asked there would name the old one for ever. What
+is due there is the next."""
 
 
 @final
@@ -28,7 +29,7 @@ class HighLevelPolicy(Policy):
 
     def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
         if recipe.privileged:
-            raise InputError("Policy 'hlp' sees both arms and pictures; leave 'privileged' off.")
+            raise InputError("Policy 'hlp' sees both arms and images; leave 'privileged' off.")
         super().__init__(Inputs(visual, names.BOTH_ARMS if recipe.proprioception else None))
         self.network = FeatureMLP(recipe, self.inputs, len(names.SUBTASKS))
 
@@ -41,7 +42,9 @@ class HighLevelPolicy(Policy):
         return nn.functional.cross_entropy(self(observed), target)
 
     def choose(self, features: np.ndarray | None, both_arms: np.ndarray) -> np.ndarray:
-        """Return the subtask that is due, (B,) indices in `names.SUBTASKS`, for a batch as `act` takes it."""
+        """Return the subtask that is due, (B,) indices in `names.SUBTASKS`, for a batch as `act`
+        takes it.
+        """
         return self.act(features, both_arms).argmax(axis=1)
 
 

@@ -1,7 +1,7 @@
 """Layers the members share: what takes in each kind of feature, and the paper's MLP.
 
-A global feature (the paper's) enters as it is; a feature map passes a trained spatial softmax or trained
-convolutions, and tokens a trained attention, before the MLP.
+A global feature (the paper's) enters as it is; a feature map passes a trained spatial softmax or
+trained convolutions, and tokens a trained attention, before the MLP.
 """
 
 import math
@@ -14,7 +14,9 @@ from torch import nn
 from policies.base import Inputs, Recipe
 from surgicai_vision.core.errors import InputError
 
-POINTS = 32  # patterns of a spatial softmax (Levine et al., End-to-end visuomotor policies, JMLR 2016)
+POINTS = (
+    32  # patterns of a spatial softmax (Levine et al., End-to-end visuomotor policies, JMLR 2016)
+)
 
 
 @final
@@ -32,25 +34,34 @@ class GlobalFeature(nn.Module):
 
 @final
 class SpatialSoftmax(nn.Module):
-    """A trained spatial softmax: where in the picture each of `POINTS` learned patterns lies, in [-1, 1]."""
+    """A trained spatial softmax: where in the image each of `POINTS` learned patterns lies, in [-1,
+    1].
+    """
 
     def __init__(self, channels: int, height: int, width: int):
         super().__init__()
         self.shape = (channels, height, width)
         self.dim = 2 * POINTS
         self.patterns = nn.Conv2d(channels, POINTS, 1)
-        y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
-        self.register_buffer("places", torch.stack([x.flatten(), y.flatten()], dim=1), persistent=False)
+        y, x = torch.meshgrid(
+            torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij"
+        )
+        self.register_buffer(
+            "places", torch.stack([x.flatten(), y.flatten()], dim=1), persistent=False
+        )
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the expected x and y of each pattern, (B, 2 · POINTS), for flattened maps (B, C·h·w)."""
+        """Return the expected x and y of each pattern, (B, 2 · POINTS), for flattened maps (B,
+        C·h·w).
+        """
         scores = self.patterns(rows.unflatten(1, self.shape)).flatten(2).softmax(dim=2)
         return (scores @ self.places).flatten(1)
 
 
 @final
 class MapConvolutions(nn.Module):
-    """Trained convolutions over a map, halved until at most 7 × 7 are left, then `FEATURES` numbers of them all.
+    """Trained convolutions over a map, halved until at most 7 × 7 are left, then `FEATURES` numbers
+    of them all.
 
     They see the needle's arc as a whole, where a softmax's 1 × 1 patterns see one place at a time.
     """
@@ -91,21 +102,32 @@ class TokenAttention(nn.Module):
 
 
 Head = GlobalFeature | SpatialSoftmax | MapConvolutions | TokenAttention
-MAP_HEADS: Mapping[str, Callable[..., Head]] = {"softmax": SpatialSoftmax, "convolutions": MapConvolutions}
+MAP_HEADS: Mapping[str, Callable[..., Head]] = {
+    "softmax": SpatialSoftmax,
+    "convolutions": MapConvolutions,
+}
 """`Recipe.map_head` → the layer that takes in a feature map."""
 
 
 def _head(shape: tuple[int, ...], map_head: str) -> Head:
     """Return the first layer for a feature of `shape`."""
-    heads: Mapping[int, Callable[..., Head]] = {1: GlobalFeature, 2: TokenAttention, 3: MAP_HEADS[map_head]}
+    heads: Mapping[int, Callable[..., Head]] = {
+        1: GlobalFeature,
+        2: TokenAttention,
+        3: MAP_HEADS[map_head],
+    }
     if len(shape) not in heads:
-        raise InputError(f"A feature of shape {shape} cannot be taken in; allowed are (dim,), (C, h, w) and (N, C).")
+        raise InputError(
+            f"A feature of shape {shape} cannot be taken in; allowed are (dim,), (C, h, w) and (N, C)."
+        )
     return heads[len(shape)](*shape)
 
 
 @final
 class FeatureMLP(nn.Module):
-    """The paper's network: hidden layers, each preceded by BatchNorm, on features beside a vector."""
+    """The paper's network: hidden layers, each preceded by BatchNorm, on features beside a
+    vector.
+    """
 
     def __init__(self, recipe: Recipe, inputs: Inputs, answers: int):
         super().__init__()

@@ -1,7 +1,7 @@
 """Print the renderer of a headless OpenGL context made through EGL, or fail with the reason.
 
-Runs with any python3 and no package, because it decides whether GL packages must be installed. It takes the
-road MuJoCo takes (libEGL, its devices, libGL), so that its answer is MuJoCo's.
+Runs with any python3 and no package, because it decides whether GL packages must be installed. It
+takes the road MuJoCo takes (libEGL, its devices, libGL), so that its answer is MuJoCo's.
 """
 
 import ctypes
@@ -38,7 +38,9 @@ def displays(egl):
     """Yield the initialised display of each EGL device."""
     pointer, number = ctypes.c_void_p, ctypes.c_int
     query = extension(egl, b"eglQueryDevicesEXT", ctypes.c_uint, number, pointer, pointer)
-    get_display = extension(egl, b"eglGetPlatformDisplayEXT", pointer, ctypes.c_uint, pointer, pointer)
+    get_display = extension(
+        egl, b"eglGetPlatformDisplayEXT", pointer, ctypes.c_uint, pointer, pointer
+    )
     devices, count = (pointer * 16)(), number()
     query(16, devices, ctypes.byref(count))
     for device in devices[: count.value]:
@@ -53,7 +55,9 @@ def renderer(egl, gl, display):
     wanted = (EGL_SURFACE_TYPE, EGL_PBUFFER_BIT, EGL_RENDERABLE_TYPE, EGL_OPENGL_BIT, EGL_NONE)
     config, count = pointer(), number()
     egl.eglBindAPI(EGL_OPENGL_API)
-    egl.eglChooseConfig(display, (number * len(wanted))(*wanted), ctypes.byref(config), 1, ctypes.byref(count))
+    egl.eglChooseConfig(
+        display, (number * len(wanted))(*wanted), ctypes.byref(config), 1, ctypes.byref(count)
+    )
     if not count.value:
         return None
     egl.eglCreateContext.restype = pointer

@@ -1,7 +1,8 @@
-"""LeRobot plug-in: importing it registers env type `surgicai`, policy type `surgicai_bc` and the gymnasium ids.
+"""LeRobot plug-in: importing it registers env type `surgicai`, policy type `surgicai_bc` and the
+gymnasium ids.
 
-`lerobot-train` and `lerobot-eval` import every distribution called `lerobot_env_…`, and so does a worker process
-that is handed an env of ours; nothing else is needed.
+`lerobot-train` and `lerobot-eval` import every distribution called `lerobot_env_…`, and so does a
+worker process that is handed an env of ours; nothing else is needed.
 """
 
 import surgicai_vision.envs  # noqa: F401  # registers the gymnasium ids

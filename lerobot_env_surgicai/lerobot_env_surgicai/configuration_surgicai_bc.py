@@ -20,11 +20,12 @@ class SurgicaiBcConfig(PreTrainedConfig):
     """Settings of `surgicai_bc`; the defaults are the recipe "paper" (configs/recipes/paper.yaml).
 
     Attributes:
-        encoder: frozen encoder of the pictures; null sees no picture.
+        encoder: frozen encoder of the images; null sees no image.
         encoder_weights: file with its pretrained weights, where it needs one that is not at hand.
         encoder_pool: "global", "spatial" or "tokens".
         encoder_sha256: hash of the encoder's weights; written in training, verified afterwards.
-        encoder_identity: hash of weights, preprocessing and pool; written in training, verified afterwards.
+        encoder_identity: hash of weights, preprocessing and pool; written in training, verified
+            afterwards.
         views: cameras; empty takes all the dataset has.
         hidden: width of each hidden layer.
         batch_norm: put BatchNorm before each hidden layer.
@@ -46,7 +47,8 @@ class SurgicaiBcConfig(PreTrainedConfig):
     push_to_hub: bool = False
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
-            # The encoder normalises pictures, BatchNorm the features; actions are within [-1, 1] already.
+            # The encoder normalises images, BatchNorm the features; actions are within [-1, 1]
+            # already.
             "VISUAL": NormalizationMode.IDENTITY,
             "ENV": NormalizationMode.IDENTITY,
             "STATE": NormalizationMode.MEAN_STD,
@@ -78,18 +80,23 @@ class SurgicaiBcConfig(PreTrainedConfig):
         Raises:
             InputError: the dataset or env lacks one of them, or acts otherwise than we do.
         """
-        given: dict[str, Any] = self.input_features or {}  # type: ignore[has-type]  # mypy skips its base
+        # mypy skips its base
+        given: dict[str, Any] = self.input_features or {}  # type: ignore[has-type]
         kept = {key: given[key] for key in self._wanted(given) if key in given}
         missing = [key for key in self._wanted(given) if key not in given]
         if missing or not kept:
-            raise InputError(f"surgicai_bc needs {', '.join(missing) or 'a view'}; given: {', '.join(given)}.")
+            raise InputError(
+                f"surgicai_bc needs {', '.join(missing) or 'a view'}; given: {', '.join(given)}."
+            )
         action = self.action_feature
         if action is None or tuple(action.shape) != (len(names.ACTION_NAMES),):
-            raise InputError(f"surgicai_bc acts in {len(names.ACTION_NAMES)} values; given: {action}.")
+            raise InputError(
+                f"surgicai_bc acts in {len(names.ACTION_NAMES)} values; given: {action}."
+            )
         self.input_features = kept
 
     def _wanted(self, given: dict[str, Any]) -> list[str]:
-        """Return the keys of the inputs, pictures first."""
+        """Return the keys of the inputs, images first."""
         state = [OBS_STATE] if self.proprioception else []
         if not self.encoder:
             return state
@@ -97,7 +104,9 @@ class SurgicaiBcConfig(PreTrainedConfig):
             visual = [key for key, feature in given.items() if feature.type is FeatureType.VISUAL]
             self.views = [view for view in names.CAMERAS if names.image_key(view) in visual]
             if not self.views:
-                raise InputError(f"surgicai_bc found no view of {', '.join(names.CAMERAS)} in {', '.join(given)}.")
+                raise InputError(
+                    f"surgicai_bc found no view of {', '.join(names.CAMERAS)} in {', '.join(given)}."
+                )
         return [*map(names.image_key, self.views), *state]
 
     @property

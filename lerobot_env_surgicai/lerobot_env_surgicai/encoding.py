@@ -1,4 +1,4 @@
-"""EncodeViews: the step between env and policy that turns pictures into frozen features."""
+"""EncodeViews: the step between env and policy that turns images into frozen features."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,14 +8,15 @@ from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_ENV_STATE
 
-from lerobot_env_surgicai.pictures import check_identity, encode, load_encoder
+from lerobot_env_surgicai.images import check_identity, encode, load_encoder
 from surgicai_vision.core import names
 
 
 @ProcessorStepRegistry.register("surgicai_encode_views")
 @dataclass
 class EncodeViews(ObservationProcessorStep):
-    """Replace the views' pictures by their features, `observation.environment_state` (B, views × dim).
+    """Replace the views' images by their features, `observation.environment_state` (B, views ×
+    dim).
 
     Attributes:
         encoder: the encoder's name.
@@ -30,16 +31,24 @@ class EncodeViews(ObservationProcessorStep):
     sha256: str = ""
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Return the observation with features in place of pictures."""
+        """Return the observation with features in place of images."""
         encoder = load_encoder(self.encoder, self.weights, "global")
         check_identity(encoder, self.sha256, "", "The policy")
         features = torch.from_numpy(encode(encoder, observation, self.views))
-        pictures = {names.image_key(view) for view in self.views}
-        return {**{key: value for key, value in observation.items() if key not in pictures}, OBS_ENV_STATE: features}
+        images = {names.image_key(view) for view in self.views}
+        return {
+            **{key: value for key, value in observation.items() if key not in images},
+            OBS_ENV_STATE: features,
+        }
 
     def get_config(self) -> dict[str, Any]:
         """Return the arguments of this step."""
-        return {"encoder": self.encoder, "views": self.views, "weights": self.weights, "sha256": self.sha256}
+        return {
+            "encoder": self.encoder,
+            "views": self.views,
+            "weights": self.weights,
+            "sha256": self.sha256,
+        }
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]

@@ -2,9 +2,9 @@
 
     lerobot-eval --env.type=surgicai --env.dataset=outputs/datasets/grasp --policy.path=…
 
-What a policy sees: `observation.images.<view>` and `observation.state` as in our datasets, never depth (ACT and
-Diffusion take three channels only). With `encoder` it sees `observation.environment_state`, the frozen features
-of the views, in place of the pictures.
+What a policy sees: `observation.images.<view>` and `observation.state` as in our datasets, never
+depth (ACT and Diffusion take three channels only). With `encoder` it sees
+`observation.environment_state`, the frozen features of the views, in place of the images.
 """
 
 import dataclasses
@@ -38,21 +38,22 @@ TASK_FIELDS = tuple(field.name for field in dataclasses.fields(TaskConfig))
 class SurgicaiEnv(EnvConfig):
     """An env of surgicai-vision.
 
-    What is None is taken from `dataset`, and without one is the default of `TaskConfig`, two views of 224 px, and
-    pictures. After that nothing is None but `encoder`, and `dataset` is forgotten: a saved configuration is whole.
+    What is None is taken from `dataset`, and without one is the default of `TaskConfig`, two views
+    of 224 px, and images. After that nothing is None but `encoder`, and `dataset` is forgotten: a
+    saved configuration is whole.
 
     Attributes:
         task: one of `names.TASKS`.
         dataset: a dataset of ours.
         cameras: views.
-        image_size: height and width of a picture [px].
+        image_size: height and width of an image [px].
         step: step-size preset.
         tolerance: "paper" or "released".
         reward: "sparse" or "dense".
         max_steps: episode limit [control steps].
         scene: the scene.
         randomisation: what differs from episode to episode besides the start.
-        encoder: show this encoder's features of the views in place of pictures.
+        encoder: show this encoder's features of the views in place of images.
         encoder_weights: file with the encoder's pretrained weights.
         encoder_sha256: hash of the weights it must have; empty for any.
     """
@@ -84,7 +85,10 @@ class SurgicaiEnv(EnvConfig):
             self.features[FEATURES] = PolicyFeature(FeatureType.ENV, (dim,))
         else:
             shape = (self.image_size, self.image_size, 3)
-            self.features |= {names.image_key(view): PolicyFeature(FeatureType.VISUAL, shape) for view in self.views}
+            self.features |= {
+                names.image_key(view): PolicyFeature(FeatureType.VISUAL, shape)
+                for view in self.views
+            }
         renamed = {AGENT_POS: OBS_STATE, FEATURES: OBS_ENV_STATE}
         self.features_map = {key: renamed.get(key, key) for key in self.features}
 
@@ -121,7 +125,9 @@ class SurgicaiEnv(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Return the arguments of `gymnasium.make`; its step limit gives LeRobot `_max_episode_steps`."""
+        """Return the arguments of `gymnasium.make`; its step limit gives LeRobot
+        `_max_episode_steps`.
+        """
         config = to_mapping(self.task_config())
         del config["task"]
         return {
@@ -133,11 +139,13 @@ class SurgicaiEnv(EnvConfig):
             "max_episode_steps": self.max_steps,
         }
 
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, VectorEnv]]:
         """Return `n_envs` envs side by side, in processes of their own when asked for.
 
-        A finished env waits for the others (`FreezeAfterEpisodeEnd`): its next episode would leak a step of
-        reward into this one's, and cost its rendering.
+        A finished env waits for the others (`FreezeAfterEpisodeEnd`): its next episode would leak a
+        step of reward into this one's, and cost its rendering.
         """
         make = functools.partial(make_one, self.gym_id, self.disable_env_checker, self.gym_kwargs)
         if use_async_envs and n_envs > 1:
@@ -153,10 +161,16 @@ class SurgicaiEnv(EnvConfig):
         """Return what stands between env and policy: the encoder, when there is one."""
         steps = []
         if self.encoder:
-            steps = [EncodeViews(self.encoder, self.views, self.encoder_weights, self.encoder_sha256)]
+            steps = [
+                EncodeViews(self.encoder, self.views, self.encoder_weights, self.encoder_sha256)
+            ]
         return PolicyProcessorPipeline(steps=steps), PolicyProcessorPipeline(steps=[])
 
 
 def make_one(gym_id: str, disable_env_checker: bool, arguments: dict[str, Any]) -> gymnasium.Env:
-    """Make one env; a function of this module, so that a worker process that unpickles it registers the ids."""
-    return FreezeAfterEpisodeEnd(gymnasium.make(gym_id, disable_env_checker=disable_env_checker, **arguments))
+    """Make one env; a function of this module, so that a worker process that unpickles it registers
+    the ids.
+    """
+    return FreezeAfterEpisodeEnd(
+        gymnasium.make(gym_id, disable_env_checker=disable_env_checker, **arguments)
+    )

@@ -1,7 +1,8 @@
 """`surgicai_bc`: behaviour cloning on frozen features, as a LeRobot policy.
 
-The network is the `bc` of surgicai-vision. The encoder is no part of the module: it is never saved, trained or put
-into training mode; its name and hashes stand in config.json and are verified whenever the policy is loaded.
+The network is the `bc` of surgicai-vision. The encoder is no part of the module: it is never saved,
+trained or put into training mode; its name and hashes stand in config.json and are verified
+whenever the policy is loaded.
 """
 
 import copy
@@ -16,7 +17,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from lerobot_env_surgicai.configuration_surgicai_bc import SurgicaiBcConfig
-from lerobot_env_surgicai.pictures import Remembered, check_identity, encode, identity, load_encoder
+from lerobot_env_surgicai.images import Remembered, check_identity, encode, identity, load_encoder
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.training import policies
@@ -26,7 +27,8 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
     """Behaviour cloning: frozen features and the tip's pose in, one action out.
 
     Attributes:
-        memoryless: True: an action depends on the present observation alone, so episodes may share a batch.
+        memoryless: True: an action depends on the present observation alone, so episodes may share
+            a batch.
     """
 
     config_class = SurgicaiBcConfig
@@ -40,16 +42,25 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
         self._training_encoder: Any = None
         visual: tuple[tuple[int, ...], ...] = ()
         if config.encoder:
-            self._encoder = load_encoder(config.encoder, config.encoder_weights, config.encoder_pool)
-            check_identity(self._encoder, config.encoder_sha256, config.encoder_identity, "surgicai_bc")
-            config.encoder_sha256, config.encoder_identity = self._encoder.weights_sha256, identity(self._encoder)
+            self._encoder = load_encoder(
+                config.encoder, config.encoder_weights, config.encoder_pool
+            )
+            check_identity(
+                self._encoder, config.encoder_sha256, config.encoder_identity, "surgicai_bc"
+            )
+            config.encoder_sha256, config.encoder_identity = (
+                self._encoder.weights_sha256,
+                identity(self._encoder),
+            )
             self._training_encoder = Remembered(self._encoder)
             visual = (self._encoder.shape,) * len(config.views)
         self.network = policies.policy_plugin("bc").make(config.recipe(), visual)
         self._acting: Any = None
 
     @classmethod
-    def from_pretrained(cls, pretrained_name_or_path: str | Path, *, strict: bool = True, **arguments: Any) -> Any:
+    def from_pretrained(
+        cls, pretrained_name_or_path: str | Path, *, strict: bool = True, **arguments: Any
+    ) -> Any:
         """Load a policy; unlike LeRobot's own, a tensor that is missing or unexpected is an error.
 
         Raises:
@@ -60,7 +71,9 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
             return super().from_pretrained(pretrained_name_or_path, strict=strict, **arguments)
         except (RuntimeError, SafetensorError) as error:
             reason = " ".join(str(error).split())[:200]
-            raise BadFile(f"{pretrained_name_or_path} holds no whole weights of surgicai_bc ({reason}).") from None
+            raise BadFile(
+                f"{pretrained_name_or_path} holds no whole weights of surgicai_bc ({reason})."
+            ) from None
 
     def get_optim_params(self) -> Any:
         """Return the parameters that are trained: the network's."""
@@ -103,7 +116,8 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
         """Return the action (B, 7); it does not depend on what else is in the batch."""
         if self._acting is None:
-            # `act` computes in float64 on the CPU, and so may not have its weights moved or trained under it.
+            # `act` computes in float64 on the CPU, and so may not have its weights moved or trained
+            # under it.
             acting = copy.deepcopy(self.network).cpu().eval()
             object.__setattr__(self, "_acting", acting)  # not a submodule: it must not be saved
         poses = batch[OBS_STATE].float().cpu().numpy()
@@ -112,14 +126,17 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
         )
 
     def _features(self, batch: dict[str, Tensor], encoder: Any) -> np.ndarray | None:
-        """Return the views' features side by side (B, F) float32; None without pictures."""
+        """Return the views' features side by side (B, F) float32; None without images."""
         if encoder is None:
             return None
         for view in self.config.views:
-            trained, given = self.config.input_features[names.image_key(view)].shape, batch[names.image_key(view)]
+            trained, given = (
+                self.config.input_features[names.image_key(view)].shape,
+                batch[names.image_key(view)],
+            )
             if tuple(given.shape[1:]) != tuple(trained):
                 raise InputError(
-                    f"surgicai_bc was trained on pictures of {tuple(trained)}, got {tuple(given.shape[1:])}; "
+                    f"surgicai_bc was trained on images of {tuple(trained)}, got {tuple(given.shape[1:])}; "
                     f"give --env.image_size={trained[-1]}."
                 )
         return encode(encoder, batch, self.config.views)

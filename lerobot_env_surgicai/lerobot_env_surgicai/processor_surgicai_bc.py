@@ -14,7 +14,9 @@ SMALLEST_STD = 1e-6  # a component that varies less is constant, and only its me
 def make_surgicai_bc_pre_post_processors(
     config: SurgicaiBcConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> tuple[Any, Any]:
-    """Return the pipelines around the policy: state to mean 0 and std 1, pictures and actions as they are."""
+    """Return the pipelines around the policy: state to mean 0 and std 1, images and actions as they
+    are.
+    """
     statistics = dict(dataset_stats or {})
     if "std" in statistics.get(OBS_STATE, {}):
         std = torch.as_tensor(statistics[OBS_STATE]["std"])

@@ -1,8 +1,8 @@
 """The verbs, one file each, in the order of the flow.
 
 A verb's module holds `EXAMPLE` (one command line), `Options` (a frozen dataclass: the schema of its
-options and of its `--config` file) and `run(options, console) -> dict` (the result `--json` prints). `NOTES`, where
-there are any, stand at the end of its `--help`.
+options and of its `--config` file) and `run(options, console) -> dict` (the result `--json`
+prints). `NOTES`, where there are any, stand at the end of its `--help`.
 A verb that has verbs of its own is a folder with its own `VERBS`.
 """
 
@@ -23,7 +23,7 @@ VERBS = MappingProxyType(
         "cache": "list, measure or prune the cached features",
         "train": "train a policy on a dataset's features",
         "evaluate": "run a policy from held-out starts and count successes",
-        "robustness": "run a policy while light, cameras, pictures or the arm shift",
+        "robustness": "run a policy while light, cameras, images or the arm shift",
         "sweep": "encode, train and evaluate every cell of a grid",
         "report": "write the report of stored results",
     }

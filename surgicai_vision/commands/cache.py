@@ -19,7 +19,10 @@ class Options:
     """Options of `cache`."""
 
     action: str = option(
-        dataclasses.MISSING, "list, size, or prune", metavar="ACTION", check=one_of("action", ACTIONS)
+        dataclasses.MISSING,
+        "list, size, or prune",
+        metavar="ACTION",
+        check=one_of("action", ACTIONS),
     )
     keep: tuple[str, ...] = option(
         (), "datasets whose features prune keeps, a comma list of folders", metavar="DIR[,DIR]"
@@ -33,9 +36,13 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
     prune = options.action == "prune"
     if not prune and (options.keep or options.all):
-        raise InputError(f"--keep and --all say what prune deletes; '{options.action}' takes neither.")
+        raise InputError(
+            f"--keep and --all say what prune deletes; '{options.action}' takes neither."
+        )
     if prune and bool(options.keep) == options.all:
-        raise InputError(f"prune deletes features in {default_cache_root()}; give either --keep DIR or --all.")
+        raise InputError(
+            f"prune deletes features in {default_cache_root()}; give either --keep DIR or --all."
+        )
     if prune:
         kept = {folders.open_dataset(folder, "", ()).fingerprint for folder in options.keep}
         entries = prune_cache(keep_datasets=kept)
@@ -48,7 +55,12 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     said = "removed" if prune else "held"
     console.say(f"{len(entries)} entries, {_mb(total)} {said} in {default_cache_root()}")
     rows = [_row(entry.folder, entry.size, entry.manifest) for entry in entries]
-    return {"action": options.action, "entries": rows, "bytes": total, "folder": str(default_cache_root())}
+    return {
+        "action": options.action,
+        "entries": rows,
+        "bytes": total,
+        "folder": str(default_cache_root()),
+    }
 
 
 def _mb(size: int) -> str:
@@ -59,9 +71,7 @@ def _text(manifest: dict[str, Any] | None) -> str:
     if manifest is None:
         return "unfinished"
     shape = " × ".join(map(str, (manifest["length"], *manifest["shape"])))
-    return (
-        f"{manifest['encoder']}, {manifest['view']}, {manifest['pool']}, {shape}, dataset {manifest['dataset'][:12]}"
-    )
+    return f"{manifest['encoder']}, {manifest['view']}, {manifest['pool']}, {shape}, dataset {manifest['dataset'][:12]}"
 
 
 def _row(folder: Path, size: int, manifest: dict[str, Any] | None) -> dict[str, Any]:

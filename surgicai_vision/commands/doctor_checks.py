@@ -1,7 +1,8 @@
 """Doctor: look at this machine and say, line by line, what is well, what is not, and what to do.
 
-Whatever can crash a process or take long to import (GL, torch, the encoders) is looked at in a process of
-its own, `python -m surgicai_vision.commands.doctor_checks PROBE`, so that a broken driver costs one line and not the report.
+Whatever can crash a process or take long to import (GL, torch, the encoders) is looked at in a
+process of its own, `python -m surgicai_vision.commands.doctor_checks PROBE`, so that a broken
+driver costs one line and not the report.
 """
 
 import importlib.metadata
@@ -71,7 +72,9 @@ def check_python(version: tuple[int, int] | None = None) -> Check:
 
 
 def check_packages(lock: Path | None = None) -> Check:
-    """Compare installed packages with requirements.lock, or outside a checkout with what the wheel requires."""
+    """Compare installed packages with requirements.lock, or outside a checkout with what the wheel
+    requires.
+    """
     lock = lock or Path(__file__).resolve().parents[2] / "requirements.lock"
     locked = lock.is_file()
     wanted = locked_requirements(lock) if locked else own_requirements()
@@ -82,7 +85,9 @@ def check_packages(lock: Path | None = None) -> Check:
     shown = "; ".join(wrong[:5]) + (f"; and {len(wrong) - 5} more" if len(wrong) > 5 else "")
     status: Status = "warning" if locked else "fail"
     advice = "make setup" if locked else f"pip install --upgrade {DISTRIBUTION}"
-    return Check("packages", status, f"{len(wrong)} of {len(wanted)} differ from {source}: {shown}", advice)
+    return Check(
+        "packages", status, f"{len(wrong)} of {len(wanted)} differ from {source}: {shown}", advice
+    )
 
 
 def locked_requirements(lock: Path) -> list[Any]:
@@ -122,7 +127,10 @@ def check_names() -> Check:
     ]
     if wrong:
         return Check(
-            "import names", "fail", "; ".join(wrong), f"let {DISTRIBUTION} alone own them: pip uninstall the other"
+            "import names",
+            "fail",
+            "; ".join(wrong),
+            f"let {DISTRIBUTION} alone own them: pip uninstall the other",
         )
     return Check("import names", "ok", f"{', '.join(PACKAGES)} belong to {DISTRIBUTION}")
 
@@ -162,7 +170,12 @@ def check_gpu(finding: Finding) -> Check:
     if finding["devices"]:
         return Check("GPU", "ok", ", ".join(finding["devices"]))
     if shutil.which("nvidia-smi"):
-        return Check("GPU", "warning", "an NVIDIA driver is here, but torch sees no GPU", "compare nvidia-smi")
+        return Check(
+            "GPU",
+            "warning",
+            "an NVIDIA driver is here, but torch sees no GPU",
+            "compare nvidia-smi",
+        )
     return Check("GPU", "ok", "none; everything runs on the processor")
 
 
@@ -172,8 +185,12 @@ def check_encoders(finding: Finding) -> Iterator[Check]:
         yield Check("encoders", "fail", finding["error"], "make setup")
         return
     for name, found in finding.items():
-        advice = "" if found["at_hand"] else "needed only for this encoder: a network, or --weights FILE"
-        yield Check(f"encoder {name}", "ok" if found["at_hand"] else "warning", found["detail"], advice)
+        advice = (
+            "" if found["at_hand"] else "needed only for this encoder: a network, or --weights FILE"
+        )
+        yield Check(
+            f"encoder {name}", "ok" if found["at_hand"] else "warning", found["detail"], advice
+        )
 
 
 def check_disk(folder: Path) -> Check:
@@ -181,7 +198,12 @@ def check_disk(folder: Path) -> Check:
     free = shutil.disk_usage(folder).free / 1e9
     detail = f"{free:.0f} GB free in {folder}"
     if free < DISK_GB:
-        return Check("disk", "warning", detail, f"free at least {DISK_GB:.0f} GB, or give --out on another disk")
+        return Check(
+            "disk",
+            "warning",
+            detail,
+            f"free at least {DISK_GB:.0f} GB, or give --out on another disk",
+        )
     return Check("disk", "ok", detail)
 
 
@@ -191,7 +213,12 @@ def start_probe(name: str) -> subprocess.Popen[str]:
     environment.setdefault("MUJOCO_GL", "egl")
     command = [sys.executable, "-m", "surgicai_vision.commands.doctor_checks", name]
     return subprocess.Popen(
-        command, env=environment, text=True, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        command,
+        env=environment,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     )
 
 
@@ -260,7 +287,10 @@ def probe_encoders() -> Finding:
             detail = str(path) if path else f"{card.source} {card.revision}, always at hand"
             found[name] = {"at_hand": True, "detail": f"{detail}{unpinned if path else ''}"}
         except MissingWeights:
-            found[name] = {"at_hand": False, "detail": f"{card.filename} of {card.source} is not here{unpinned}"}
+            found[name] = {
+                "at_hand": False,
+                "detail": f"{card.filename} of {card.source} is not here{unpinned}",
+            }
         except SurgicaiError as error:
             found[name] = {"at_hand": False, "detail": str(error)}
     return found

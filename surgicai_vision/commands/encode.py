@@ -19,21 +19,34 @@ EXAMPLE = "surgicai-vision encode --task grasp --encoder imagenet-lite --view fr
 class Options:
     """Options of `encode`."""
 
-    task: str = option("grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
-    dataset: str | None = option(None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>")
+    task: str = option(
+        "grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
+    )
+    dataset: str | None = option(
+        None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>"
+    )
     encoder: str = option(
         "imagenet-lite",
         f"one of {encoders.encoder_choices()}",
         check=encoders.check_encoder_option,
     )
     view: tuple[str, ...] = option(
-        ("front", "back"), "views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]"
+        ("front", "back"),
+        "views, a comma list",
+        check=many_of("view", names.CAMERAS),
+        metavar="VIEW[,VIEW]",
     )
     weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
-    pool: str = option("global", f"what is taken: {', '.join(encoders.POOLS)}", check=one_of("pool", encoders.POOLS))
+    pool: str = option(
+        "global",
+        f"what is taken: {', '.join(encoders.POOLS)}",
+        check=one_of("pool", encoders.POOLS),
+    )
     export: str | None = option(
-        None, "also write a dataset with the features in place of pictures, for LeRobot's policies", metavar="DIR"
+        None,
+        "also write a dataset with the features in place of images, for LeRobot's policies",
+        metavar="DIR",
     )
 
 
@@ -47,13 +60,17 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         check_output(Path(options.export))
     from surgicai_vision.features.cache import encode
 
-    encoder = encoders.load_encoder(options.encoder, options.weights, options.pool, options.accept_licence)
+    encoder = encoders.load_encoder(
+        options.encoder, options.weights, options.pool, options.accept_licence
+    )
     entries, rows = [], []
     for view in options.view:
         with console.stage(f"encoding {view} by {options.encoder}", "frames") as progress:
             features = encode(dataset, view, encoder, progress=progress)
         state = f"{features.encoded} frames encoded" if features.encoded else "at hand"
-        console.say(f"{options.encoder} {view}: {len(features.rows)} × {features.dim}, {state}: {features.folder}")
+        console.say(
+            f"{options.encoder} {view}: {len(features.rows)} × {features.dim}, {state}: {features.folder}"
+        )
         rows.append(features.rows)
         entries.append(
             {
@@ -75,4 +92,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         }
         export_features(dataset, rows, about, Path(options.export))
         console.say(f"exported: {options.export}")
-    return {"encoder": options.encoder, "weights_sha256": encoder.weights_sha256, "features": entries}
+    return {
+        "encoder": options.encoder,
+        "weights_sha256": encoder.weights_sha256,
+        "features": entries,
+    }

@@ -35,7 +35,9 @@ class Options:
     """Options of `evaluate`."""
 
     policy: str = option(
-        dataclasses.MISSING, "a checkpoint folder, a chain.yaml, or expert, replay, random or zero", metavar="POLICY"
+        dataclasses.MISSING,
+        "a checkpoint folder, a chain.yaml, or expert, replay, random or zero",
+        metavar="POLICY",
     )
     task: str | None = option(
         None,
@@ -44,12 +46,21 @@ class Options:
         default_text="the checkpoint's, else grasp",
     )
     episodes: int = option(20, "number of episodes", check=positive, metavar="N")
-    seed: int = option(names.TEST_SEED, "seed of the first start; each episode takes the next", check=not_negative)
+    seed: int = option(
+        names.TEST_SEED, "seed of the first start; each episode takes the next", check=not_negative
+    )
     workers: int | None = option(
-        None, "processes", check=positive, metavar="N", default_text="one a core, at most one for four episodes"
+        None,
+        "processes",
+        check=positive,
+        metavar="N",
+        default_text="one a core, at most one for four episodes",
     )
     dataset: str | None = option(
-        None, "dataset whose mean demonstration replay plays", metavar="DIR", default_text="outputs/datasets/<task>"
+        None,
+        "dataset whose mean demonstration replay plays",
+        metavar="DIR",
+        default_text="outputs/datasets/<task>",
     )
     weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
@@ -77,7 +88,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         return _run_swaps(options, console)
     subject = subject_of(options)
     seeds = range(options.seed, options.seed + options.episodes)
-    default = folders.evaluation_folder(subject.config.task, subject.name, options.seed, options.episodes)
+    default = folders.evaluation_folder(
+        subject.config.task, subject.name, options.seed, options.episodes
+    )
     out = Path(options.out) if options.out else default
     folders.check_folder(out, MARKER)
     title = f"evaluating {subject.name} on {subject.config.task}"
@@ -100,7 +113,9 @@ def subject_of(options: Any) -> Any:
     if swap and folder.suffix not in CHAIN_SUFFIXES:
         raise InputError(f"--swap {swap} is for a chain.yaml; leave it out.")
     if options.policy == REPLAY:
-        subject = policy_spec.replay_subject(folders.open_dataset(options.dataset, options.task or "grasp", ()))
+        subject = policy_spec.replay_subject(
+            folders.open_dataset(options.dataset, options.task or "grasp", ())
+        )
         return _in_env(subject, options.env)
     if options.dataset:
         raise InputError("--dataset is for replay alone; leave it out.")
@@ -110,7 +125,9 @@ def subject_of(options: Any) -> Any:
         config = task_config(options.task or "grasp", options.env)
         return policy_spec.baseline_subject(options.policy, config)
     if not folder.exists() and folder.parent == Path():
-        raise UnknownName("policy or checkpoint folder", options.policy, (*agents.BASELINES, REPLAY))
+        raise UnknownName(
+            "policy or checkpoint folder", options.policy, (*agents.BASELINES, REPLAY)
+        )
     lerobot = lerobot_agent.find(folder)
     if lerobot:
         subject = lerobot_agent.subject(lerobot, options.task, options.weights)
@@ -118,13 +135,19 @@ def subject_of(options: Any) -> Any:
         subject = policy_spec.checkpoint_subject(folder, options.weights, options.accept_licence)
     trained_for = subject.config.task
     if options.task not in (None, trained_for):
-        raise InputError(f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out.")
+        raise InputError(
+            f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out."
+        )
     return _in_env(subject, options.env)
 
 
 def _in_env(subject: Any, env: dict[str, Any] | None) -> Any:
     """Put a subject into the env of the table `env`, where there is one."""
-    return dataclasses.replace(subject, config=task_config(subject.config.task, env)) if env else subject
+    return (
+        dataclasses.replace(subject, config=task_config(subject.config.task, env))
+        if env
+        else subject
+    )
 
 
 def _chain(path: Path, options: Any, swap: str | None = None) -> Any:
@@ -133,10 +156,14 @@ def _chain(path: Path, options: Any, swap: str | None = None) -> Any:
 
     config = from_mapping(hierarchical.Chain, read_yaml(path), str(path))
     if options.task not in (None, names.SUTURE):
-        raise InputError(f"{path} is a chain of the whole procedure; leave --task {options.task} out.")
+        raise InputError(
+            f"{path} is a chain of the whole procedure; leave --task {options.task} out."
+        )
     env = {"max_steps": config.max_steps, **options.env} if options.env else None
     if swap != ALL:
-        return _in_env(expert_swap.swapped(config, swap, options.weights, options.accept_licence), env)
+        return _in_env(
+            expert_swap.swapped(config, swap, options.weights, options.accept_licence), env
+        )
     variants = expert_swap.variants_of(config, options.weights, options.accept_licence)
     return {name: _in_env(subject, env) for name, subject in variants.items()}
 
@@ -147,7 +174,9 @@ def _run_swaps(options: Options, console: Console) -> dict[str, Any]:
 
     variants = subject_of(options)
     plain = variants[AS_IT_IS]
-    default = folders.evaluation_folder(plain.config.task, plain.name, options.seed, options.episodes)
+    default = folders.evaluation_folder(
+        plain.config.task, plain.name, options.seed, options.episodes
+    )
     out = Path(options.out) if options.out else default.with_name(f"{default.name}-swaps")
     folders.check_folder(out, MARK)
     seeds = range(options.seed, options.seed + options.episodes)
@@ -155,7 +184,9 @@ def _run_swaps(options: Options, console: Console) -> dict[str, Any]:
     for swap in dict.fromkeys(row["swap"] for row in rows):
         mine = [row for row in rows if row["swap"] == swap]
         who = f"expert in {swap}" if swap else "the chain"
-        console.say(f"{who:<18} " + ", ".join(f"{row['subtask']} {row['k']}/{row['n']}" for row in mine))
+        console.say(
+            f"{who:<18} " + ", ".join(f"{row['subtask']} {row['k']}/{row['n']}" for row in mine)
+        )
     console.say(f"survival: {out / CURVES}")
     return {"policy": plain.name, "task": plain.config.task, "survival": rows, "out": str(out)}
 
@@ -175,5 +206,7 @@ def summary_line(result: dict[str, Any]) -> str:
             f"{count} {kind.replace('_', ' ')}" for kind, count in result["failures"].items()
         )
     if "survival" in result:
-        line += "; reached " + ", ".join(f"{stage['subtask']} {stage['k']}" for stage in result["survival"])
+        line += "; reached " + ", ".join(
+            f"{stage['subtask']} {stage['k']}" for stage in result["survival"]
+        )
     return line

@@ -46,7 +46,9 @@ def check_folder(out: Path, marker: str) -> None:
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=files.TEMPORARY):
             pass
     except OSError as error:
-        raise InputError(f"--out {out} cannot be written: {error.strerror}; choose another folder.") from None
+        raise InputError(
+            f"--out {out} cannot be written: {error.strerror}; choose another folder."
+        ) from None
 
 
 def demos_task(folder: Path) -> str:
@@ -66,7 +68,9 @@ def open_dataset(folder: str | None, task: str, views: Sequence[str]) -> Any:
     path = Path(folder) if folder else dataset_folder(task)
     if not path.exists():
         command = f"surgicai-vision render-demos --task {task} --episodes 50"
-        raise BadFile(f"There is no dataset {path}; make it by `{command}`, or give one with --dataset DIR.")
+        raise BadFile(
+            f"There is no dataset {path}; make it by `{command}`, or give one with --dataset DIR."
+        )
     from surgicai_vision.dataset.reader import open_dataset as open_folder
 
     dataset = open_folder(path)
@@ -76,14 +80,18 @@ def open_dataset(folder: str | None, task: str, views: Sequence[str]) -> Any:
 
 
 def check_file(path: Path, name: str, suffixes: Sequence[str]) -> None:
-    """Make the folder of an output file, before any work; refuse an ending that cannot be written."""
+    """Make the folder of an output file, before any work; refuse an ending that cannot be
+    written.
+    """
     if path.suffix not in suffixes:
         raise InputError(f"{name} {path} ends in '{path.suffix}'; allowed: {', '.join(suffixes)}.")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     except OSError as error:
-        raise InputError(f"{name} {path} cannot be written: {error.strerror}; choose another place.") from None
+        raise InputError(
+            f"{name} {path} cannot be written: {error.strerror}; choose another place."
+        ) from None
     os.close(descriptor)
     if not path.stat().st_size:
         path.unlink()

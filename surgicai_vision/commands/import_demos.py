@@ -11,7 +11,14 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import config_only, one_of, option
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError, check_name
-from surgicai_vision.demos.imports.rosbag.config import CONVENTIONS, SEGMENTATIONS, BagConfig, Topics, bags_in, is_bag
+from surgicai_vision.demos.imports.rosbag.config import (
+    CONVENTIONS,
+    SEGMENTATIONS,
+    BagConfig,
+    Topics,
+    bags_in,
+    is_bag,
+)
 
 EXAMPLE = "surgicai-vision import-demos regrasp_all_episodes_merged.pkl --task handoff --out outputs/demos/surgicai"
 ROLES = tuple(field.name for field in dataclasses.fields(Topics))
@@ -28,7 +35,8 @@ class Options:
     """Options of `import-demos`."""
 
     file: str = option(
-        dataclasses.MISSING, "a pickle as SurgicAI writes it, an npz of its arrays, a bag, or a folder of bags"
+        dataclasses.MISSING,
+        "a pickle as SurgicAI writes it, an npz of its arrays, a bag, or a folder of bags",
     )
     task: str | None = option(
         None,
@@ -37,9 +45,14 @@ class Options:
         default_text="none: say it; of a bag all that is found",
     )
     out: str | None = option(
-        None, "folder to make", metavar="DIR", default_text="outputs/demos/surgicai-<task> or outputs/demos/bag"
+        None,
+        "folder to make",
+        metavar="DIR",
+        default_text="outputs/demos/surgicai-<task> or outputs/demos/bag",
     )
-    topic: tuple[str, ...] = option((), "topics of a bag that differ, as ROLE=/TOPIC,ROLE=/TOPIC", metavar="LIST")
+    topic: tuple[str, ...] = option(
+        (), "topics of a bag that differ, as ROLE=/TOPIC,ROLE=/TOPIC", metavar="LIST"
+    )
     convention: str | None = option(
         None,
         f"whose topics a bag has: {', '.join(CONVENTIONS)}",
@@ -62,9 +75,15 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     path = Path(options.file)
     if is_bag(path) or path.is_dir():
         return _import_bags(path, options, console)
-    given = [name for name in ("topic", "convention", "segmentation", "bag", "env") if getattr(options, name)]
+    given = [
+        name
+        for name in ("topic", "convention", "segmentation", "bag", "env")
+        if getattr(options, name)
+    ]
     if given:
-        raise InputError(f"--{given[0]} is of bags, and {path} is none (*.bag, *.db3, *.mcap, a folder of ROS 2).")
+        raise InputError(
+            f"--{given[0]} is of bags, and {path} is none (*.bag, *.db3, *.mcap, a folder of ROS 2)."
+        )
     return _import_surgicai(path, options, console)
 
 
@@ -72,14 +91,20 @@ def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str
     from surgicai_vision.demos.imports.surgicai import import_demos
 
     if options.task is None:
-        raise InputError(f"import-demos needs --task: the file does not say it; one of {', '.join(names.SUBTASKS)}.")
+        raise InputError(
+            f"import-demos needs --task: the file does not say it; one of {', '.join(names.SUBTASKS)}."
+        )
     out = Path(options.out) if options.out else folders.demos_folder(f"surgicai-{options.task}")
     folders.check_folder(out, "demos.json")
     with console.stage(f"importing {options.task}", "episodes") as progress:
         summary = import_demos(path, task=options.task, out=out, progress=progress)
-    console.say(f"{len(summary.paths)} demonstrations of {options.task}, {summary.steps} steps: {out}")
+    console.say(
+        f"{len(summary.paths)} demonstrations of {options.task}, {summary.steps} steps: {out}"
+    )
     if summary.skipped:
-        console.say(f"{len(summary.skipped)} episodes could not be replayed; {out}/demos.json says why.")
+        console.say(
+            f"{len(summary.skipped)} episodes could not be replayed; {out}/demos.json says why."
+        )
     return {
         "task": options.task,
         "episodes": len(summary.paths),
@@ -95,11 +120,18 @@ def _import_bags(path: Path, options: Options, console: Console) -> dict[str, An
 
     bags = bags_in(path)
     if not bags:
-        raise BadFile(f"Cannot read {path}: it is a folder without bags (*.bag, *.db3, *.mcap, folders of ROS 2).")
+        raise BadFile(
+            f"Cannot read {path}: it is a folder without bags (*.bag, *.db3, *.mcap, folders of ROS 2)."
+        )
     out = Path(options.out) if options.out else folders.demos_folder("bag")
     with console.stage(f"importing {path.name}", "bags") as progress:
         summaries = import_bags(
-            bags, task=options.task, out=out, config=_config(options), env=options.env, progress=progress
+            bags,
+            task=options.task,
+            out=out,
+            config=_config(options),
+            env=options.env,
+            progress=progress,
         )
     rows = {}
     for made in summaries:
@@ -109,9 +141,13 @@ def _import_bags(path: Path, options: Options, console: Console) -> dict[str, An
             f"by our tolerances: {made.out}"
         )
         if made.skipped:
-            console.say(f"{len(made.skipped)} parts could not be replayed; {made.out}/demos.json says why.")
+            console.say(
+                f"{len(made.skipped)} parts could not be replayed; {made.out}/demos.json says why."
+            )
         if made.clipped:
-            console.say(f"{made.clipped} steps are faster than step preset '{made.step}' and were clipped.")
+            console.say(
+                f"{made.clipped} steps are faster than step preset '{made.step}' and were clipped."
+            )
         rows[made.task] = {
             "episodes": kept,
             "steps": made.steps,
@@ -141,6 +177,8 @@ def _topics(given: Sequence[str]) -> dict[str, str]:
     for text in given:
         role, equals, topic = text.partition("=")
         if not equals:
-            raise InputError(f"--topic is '{text}'; write ROLE=/TOPIC, with ROLE one of {', '.join(ROLES)}.")
+            raise InputError(
+                f"--topic is '{text}'; write ROLE=/TOPIC, with ROLE one of {', '.join(ROLES)}."
+            )
         topics[check_name("role", role, ROLES)] = topic
     return topics

@@ -9,7 +9,9 @@ from typing import Any
 from surgicai_vision.core.errors import InputError
 
 LOGS = ("auto", "tensorboard", "wandb", "none")
-"""`auto` is TensorBoard where it is installed. Nothing is sent anywhere unless `wandb` is asked for."""
+"""`auto` is TensorBoard where it is installed. Nothing is sent anywhere unless `wandb` is asked
+for.
+"""
 
 Log = Callable[[int, dict[str, float]], None]
 
@@ -27,23 +29,30 @@ def open_log(kind: str, out: Path) -> Iterator[Log | None]:
 
     Args:
         kind: one of `LOGS`.
-        out: the checkpoint folder; TensorBoard writes into `<out>-tensorboard`, W&B keeps its files beside it.
+        out: the checkpoint folder; TensorBoard writes into `<out>-tensorboard`, W&B keeps its files
+            beside it.
 
     Raises:
         InputError: what was asked for by name is not installed, or nobody is logged in to W&B.
     """
     if kind in ("tensorboard", "wandb") and not installed(kind):
-        raise InputError(f"--log {kind}: the package {kind} is not installed; install it, or give --log none.")
+        raise InputError(
+            f"--log {kind}: the package {kind} is not installed; install it, or give --log none."
+        )
     if kind == "wandb":
         _check_login()
-        yield from _drawing(lambda: _wandb(out), lambda run, losses, epoch: run.log(losses, step=epoch), "finish")
+        yield from _drawing(
+            lambda: _wandb(out), lambda run, losses, epoch: run.log(losses, step=epoch), "finish"
+        )
     elif kind == "tensorboard" or (kind == "auto" and installed("tensorboard")):
         yield from _drawing(lambda: _tensorboard(out), _add_scalars, "close")
     else:
         yield None
 
 
-def _drawing(start: Callable[[], Any], draw: Callable[[Any, dict[str, float], int], None], end: str) -> Iterator[Log]:
+def _drawing(
+    start: Callable[[], Any], draw: Callable[[Any, dict[str, float], int], None], end: str
+) -> Iterator[Log]:
     """Yield a log that starts its writer with the first losses and ends it by the method `end`."""
     writers: list[Any] = []
 
@@ -72,11 +81,15 @@ def _add_scalars(writer: Any, losses: dict[str, float], epoch: int) -> None:
 
 
 def _check_login() -> None:
-    """Refuse W&B without an account before any work; `WANDB_MODE=offline` keeps a run on this machine."""
+    """Refuse W&B without an account before any work; `WANDB_MODE=offline` keeps a run on this
+    machine.
+    """
     import wandb
 
     if wandb.setup().settings.mode == "online" and not wandb.api.is_authenticated:
-        raise InputError("--log wandb: nobody is logged in; run `wandb login`, or set WANDB_MODE=offline.")
+        raise InputError(
+            "--log wandb: nobody is logged in; run `wandb login`, or set WANDB_MODE=offline."
+        )
 
 
 def _wandb(out: Path) -> Any:

@@ -1,8 +1,8 @@
 """The command line: `surgicai-vision VERB [options]`.
 
 Exit codes: 0 done, 1 the work failed or was interrupted, 2 wrong input. Errors made on purpose
-(`SurgicaiError`) are one line without a traceback. A verb's module, and what it needs, is imported only
-when that verb runs, so `--help` is instant.
+(`SurgicaiError`) are one line without a traceback. A verb's module, and what it needs, is imported
+only when that verb runs, so `--help` is instant.
 """
 
 import argparse
@@ -30,8 +30,14 @@ INTERRUPTED = "interrupted; run the same command again to continue"
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return its exit code."""
     arguments = sys.argv[1:] if argv is None else argv
-    for name in ("HF_DATASETS_DISABLE_PROGRESS_BARS", "HF_HUB_DISABLE_PROGRESS_BARS", "HF_HUB_DISABLE_TELEMETRY"):
-        os.environ.setdefault(name, "1")  # the bars are ours; nothing of a run is reported to anyone
+    for name in (
+        "HF_DATASETS_DISABLE_PROGRESS_BARS",
+        "HF_HUB_DISABLE_PROGRESS_BARS",
+        "HF_HUB_DISABLE_TELEMETRY",
+    ):
+        os.environ.setdefault(
+            name, "1"
+        )  # the bars are ours; nothing of a run is reported to anyone
     try:
         return _dispatch(arguments)
     except SurgicaiError as error:
@@ -41,7 +47,9 @@ def main(argv: list[str] | None = None) -> int:
         print(f"{PROGRAM}: {INTERRUPTED}", file=sys.stderr)
         return 1
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains at exit
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # or Python complains at exit
         return 1
     except OSError as error:
         if error.filename is None:
@@ -66,13 +74,17 @@ def _choose(group: str, verbs: Mapping[str, str], title: str, arguments: list[st
         return 0 if arguments else 2
     verb = arguments[0]
     if verb.startswith("-"):
-        raise UnknownName("option before the verb", verb, ("--help",) if group else ("--help", "--version"))
+        raise UnknownName(
+            "option before the verb", verb, ("--help",) if group else ("--help", "--version")
+        )
     if verb not in verbs:
         raise UnknownName(f"verb of {group}" if group else "verb", verb, verbs)
     name = f"{group} {verb}".strip()
     module = importlib.import_module(module_name(name))
     if hasattr(module, "VERBS"):
-        return _choose(name, module.VERBS, f"{verbs[verb][0].upper()}{verbs[verb][1:]}.", arguments[1:])
+        return _choose(
+            name, module.VERBS, f"{verbs[verb][0].upper()}{verbs[verb][1:]}.", arguments[1:]
+        )
     return _run(name, verbs[verb], module, arguments[1:])
 
 
@@ -124,7 +136,9 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose errors are one `InputError` line."""
 
     def error(self, message: str) -> NoReturn:
-        raise InputError(f"{self.prog.removeprefix(PROGRAM).strip()}: {message}; see `{self.prog} --help`.")
+        raise InputError(
+            f"{self.prog.removeprefix(PROGRAM).strip()}: {message}; see `{self.prog} --help`."
+        )
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         raise _HelpShown
@@ -134,7 +148,9 @@ def _parser(verb: str, text: str, module: Any) -> argparse.ArgumentParser:
     parser = _Parser(
         prog=f"{PROGRAM} {verb}",
         description=f"{text[0].upper()}{text[1:]}.",
-        epilog="\n\n".join([f"example:\n  {module.EXAMPLE}", *filter(None, [getattr(module, "NOTES", "")])]),
+        epilog="\n\n".join(
+            [f"example:\n  {module.EXAMPLE}", *filter(None, [getattr(module, "NOTES", "")])]
+        ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )

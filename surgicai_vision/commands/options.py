@@ -1,4 +1,5 @@
-"""Options: a frozen dataclass per verb becomes its command line and the schema of its `--config` file.
+"""Options: a frozen dataclass per verb becomes its command line and the schema of its `--config`
+file.
 
 Values are taken in this order: the command line, the file, the dataclass's default.
 """
@@ -37,7 +38,13 @@ def option(
         default_text: what `--help` says of a default that depends on other options.
         repeat: it may be given again: texts are joined by commas, lists one behind the other.
     """
-    metadata = {"text": text, "check": check, "metavar": metavar, "default_text": default_text, "repeat": repeat}
+    metadata = {
+        "text": text,
+        "check": check,
+        "metavar": metavar,
+        "default_text": default_text,
+        "repeat": repeat,
+    }
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
@@ -67,7 +74,7 @@ def positive(name: str, value: float | None) -> None:
         raise InputError(f"{name} is {value}; it must be at least 1.")
 
 
-def picture_size(name: str, value: int) -> None:
+def image_size(name: str, value: int) -> None:
     """Refuse a size that the renderer has no room for [px]."""
     if not 16 <= value <= 960:
         raise InputError(f"{name} is {value}; it must be within 16 and 960 pixels.")
@@ -110,7 +117,9 @@ def many_of(kind: str, allowed: Iterable[str]) -> Check:
 
 
 def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
-    """Add the options of the dataclass `cls` to `parser`; what is not given stays out of the result."""
+    """Add the options of the dataclass `cls` to `parser`; what is not given stays out of the
+    result.
+    """
     hints = typing.get_type_hints(cls)
     for field in dataclasses.fields(cls):
         meta = field.metadata
@@ -133,7 +142,10 @@ def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
 def executor_option() -> Any:
     """Declare `executor`: what runs a verb's jobs."""
     return option(
-        "local", "what runs the processes: local, or ray", check=one_of("executor", ("local", "ray")), metavar="NAME"
+        "local",
+        "what runs the processes: local, or ray",
+        check=one_of("executor", ("local", "ray")),
+        metavar="NAME",
     )
 
 
@@ -150,7 +162,10 @@ def weights_option() -> Any:
 def address_option() -> Any:
     """Declare `address`: where `executor` finds a cluster."""
     return option(
-        None, "with --executor ray, a running cluster", metavar="HOST:PORT", default_text="one on this machine alone"
+        None,
+        "with --executor ray, a running cluster",
+        metavar="HOST:PORT",
+        default_text="one on this machine alone",
     )
 
 
@@ -200,7 +215,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise BadFile(f"{path} is not valid YAML ({' '.join(str(error).split())}).") from None
     except (RecursionError, ValueError) as error:
-        raise BadFile(f"{path} is not taken: {type(error).__name__} ({' '.join(str(error).split())[:100]}).") from None
+        raise BadFile(
+            f"{path} is not taken: {type(error).__name__} ({' '.join(str(error).split())[:100]})."
+        ) from None
     if not isinstance(table, dict) or not all(isinstance(key, str) for key in table):
         raise BadFile(f"{path} holds no table of keys; write one `key: value` a line.")
     return table
@@ -214,7 +231,9 @@ def nearest_option(given: str, parser: argparse.ArgumentParser) -> UnknownName:
 class _Joined(argparse.Action):
     """An option that may be given again."""
 
-    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+    def __call__(
+        self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None
+    ) -> None:
         """Join texts by commas, lists one behind the other."""
         before = getattr(namespace, self.dest, None)
         joined = f"{before},{values}" if isinstance(values, str) else (*(before or ()), *values)

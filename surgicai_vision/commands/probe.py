@@ -27,8 +27,12 @@ def _check_encoders(name: str, given: tuple[str, ...]) -> None:
 class Options:
     """Options of `probe`."""
 
-    task: str = option("grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
-    dataset: str | None = option(None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>")
+    task: str = option(
+        "grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
+    )
+    dataset: str | None = option(
+        None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>"
+    )
     encoder: tuple[str, ...] = option(
         ("imagenet-lite",),
         f"encoders, a comma list of {encoders.encoder_choices()}",
@@ -43,7 +47,11 @@ class Options:
     )
     weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
-    pool: str = option("global", f"what is taken: {', '.join(encoders.POOLS)}", check=one_of("pool", encoders.POOLS))
+    pool: str = option(
+        "global",
+        f"what is taken: {', '.join(encoders.POOLS)}",
+        check=one_of("pool", encoders.POOLS),
+    )
     seed: int = option(0, "seed of the folds and of the intervals", check=not_negative)
     out: str | None = option(
         None, f"folder for {RESULT}; an earlier one is replaced", metavar="DIR",
@@ -58,7 +66,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     for encoder in options.encoder:
         encoders.find_weights(encoder, options.weights, options.accept_licence)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
-    label = "-".join((dataset.task, "+".join(options.encoder).replace(":", "-"), "+".join(options.view)))
+    label = "-".join(
+        (dataset.task, "+".join(options.encoder).replace(":", "-"), "+".join(options.view))
+    )
     out = Path(options.out) if options.out else folders.OUTPUTS / "probes" / label
     check_output(out, may_resume=RESULT)
     rows = [row for encoder in options.encoder for row in _rows(options, encoder, dataset, console)]
@@ -82,7 +92,9 @@ def _rows(options: Options, name: str, dataset: Any, console: Console) -> list[d
     rows = []
     for views in sets:
         with console.stage(f"probe: {name}, {'+'.join(views)}", "folds") as progress:
-            found = probe(dataset, [entries[view] for view in views], seed=options.seed, progress=progress)
+            found = probe(
+                dataset, [entries[view] for view in views], seed=options.seed, progress=progress
+            )
         row = {
             "task": dataset.task,
             "encoder": name,
@@ -102,7 +114,9 @@ def line(row: dict[str, Any]) -> str:
     """Return a row in one line for people."""
     parts = []
     for key, unit in (("tip_mm", "mm"), ("angle_deg", "°")):
-        value, low, high, chance = (row[name] for name in (key, f"{key}_low", f"{key}_high", f"{key}_chance"))
+        value, low, high, chance = (
+            row[name] for name in (key, f"{key}_low", f"{key}_high", f"{key}_chance")
+        )
         parts.append(f"{value:.2f} {unit} ({low:.2f}–{high:.2f}; mean pose {chance:.2f})")
     tip, angle = parts
     return f"{row['encoder']} {row['view']}: tip {tip}, angle {angle}, {row['n']} episodes"

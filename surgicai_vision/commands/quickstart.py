@@ -6,9 +6,16 @@ from typing import Any
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import config_only, many_of, not_negative, one_of, option, positive
+from surgicai_vision.commands.options import (
+    config_only,
+    many_of,
+    not_negative,
+    one_of,
+    option,
+    positive,
+)
 from surgicai_vision.core import names
-from surgicai_vision.experiments.quickstart import PolicyChoice, Quickstart
+from surgicai_vision.experiments.quickstart_config import PolicyChoice, Quickstart
 
 EXAMPLE = "surgicai-vision quickstart"
 
@@ -17,15 +24,26 @@ EXAMPLE = "surgicai-vision quickstart"
 class Options:
     """Options of `quickstart`."""
 
-    task: str = option(Quickstart.task, f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
-    demonstrations: int = option(Quickstart.demonstrations, "expert demonstrations", check=positive, metavar="N")
-    view: tuple[str, ...] = option(
-        Quickstart.view, "rendered views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]"
+    task: str = option(
+        Quickstart.task, f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
     )
-    size: int = option(Quickstart.size, "height and width of pictures [px]", check=positive, metavar="PX")
+    demonstrations: int = option(
+        Quickstart.demonstrations, "expert demonstrations", check=positive, metavar="N"
+    )
+    view: tuple[str, ...] = option(
+        Quickstart.view,
+        "rendered views, a comma list",
+        check=many_of("view", names.CAMERAS),
+        metavar="VIEW[,VIEW]",
+    )
+    size: int = option(
+        Quickstart.size, "height and width of images [px]", check=positive, metavar="PX"
+    )
     depth: bool = option(Quickstart.depth, "render depth beside RGB")
     recipe: str = option(Quickstart.recipe, "recipe of behaviour cloning")
-    episodes: int = option(Quickstart.episodes, "held-out starts of each evaluation", check=positive, metavar="N")
+    episodes: int = option(
+        Quickstart.episodes, "held-out starts of each evaluation", check=positive, metavar="N"
+    )
     seed: int = option(Quickstart.seed, "training seed", check=not_negative)
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     out: str = option("outputs/quickstart", "folder to make or to continue", metavar="DIR")
@@ -65,7 +83,10 @@ def table(results: list[dict[str, Any]]) -> list[str]:
     head = ("policy", "success", "95 % interval", "length [mm]", "steps")
     rows = [head, *(_row(result) for result in results)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:

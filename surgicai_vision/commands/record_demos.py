@@ -1,4 +1,6 @@
-"""`record-demos`: record demonstrations by the scripted expert, or by movement primitives learned from some."""
+"""`record-demos`: record demonstrations by the scripted expert, or by movement primitives learned
+from some.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,15 +30,21 @@ EXAMPLE = "surgicai-vision record-demos --task grasp --episodes 50"
 class Options:
     """Options of `record-demos`."""
 
-    task: str = option("grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
+    task: str = option(
+        "grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
+    )
     episodes: int = option(50, "successful episodes to keep", check=positive, metavar="N")
-    source: str = option(
+    demonstrator: str = option(
         "expert",
         "who acts: expert; search: the expert without the grasp's goal; dmp: movement primitives learned from --from",
     )
-    from_: str | None = option(None, "demonstrations to learn from (--source dmp)", metavar="DEMOS")
+    from_: str | None = option(
+        None, "demonstrations to learn from (--demonstrator dmp)", metavar="DEMOS"
+    )
     demos_used: int = option(1, "how many of them to learn from", check=positive, metavar="N")
-    seed: int = option(names.TRAIN_SEED, "seed of the first start; each episode takes the next", check=not_negative)
+    seed: int = option(
+        names.TRAIN_SEED, "seed of the first start; each episode takes the next", check=not_negative
+    )
     noise: float = option(
         0.0,
         "standard deviation of the noise on executed motions, in units of an action's range; labels stay the expert's",
@@ -50,17 +58,29 @@ class Options:
         metavar="SIGMA",
         default_text="--noise itself",
     )
-    recoveries: float = option(
-        0.0, "share of episodes that start with a push that is not recorded", check=share, metavar="P"
+    perturb_start_fraction: float = option(
+        0.0,
+        "share of episodes that start with a push that is not recorded",
+        check=share,
+        metavar="P",
     )
     learner: str | None = option(
-        None, "a checkpoint that acts until a step drawn by chance; labels stay the expert's (DAgger)", metavar="DIR"
+        None,
+        "a checkpoint that acts until a step drawn by chance; labels stay the expert's (DAgger)",
+        metavar="DIR",
     )
-    linger: int = option(0, "control steps that an episode goes on after its success", check=not_negative, metavar="N")
+    post_success_steps: int = option(
+        0,
+        "control steps that an episode goes on after its success",
+        check=not_negative,
+        metavar="N",
+    )
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     executor: str = executor_option()
     address: str | None = address_option()
-    out: str | None = option(None, "folder to make or to continue", metavar="DIR", default_text="outputs/demos/<task>")
+    out: str | None = option(
+        None, "folder to make or to continue", metavar="DIR", default_text="outputs/demos/<task>"
+    )
     env: dict | None = config_only()
 
 
@@ -73,7 +93,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     from surgicai_vision.evaluation.statistics import clopper_pearson
 
     if options.noise_from is not None and options.noise_from > options.noise:
-        raise InputError(f"--noise-from is {options.noise_from:g}; it must be at most --noise, {options.noise:g}.")
+        raise InputError(
+            f"--noise-from is {options.noise_from:g}; it must be at most --noise, {options.noise:g}."
+        )
     engine = Engine(options.executor, options.address)
     config = task_config(options.task, options.env)
     out = Path(options.out) if options.out else folders.demos_folder(options.task)
@@ -85,10 +107,12 @@ def run(options: Options, console: Console) -> dict[str, Any]:
             config,
             episodes=options.episodes,
             out=out,
-            source=options.source,
+            demonstrator=options.demonstrator,
             seed=options.seed,
-            disturbance=Disturbance(options.noise, options.recoveries, options.noise_from),
-            linger=options.linger,
+            disturbance=Disturbance(
+                options.noise, options.perturb_start_fraction, options.noise_from
+            ),
+            post_success_steps=options.post_success_steps,
             workers=options.workers,
             engine=engine,
             demos=taught,

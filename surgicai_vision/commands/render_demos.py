@@ -11,11 +11,11 @@ from surgicai_vision.commands.options import (
     address_option,
     config_only,
     executor_option,
+    image_size,
     many_of,
     not_negative,
     one_of,
     option,
-    picture_size,
     positive,
 )
 from surgicai_vision.core import names
@@ -42,29 +42,43 @@ class Options:
         default_text="grasp",
     )
     episodes: int | None = option(
-        None, "without --demos, demonstrations to record", check=positive, metavar="N", default_text="50"
+        None,
+        "without --demos, demonstrations to record",
+        check=positive,
+        metavar="N",
+        default_text="50",
     )
-    seed: int = option(names.TRAIN_SEED, "without --demos, seed of the first start", check=not_negative)
+    seed: int = option(
+        names.TRAIN_SEED, "without --demos, seed of the first start", check=not_negative
+    )
     view: tuple[str, ...] = option(
-        ("front", "back"), "views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]"
+        ("front", "back"),
+        "views, a comma list",
+        check=many_of("view", names.CAMERAS),
+        metavar="VIEW[,VIEW]",
     )
-    size: int = option(224, "height and width of pictures [px]", check=picture_size, metavar="PX")
+    size: int = option(224, "height and width of images [px]", check=image_size, metavar="PX")
     depth: bool = option(False, "render depth beside RGB")
     segmentation: bool = option(False, "render the parts beside RGB")
-    every: int = option(
-        1, "render every N-th frame alone: many episodes at the cost of few", check=positive, metavar="N"
+    frame_stride: int = option(
+        1,
+        "render every N-th frame alone: many episodes at the cost of few",
+        check=positive,
+        metavar="N",
     )
     video: str | None = option(
         None,
         f"store RGB as video: {', '.join(CODECS)}; the error is measured",
         check=one_of("video codec", CODECS),
         metavar="CODEC",
-        default_text="lossless pictures",
+        default_text="lossless images",
     )
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     executor: str = executor_option()
     address: str | None = address_option()
-    out: str | None = option(None, "dataset to make", metavar="DIR", default_text="outputs/datasets/<task>")
+    out: str | None = option(
+        None, "dataset to make", metavar="DIR", default_text="outputs/datasets/<task>"
+    )
     env: dict | None = config_only()
 
 
@@ -75,7 +89,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
     engine = Engine(options.executor, options.address)
     if options.demos and (options.task or options.episodes or options.env):
-        raise InputError("--task, --episodes and env say what to record; with --demos DIR nothing is recorded.")
+        raise InputError(
+            "--task, --episodes and env say what to record; with --demos DIR nothing is recorded."
+        )
     if not options.view:
         raise InputError(f"--view is empty; give some of {', '.join(names.CAMERAS)}.")
     given = [Path(folder) for folder in options.demos or ()]
@@ -91,15 +107,22 @@ def run(options: Options, console: Console) -> dict[str, Any]:
             size=options.size,
             depth=options.depth,
             segmentation=options.segmentation,
-            every=options.every,
+            frame_stride=options.frame_stride,
             video=options.video,
             workers=options.workers,
             engine=engine,
             progress=progress,
         )
-    console.say(f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}")
+    console.say(
+        f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}"
+    )
     say_error(summary, console)
-    return {**dataclasses.asdict(summary), "task": task, "views": list(options.view), "dataset": str(out)}
+    return {
+        **dataclasses.asdict(summary),
+        "task": task,
+        "views": list(options.view),
+        "dataset": str(out),
+    }
 
 
 def say_error(summary: Any, console: Console) -> None:

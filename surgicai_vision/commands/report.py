@@ -19,10 +19,15 @@ class Options:
     """Options of `report`."""
 
     dir: str = option(
-        dataclasses.MISSING, "folder with results of quickstart, evaluate, robustness or sweep", metavar="DIR"
+        dataclasses.MISSING,
+        "folder with results of quickstart, evaluate, robustness or sweep",
+        metavar="DIR",
     )
     out: str | None = option(
-        None, "where to write the page; tables/ stands beside it", metavar="FILE.html", default_text="DIR/report.html"
+        None,
+        "where to write the page; tables/ stands beside it",
+        metavar="FILE.html",
+        default_text="DIR/report.html",
     )
     strips: int = option(
         STRIPS,
@@ -39,7 +44,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
     folder = Path(options.dir)
     if not folder.is_dir():
-        raise BadFile(f"{folder} is no folder; give one that quickstart, evaluate or sweep has written.")
+        raise BadFile(
+            f"{folder} is no folder; give one that quickstart, evaluate or sweep has written."
+        )
     cells = _cells(folder, console)
     found = collect(folder, cells)
     with console.stage("report", "parts") as progress:
@@ -53,7 +60,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 
 
 def _cells(folder: Path, console: Console) -> Sequence[Mapping[str, Any]]:
-    """Return every cell of the sweep in `folder` with its state; nothing where it is no sweep, or not one of ours."""
+    """Return every cell of the sweep in `folder` with its state; nothing where it is no sweep, or
+    not one of ours.
+    """
     from surgicai_vision.core.config import from_mapping, to_mapping
     from surgicai_vision.core.files import read_json
     from surgicai_vision.experiments.sweep import Grid, plan
@@ -65,8 +74,11 @@ def _cells(folder: Path, console: Console) -> Sequence[Mapping[str, Any]]:
     try:
         states = plan(from_mapping(Grid, read_json(path), str(path)), folder)
     except SurgicaiError as error:
-        console.note(f"The grid cannot be read here, so only cells with a result or a record are reported: {error}")
+        console.note(
+            f"The grid cannot be read here, so only cells with a result or a record are reported: {error}"
+        )
         return ()
     return [
-        {**to_mapping(state.cell), "key": state.key, "state": state.state, "reason": state.reason} for state in states
+        {**to_mapping(state.cell), "key": state.key, "state": state.state, "reason": state.reason}
+        for state in states
     ]

@@ -1,4 +1,6 @@
-"""`robustness`: run a policy while one thing at a time shifts, and draw its successes against the strength."""
+"""`robustness`: run a policy while one thing at a time shifts, and draw its successes against the
+strength.
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -20,9 +22,7 @@ from surgicai_vision.commands.options import (
 from surgicai_vision.core import names
 from surgicai_vision.evaluation.robustness import AXES, CURVES, MARK, STRENGTHS, robustness
 
-EXAMPLE = (
-    "surgicai-vision robustness outputs/train/grasp-imagenet-lite-front-seed0 --axis light,blur --strength 0,0.5,1"
-)
+EXAMPLE = "surgicai-vision robustness outputs/train/grasp-imagenet-lite-front-seed0 --axis light,blur --strength 0,0.5,1"
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,9 @@ class Options:
     """Options of `robustness`."""
 
     policy: str = option(
-        dataclasses.MISSING, "a checkpoint folder, a chain.yaml, or expert, replay, random or zero", metavar="POLICY"
+        dataclasses.MISSING,
+        "a checkpoint folder, a chain.yaml, or expert, replay, random or zero",
+        metavar="POLICY",
     )
     task: str | None = option(
         None,
@@ -49,12 +51,21 @@ class Options:
         STRENGTHS, "how much, from 0 (not at all) to 1, increasing", metavar="NUMBER,NUMBER"
     )
     episodes: int = option(20, "number of episodes at each strength", check=positive, metavar="N")
-    seed: int = option(names.TEST_SEED, "seed of the first start; each episode takes the next", check=not_negative)
+    seed: int = option(
+        names.TEST_SEED, "seed of the first start; each episode takes the next", check=not_negative
+    )
     workers: int | None = option(
-        None, "processes", check=positive, metavar="N", default_text="one a core, at most one for four episodes"
+        None,
+        "processes",
+        check=positive,
+        metavar="N",
+        default_text="one a core, at most one for four episodes",
     )
     dataset: str | None = option(
-        None, "dataset whose mean demonstration replay plays", metavar="DIR", default_text="outputs/datasets/<task>"
+        None,
+        "dataset whose mean demonstration replay plays",
+        metavar="DIR",
+        default_text="outputs/datasets/<task>",
     )
     weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
@@ -74,7 +85,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     out = Path(options.out) if options.out else folders.OUTPUTS / "robustness" / name
     folders.check_folder(out, MARK)
     seeds = range(options.seed, options.seed + options.episodes)
-    rows = robustness(subject, seeds, out, console.stage, options.axis, options.strength, options.workers)
+    rows = robustness(
+        subject, seeds, out, console.stage, options.axis, options.strength, options.workers
+    )
     for axis in dict.fromkeys(row["axis"] for row in rows):
         console.say(curve_line([row for row in rows if row["axis"] == axis]))
     console.say(f"curves: {out / CURVES}")

@@ -7,7 +7,13 @@ from typing import Any
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import address_option, executor_option, option, positive, read_yaml
+from surgicai_vision.commands.options import (
+    address_option,
+    executor_option,
+    option,
+    positive,
+    read_yaml,
+)
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, UnknownName
 from surgicai_vision.core.files import configs_folder
@@ -20,9 +26,16 @@ EXAMPLE = "surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/s
 class Options:
     """Options of `sweep`."""
 
-    grid: str = option(dataclasses.MISSING, "the grid; shipped ones also by their name (smoke)", metavar="GRID.yaml")
+    grid: str = option(
+        dataclasses.MISSING,
+        "the grid; shipped ones also by their name (smoke)",
+        metavar="GRID.yaml",
+    )
     out: str | None = option(
-        None, "folder to make or to continue", metavar="DIR", default_text="outputs/sweeps/<name of the grid>"
+        None,
+        "folder to make or to continue",
+        metavar="DIR",
+        default_text="outputs/sweeps/<name of the grid>",
     )
     only: tuple[str, ...] | None = option(
         None,
@@ -31,11 +44,18 @@ class Options:
         repeat=True,
         default_text="all",
     )
-    dry_run: bool = option(False, "list the cells, what is there already and about how long the rest takes; no work")
-    workers: int = option(
-        folders.CORES, "cells at a time; the results do not depend on it", check=positive, metavar="N"
+    dry_run: bool = option(
+        False, "list the cells, what is there already and about how long the rest takes; no work"
     )
-    attempts: int = option(3, "how often a cell is started whose process is killed", check=positive, metavar="N")
+    workers: int = option(
+        folders.CORES,
+        "cells at a time; the results do not depend on it",
+        check=positive,
+        metavar="N",
+    )
+    attempts: int = option(
+        3, "how often a cell is started whose process is killed", check=positive, metavar="N"
+    )
     executor: str = executor_option()
     address: str | None = address_option()
 
@@ -68,7 +88,9 @@ def _list(grid: Grid, out: Path, choice: Choice, workers: int, console: Console)
     for state in states:
         line = f"{state.state:<8} {state.key}  {state.where}"
         console.say(f"{line}: {state.reason}" if state.reason else line)
-    counts = {name.replace(" ", "_"): sum(state.state == name for state in states) for name in STATES}
+    counts = {
+        name.replace(" ", "_"): sum(state.state == name for state in states) for name in STATES
+    }
     time = estimate(grid, out, states, workers)
     console.say(
         f"{len(states)} cells: {', '.join(f'{counts[key]} {key.replace("_", " ")}' for key in counts)}; about "
@@ -102,12 +124,14 @@ def grid_file(given: str) -> Path:
 
 
 def read_grid(path: Path) -> Grid:
-    """Read a grid; a list of views may be written as "front,back", an axis of one value without brackets."""
+    """Read a grid; a list of views may be written as "front,back", an axis of one value without
+    brackets.
+    """
     table = read_yaml(path)
     if isinstance(table.get("view"), list):
         table["view"] = [_listed(view) for view in table["view"]]
-    if isinstance(table.get("lever"), list):
-        table["lever"] = [_lever(lever) for lever in table["lever"]]
+    if isinstance(table.get("ablation"), list):
+        table["ablation"] = [_ablation(ablation) for ablation in table["ablation"]]
     for name in AXES:
         if name in table and isinstance(table[name], (str, int)):
             table[name] = [table[name]]
@@ -121,8 +145,10 @@ def _listed(value: Any) -> Any:
     return value.split(",") if isinstance(value, str) else value
 
 
-def _lever(table: Any) -> Any:
-    """Return a lever whose lists may be written as texts."""
+def _ablation(table: Any) -> Any:
+    """Return a ablation whose lists may be written as texts."""
     if not isinstance(table, dict):
         return table
-    return {key: _listed(value) if key in ("view", "change") else value for key, value in table.items()}
+    return {
+        key: _listed(value) if key in ("view", "change") else value for key, value in table.items()
+    }

@@ -6,7 +6,15 @@ from typing import Any
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import config_only, many_of, not_negative, one_of, option, positive, task_config
+from surgicai_vision.commands.options import (
+    config_only,
+    many_of,
+    not_negative,
+    one_of,
+    option,
+    positive,
+    task_config,
+)
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
@@ -44,10 +52,16 @@ def _within(low: float, high: float) -> Any:
 class Options:
     """Options of `teleoperate`."""
 
-    task: str = option("grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
+    task: str = option(
+        "grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
+    )
     web: bool = option(False, "show a page on this machine's loopback in place of a window")
     port: int | None = option(
-        None, "with --web, its port, 0 for any", check=_within(0, 65535), metavar="N", default_text=f"{WEB_PORT}"
+        None,
+        "with --web, its port, 0 for any",
+        check=_within(0, 65535),
+        metavar="N",
+        default_text=f"{WEB_PORT}",
     )
     view: tuple[str, ...] = option(
         ("front", "back"),
@@ -55,14 +69,18 @@ class Options:
         check=many_of("view", names.CAMERAS),
         metavar="VIEW[,VIEW]",
     )
-    size: int = option(448, "height and width of pictures [px]", check=_within(*SIZES), metavar="PX")
+    size: int = option(448, "height and width of images [px]", check=_within(*SIZES), metavar="PX")
     frame: str = option(
         "camera",
         "whose axes the keys mean: camera (of the leading view), or tool",
         check=one_of("frame", ("camera", "tool")),
     )
-    speed: float = option(0.5, "share of the step size that a key or a full deflection commands", check=_speed)
-    pace: float = option(1.0, "share of real time; 0.5 gives twice the time to react", check=_within(*PACES))
+    speed: float = option(
+        0.5, "share of the step size that a key or a full deflection commands", check=_speed
+    )
+    pace: float = option(
+        1.0, "share of real time; 0.5 gives twice the time to react", check=_within(*PACES)
+    )
     seconds: float | None = option(
         None,
         "simulated seconds an attempt may take",
@@ -70,16 +88,29 @@ class Options:
         default_text=f"{SECONDS:g}, {SECONDS * len(names.SUBTASKS):g} for {names.SUTURE}",
     )
     episodes: int | None = option(
-        None, "stop when so many more are kept", check=positive, metavar="N", default_text="go on until Esc"
+        None,
+        "stop when so many more are kept",
+        check=positive,
+        metavar="N",
+        default_text="go on until Esc",
     )
     seed: int | None = option(
-        None, "seed of a new folder's first start", check=not_negative, metavar="N", default_text=f"{names.TRAIN_SEED}"
+        None,
+        "seed of a new folder's first start",
+        check=not_negative,
+        metavar="N",
+        default_text=f"{names.TRAIN_SEED}",
     )
     auto_keep: bool = option(False, "keep a success without asking")
     keep_failures: bool = option(False, "→ keeps an episode without success too")
-    skip_idle: bool = option(False, "the world stands still while nothing is held, and pauses are not recorded")
+    skip_idle: bool = option(
+        False, "the world stands still while nothing is held, and pauses are not recorded"
+    )
     out: str | None = option(
-        None, "folder to make or to continue", metavar="DIR", default_text="outputs/teleoperation/<task>"
+        None,
+        "folder to make or to continue",
+        metavar="DIR",
+        default_text="outputs/teleoperation/<task>",
     )
     env: dict | None = config_only()
 
@@ -104,14 +135,27 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     with _place(options) as place:
         env = envs.make(config)
         with open_recordings(out, config, env.scene.hash, options.seed) as recordings:
-            session = Session(env, Steering(env, options.frame, options.speed), recordings, options.view, rules)
+            session = Session(
+                env, Steering(env, options.frame, options.speed), recordings, options.view, rules
+            )
             views = Views(env, options.view, options.size)
             for line in place.invitation:
                 console.note(line)
-            drive(session, place, place, views, Pacer(options.pace), lambda status: _tell(console, status.message))
+            drive(
+                session,
+                place,
+                place,
+                views,
+                Pacer(options.pace),
+                lambda status: _tell(console, status.message),
+            )
             views.close()
     env.close()
-    held = f"{len(recordings.seeds)} demonstrations: {out}" if recordings.seeds else "no demonstrations yet."
+    held = (
+        f"{len(recordings.seeds)} demonstrations: {out}"
+        if recordings.seeds
+        else "no demonstrations yet."
+    )
     console.say(f"{session.kept} kept, {session.discarded} discarded; {held}")
     return {
         "task": options.task,

@@ -7,7 +7,14 @@ from typing import Any
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.logs import LOGS, open_log
-from surgicai_vision.commands.options import many_of, not_negative, one_of, option, positive, weights_option
+from surgicai_vision.commands.options import (
+    many_of,
+    not_negative,
+    one_of,
+    option,
+    positive,
+    weights_option,
+)
 from surgicai_vision.core import names
 from surgicai_vision.core.config import DEVIATIONS
 from surgicai_vision.core.errors import InputError
@@ -28,8 +35,12 @@ def _check_encoder(name: str, given: str) -> None:
 class Options:
     """Options of `train`."""
 
-    task: str = option("grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS))
-    dataset: str | None = option(None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>")
+    task: str = option(
+        "grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
+    )
+    dataset: str | None = option(
+        None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>"
+    )
     subtask: str | None = option(
         None,
         f"take one subtask's frames of a dataset of whole procedures, for a chain: {', '.join(names.SUBTASKS)}",
@@ -50,9 +61,17 @@ class Options:
     )
     weights: str | None = weights_option()
     accept_licence: bool = option(False, "accept weights under a non-commercial licence")
-    pool: str = option("global", f"what is taken: {', '.join(encoders.POOLS)}", check=one_of("pool", encoders.POOLS))
-    policy: str = option("bc", f"one of {', '.join(policies.POLICIES)}", check=one_of("policy", policies.POLICIES))
-    recipe: str = option("paper", f"the policy's recipe: {', '.join(policies.recipe_names())}, or FILE.yaml")
+    pool: str = option(
+        "global",
+        f"what is taken: {', '.join(encoders.POOLS)}",
+        check=one_of("pool", encoders.POOLS),
+    )
+    policy: str = option(
+        "bc", f"one of {', '.join(policies.POLICIES)}", check=one_of("policy", policies.POLICIES)
+    )
+    recipe: str = option(
+        "paper", f"the policy's recipe: {', '.join(policies.recipe_names())}, or FILE.yaml"
+    )
     deviation: tuple[str, ...] | None = option(
         None,
         f"what to do as the released code did, a comma list of {', '.join(DEVIATIONS)}",
@@ -70,11 +89,18 @@ class Options:
     epochs: int | None = option(
         None, "passes over the frames", check=positive, metavar="N", default_text="the recipe's"
     )
-    start: str | None = option(None, "checkpoint to start from, with the same inputs (fine-tuning)", metavar="DIR")
-    save_every: int = option(
-        0, "also keep a checkpoint every N epochs; 0 keeps the last", check=not_negative, metavar="N"
+    start: str | None = option(
+        None, "checkpoint to start from, with the same inputs (fine-tuning)", metavar="DIR"
     )
-    log: str = option("auto", f"where losses are drawn: {', '.join(LOGS)}", check=one_of("log", LOGS))
+    save_every: int = option(
+        0,
+        "also keep a checkpoint every N epochs; 0 keeps the last",
+        check=not_negative,
+        metavar="N",
+    )
+    log: str = option(
+        "auto", f"where losses are drawn: {', '.join(LOGS)}", check=one_of("log", LOGS)
+    )
     seed: int = option(0, "training seed", check=not_negative)
     out: str | None = option(
         None,
@@ -129,6 +155,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
 def _views(options: Options, encoder: str | None) -> tuple[str, ...]:
     if encoder is None:
         if options.view:
-            raise InputError(f"--encoder {options.encoder} sees no picture; leave --view out, or name an encoder.")
+            raise InputError(
+                f"--encoder {options.encoder} sees no image; leave --view out, or name an encoder."
+            )
         return ()
     return ("front", "back") if options.view is None else options.view

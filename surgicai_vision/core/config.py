@@ -1,8 +1,8 @@
 """Configuration: frozen dataclasses, the only schema. Built at the edge, saved beside every result.
 
-`from_mapping` builds a dataclass from plain data (YAML, JSON) and refuses unknown keys with the nearest
-name; `to_mapping` is its inverse; `digest` hashes the canonical JSON. Nothing here is instantiated by a
-name found in a file.
+`from_mapping` builds a dataclass from plain data (YAML, JSON) and refuses unknown keys with the
+nearest name; `to_mapping` is its inverse; `digest` hashes the canonical JSON. Nothing here is
+instantiated by a name found in a file.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ T = TypeVar("T")
 STEPS: Mapping[str, tuple[float, float, float]] = types.MappingProxyType(
     {"paper": (0.5e-3, 2.0, 0.05), "released": (1.0e-3, 3.0, 0.05), "shipped": (1.5e-3, 3.0, 0.05)}
 )
-"""Step preset → translation [m], rotation [deg], jaw [rad] of an action of 1 (facts.md §1: the image
-evaluation, the RL training script, the trajectories shipped with the release)."""
+"""Step preset → translation [m], rotation [deg], jaw [rad] of an action of 1 (facts.md §1: the
+image evaluation, the RL training script, the trajectories shipped with the release)."""
 
 SUBTASK_STEPS = 200
 """Control steps a subtask may take (paper, image policies)."""
@@ -81,12 +81,15 @@ RANDOMISATION_LIMITS: Mapping[str, float] = types.MappingProxyType(
         "latency": LATENCY_LIMIT,
     }
 )
-"""Axis → largest magnitude: beyond it cameras lose the scene, or the procedure is no longer possible."""
+"""Axis → largest magnitude: beyond it cameras lose the scene, or the procedure is no longer
+possible.
+"""
 
 
 @dataclass(frozen=True)
 class RandomisationConfig:
-    """How much of each thing differs from episode to episode; 0 is off. Each axis is drawn uniformly from ± its value.
+    """How much of each thing differs from episode to episode; 0 is off. Each axis is drawn
+    uniformly from ± its value.
 
     Attributes:
         light: brightness of each light, as a fraction of it.
@@ -98,8 +101,8 @@ class RandomisationConfig:
         needle_size: fraction of the radius and the length of the needle's arc.
         friction: fraction of every friction coefficient.
         phantom_shift: place of the phantom, its holes and goals, in x and y [mm].
-        kinematic_error: offset of each arm's first three joints that the arm does not know of; 1 is ±5°, ±5°, ±5 mm,
-            the joint errors of the surgical robotics challenge.
+        kinematic_error: offset of each arm's first three joints that the arm does not know of; 1 is
+            ±5°, ±5°, ±5 mm, the joint errors of the surgical robotics challenge.
         latency: an action takes effect this many control steps later; the same in every episode.
     """
 
@@ -118,7 +121,9 @@ class RandomisationConfig:
     def __post_init__(self) -> None:
         for axis, limit in RANDOMISATION_LIMITS.items():
             if not 0 <= getattr(self, axis) <= limit:
-                raise InputError(f"randomisation: {axis} is {getattr(self, axis)}; allowed: 0 to {limit}.")
+                raise InputError(
+                    f"randomisation: {axis} is {getattr(self, axis)}; allowed: 0 to {limit}."
+                )
 
     @property
     def on(self) -> tuple[str, ...]:
@@ -136,7 +141,8 @@ class TaskConfig:
         step: step-size preset, a key of `STEPS`.
         tolerance: "paper" or "released" success tolerances.
         reward: "sparse" (0 on success, else -1) or "dense".
-        max_steps: episode limit [control steps]; 0 takes the paper's, 200 a subtask, 1,000 for the five in a row.
+        max_steps: episode limit [control steps]; 0 takes the paper's, 200 a subtask, 1,000 for the
+            five in a row.
         randomisation: what differs from episode to episode besides the start; nothing by default.
     """
 
@@ -154,7 +160,9 @@ class TaskConfig:
         check_name("tolerance preset", self.tolerance, ("paper", "released"))
         check_name("reward", self.reward, ("sparse", "dense"))
         if self.max_steps < 0:
-            raise InputError(f"max_steps is {self.max_steps}; it must be at least 1, or 0 for the paper's limit.")
+            raise InputError(
+                f"max_steps is {self.max_steps}; it must be at least 1, or 0 for the paper's limit."
+            )
         if self.max_steps == 0:
             subtasks = len(names.SUBTASKS) if self.task == names.SUTURE else 1
             object.__setattr__(self, "max_steps", SUBTASK_STEPS * subtasks)
@@ -162,16 +170,19 @@ class TaskConfig:
 
 @dataclass(frozen=True)
 class Deviations:
-    """Where SurgicAI's released code departs from its paper, each a switch of its own; all are off by default.
+    """Where SurgicAI's released code departs from its paper, each a switch of its own; all are off
+    by default.
 
-    The sixth, its training (one hidden layer, 1e-4, 40 epochs, split over transitions), is plain settings of the
-    recipe "released".
+    The sixth, its training (one hidden layer, 1e-4, 40 epochs, split over transitions), is plain
+    settings of the recipe "released".
 
     Attributes:
-        action_noise: evaluation adds uniform noise to the translation, as much as the encoder's file says.
+        action_noise: evaluation adds uniform noise to the translation, as much as the encoder's
+            file says.
         preprocessing: R3M and CLIP are fed ImageNet's statistics in place of their own.
-        batch_norm_drift: the frozen network stands under `train()`, so its BatchNorm statistics drift.
-        bgr: pictures are handed over as BGR and read as RGB.
+        batch_norm_drift: the frozen network stands under `train()`, so its BatchNorm statistics
+            drift.
+        bgr: images are handed over as BGR and read as RGB.
         three_evaluations: one trained policy is evaluated three times, where the paper trains five.
     """
 
@@ -222,7 +233,9 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return tuple(_convert(arguments[0], item, where) for item in value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if isinstance(hint, type) and (not isinstance(value, hint) or (hint is int and isinstance(value, bool))):
+    if isinstance(hint, type) and (
+        not isinstance(value, hint) or (hint is int and isinstance(value, bool))
+    ):
         raise InputError(f"{where}: expected {hint.__name__}, got {value!r}.")
     return value
 
@@ -242,7 +255,9 @@ def read_changes(texts: Iterable[str]) -> dict[str, Any]:
     for text in texts:
         key, sign, value = text.partition("=")
         if not sign or not key or key in changes:
-            raise InputError(f"change '{text}' is not understood; give KEY=VALUE, each key once, such as clock=false.")
+            raise InputError(
+                f"change '{text}' is not understood; give KEY=VALUE, each key once, such as clock=false."
+            )
         try:
             changes[key] = yaml.safe_load(value)
         except yaml.YAMLError:
@@ -252,22 +267,35 @@ def read_changes(texts: Iterable[str]) -> dict[str, Any]:
 
 def digest(value: Any) -> str:
     """sha256 (hex) of the canonical JSON of a dataclass or of plain data."""
-    plain = dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
-    return hashlib.sha256(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    plain = (
+        dataclasses.asdict(value)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type)
+        else value
+    )
+    return hashlib.sha256(
+        json.dumps(plain, sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
 
 
-def check_every(every: int) -> None:
-    """Raise `InputError` unless a frame every so many steps makes a whole number of frames a second."""
-    if every < 1 or names.FPS % every:
-        allowed = ", ".join(str(number) for number in range(1, names.FPS + 1) if names.FPS % number == 0)
-        raise InputError(f"every is {every}; it must divide the {names.FPS} frames a second: {allowed}.")
+def check_frame_stride(frame_stride: int) -> None:
+    """Raise `InputError` unless a frame every so many steps makes a whole number of frames a
+    second.
+    """
+    if frame_stride < 1 or names.FPS % frame_stride:
+        allowed = ", ".join(
+            str(number) for number in range(1, names.FPS + 1) if names.FPS % number == 0
+        )
+        raise InputError(
+            f"frame_stride is {frame_stride}; it must divide the {names.FPS} frames a second: {allowed}."
+        )
 
 
 def clock(steps: np.ndarray) -> np.ndarray:
-    """Return what a policy with a clock is told of the control steps (N,) since its subtask began, (N, 3) float32.
+    """Return what a policy with a clock is told of the control steps (N,) since its subtask began,
+    (N, 3) float32.
 
-    The share of `SUBTASK_STEPS`, and sine and cosine of a hand that goes round once in `CLOCK_PERIOD` steps: the share
-    alone changes too little in a few steps to act by.
+    The share of `SUBTASK_STEPS`, and sine and cosine of a hand that goes round once in
+    `CLOCK_PERIOD` steps: the share alone changes too little in a few steps to act by.
     """
     turn = 2.0 * np.pi * steps / CLOCK_PERIOD
     return np.stack([steps / SUBTASK_STEPS, np.sin(turn), np.cos(turn)], axis=1).astype(np.float32)

@@ -1,4 +1,5 @@
-"""Errors: one base class, and every message says what was given, what is allowed and what to do next.
+"""Errors: one base class, and every message says what was given, what is allowed and what to do
+next.
 
 The command line maps them to exit codes: `InputError` (wrong input) ends with 2, every other
 `SurgicaiError` (the work failed) with 1; both print one line and no traceback.
@@ -45,7 +46,9 @@ class OutputExists(InputError):
 
 
 class MissingWeights(InputError):
-    """Pretrained weights that are neither at hand nor downloadable; names the file and the alternatives."""
+    """Pretrained weights that are neither at hand nor downloadable; names the file and the
+    alternatives.
+    """
 
 
 class UnreachablePose(SurgicaiError):

@@ -1,7 +1,7 @@
 """Files: written whole or not at all (temporary name, fsync, rename), hashed, and safe to read.
 
-Every stage writes through this module, so a process killed at any moment leaves either the old file, the
-new one, or a temporary name that the next run removes.
+Every stage writes through this module, so a process killed at any moment leaves either the old
+file, the new one, or a temporary name that the next run removes.
 """
 
 import functools
@@ -54,7 +54,9 @@ def read_json(path: Path) -> Any:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`; rename it to `path` at the end, or remove it on an error."""
+    """Yield a temporary folder beside `path`; rename it to `path` at the end, or remove it on an
+    error.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}-{path.name}")
     temporary.mkdir()
@@ -100,12 +102,16 @@ def check_output(path: Path, *, may_resume: str | None = None) -> None:
             raise OutputExists(f"--out {path} is a file; give a folder that does not exist yet.")
         ours = may_resume is not None and (path / may_resume).exists()
         if any(path.iterdir()) and not ours:
-            raise OutputExists(f"--out {path} already holds files; give a folder that does not exist yet.")
+            raise OutputExists(
+                f"--out {path} already holds files; give a folder that does not exist yet."
+            )
     parent = path
     while not parent.exists():
         parent = parent.parent
     if not os.access(parent, os.W_OK | os.X_OK) or not parent.is_dir():
-        raise InputError(f"--out {path} cannot be written: no permission on {parent}; choose another folder.")
+        raise InputError(
+            f"--out {path} cannot be written: no permission on {parent}; choose another folder."
+        )
 
 
 def claim(path: Path, owner: dict[str, Any], what: str) -> None:
@@ -120,7 +126,9 @@ def claim(path: Path, owner: dict[str, Any], what: str) -> None:
         OutputExists: the file is there and says something else.
     """
     if path.exists() and read_json(path) != owner:
-        raise OutputExists(f"{path.parent} holds {what} of another policy, task or starts; give another --out.")
+        raise OutputExists(
+            f"{path.parent} holds {what} of another policy, task or starts; give another --out."
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, owner)
 
@@ -144,8 +152,9 @@ def code_version(*stages: str) -> str:
     """Return "<version>+<12 hex digits>": the sha256 over the sources of this package.
 
     Args:
-        stages: only these stages ("envs", "demos", …) and the shared modules; none means all of them. The families
-            "encoders" and "policies" stand beside the package and are named to be counted.
+        stages: only these stages ("envs", "demos", …) and the shared modules; none means all of
+            them. The families "encoders" and "policies" stand beside the package and are named to
+            be counted.
     """
     package = PACKAGE
     digest = hashlib.sha256()
@@ -155,7 +164,9 @@ def code_version(*stages: str) -> str:
     for path in sorted(package.rglob("*.py")):
         stage = path.relative_to(package).parts[0]
         if not stages or stage in stages or path in SHARED:
-            digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes() + b"\0")
+            digest.update(
+                str(path.relative_to(package)).encode() + b"\0" + path.read_bytes() + b"\0"
+            )
     return f"{__version__}+{digest.hexdigest()[:12]}"
 
 
@@ -165,6 +176,8 @@ def cache_root() -> Path:
 
 
 def configs_folder() -> Path:
-    """Return the folder of the configurations that ship with the package (in a checkout: `configs/`)."""
+    """Return the folder of the configurations that ship with the package (in a checkout:
+    `configs/`).
+    """
     shipped = PACKAGE / "configs"
     return shipped if shipped.is_dir() else PACKAGE.parent / "configs"

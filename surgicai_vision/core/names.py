@@ -6,7 +6,9 @@ Other modules import these and never spell them. Names are the field's: gymnasiu
 from types import MappingProxyType
 
 SUBTASKS = ("grasp", "place", "insert", "handoff", "pullout")
-"""The five subtasks in the order of the procedure; a subtask's index is its `phase` and its class."""
+"""The five subtasks in the order of the procedure; a subtask's index is its `phase` and its
+class.
+"""
 
 SUTURE = "suture"
 TASKS = (*SUBTASKS, SUTURE)
@@ -28,7 +30,9 @@ TASK_TEXTS = MappingProxyType(
 
 PSM1, PSM2 = "psm1", "psm2"
 ARMS = (PSM1, PSM2)
-ACTIVE_ARM = MappingProxyType({"grasp": PSM2, "place": PSM2, "insert": PSM2, "handoff": PSM1, "pullout": PSM1})
+ACTIVE_ARM = MappingProxyType(
+    {"grasp": PSM2, "place": PSM2, "insert": PSM2, "handoff": PSM1, "pullout": PSM1}
+)
 """Subtask → the arm its action moves."""
 
 FIXED_CAMERAS, WRIST_CAMERAS = ("front", "front_right", "back"), ("wrist_psm1", "wrist_psm2")
@@ -36,12 +40,14 @@ FOLLOWING_CAMERAS = ("front_psm1", "front_psm2", "back_psm1", "back_psm2")
 """What a fixed camera sees about an arm's jaws, larger (`scene.cameras`)."""
 CAMERAS = (*FIXED_CAMERAS, *WRIST_CAMERAS, *FOLLOWING_CAMERAS)
 DEPTH_VIEWS = tuple(f"{camera}_depth" for camera in CAMERAS)
-"""What a policy may see of a camera in the place of colours: its depth as a grey picture (`dataset.pictures.grey`)."""
+"""What a policy may see of a camera in the place of colours: its depth as a grey image
+(`dataset.images.grey`).
+"""
 VIEWS = (*CAMERAS, *DEPTH_VIEWS)
 RGB, DEPTH, SEGMENTATION = "rgb", "depth", "segmentation"
 MODALITIES = (RGB, DEPTH, SEGMENTATION)
 PARTS = ("background", "phantom", "needle", "thread", "psm1", "psm2")
-"""Named parts; a part's index is its value in a segmentation picture."""
+"""Named parts; a part's index is its value in a segmentation image."""
 
 OBS_TYPES = ("state", "goal", "pixels", "pixels_agent_pos")
 GRASPS = ("friction", "attach")
@@ -50,7 +56,9 @@ LAYOUTS = ("simple", "3dmed", "3dmed_straight")
 ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "jaw")
 STATE_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "jaw")
 BOTH_ARMS_NAMES = tuple(f"{arm}_{name}" for arm in ARMS for name in STATE_NAMES)
-PRIVILEGED_NAMES = tuple(f"{part}_{name}" for part in ("now", "goal", "error") for name in STATE_NAMES)
+PRIVILEGED_NAMES = tuple(
+    f"{part}_{name}" for part in ("now", "goal", "error") for name in STATE_NAMES
+)
 
 # LeRobot keys.
 STATE = "observation.state"
@@ -66,7 +74,9 @@ NEEDLE_POSE = "needle_pose"
 BOTH_ARMS = "both_arms"
 """Measured tip pose and jaw of psm1, then of psm2, each in its own base."""
 PRIVILEGED_STATE = "privileged_state"
-"""The 21 values of obs_type "state", goal included. No LeRobot key, so that no policy is fed it by default."""
+"""The 21 values of obs_type "state", goal included. No LeRobot key, so that no policy is fed it by
+default.
+"""
 
 CLOCKED_STATE = "clocked_state"
 """STATE and, last, the time since the subtask began as `config.clock` tells it."""
@@ -87,15 +97,15 @@ def camera_of(view: str) -> str:
 
 
 def image_key(view: str) -> str:
-    """LeRobot feature key of a view's RGB picture."""
+    """LeRobot feature key of a view's RGB image."""
     return f"observation.images.{view}"
 
 
 def depth_key(view: str) -> str:
-    """LeRobot feature key of a view's depth picture [m]."""
+    """LeRobot feature key of a view's depth image [m]."""
     return f"observation.images.{view}_depth"
 
 
 def segmentation_key(view: str) -> str:
-    """LeRobot feature key of a view's segmentation picture (part index)."""
+    """LeRobot feature key of a view's segmentation image (part index)."""
     return f"observation.images.{view}_segmentation"

@@ -5,12 +5,16 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 Stage = Callable[[str, str], AbstractContextManager[Callable[..., None]]]
-"""stage(title, unit) is a context that yields progress(done, total): a bar on the console, or nothing."""
+"""stage(title, unit) is a context that yields progress(done, total): a bar on the console, or
+nothing.
+"""
 
 
 @contextmanager
 def timed(stage: Stage, seconds: dict[str, float]) -> Iterator[Stage]:
-    """Yield a `stage` that adds each stage's time to `seconds`, by the first word of its title [s]."""
+    """Yield a `stage` that adds each stage's time to `seconds`, by the first word of its title
+    [s].
+    """
 
     @contextmanager
     def measured(title: str, unit: str) -> Iterator[Callable[..., None]]:

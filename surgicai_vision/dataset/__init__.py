@@ -2,9 +2,10 @@
 
     from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 
-`rendering` turns states into pictures (one job an episode), `writing` assembles the episodes with LeRobot's
-own metadata writer, `reading` opens a dataset without torch, `checking` verifies one, `repairing` keeps
-the longest verified prefix of a broken one, `viewing` makes one of fewer views or of videos.
+`rendering` turns states into images (one job an episode), `writing` assembles the episodes with
+LeRobot's own metadata writer, `reading` opens a dataset without torch, `checking` verifies one,
+`repairing` keeps the longest verified prefix of a broken one, `viewing` makes one of fewer views or
+of videos.
 """
 
 from surgicai_vision.dataset.convert import DatasetSummary, view_dataset

@@ -1,4 +1,4 @@
-"""Picture codecs, lossless: RGB and segmentation as PNG, depth as float32 TIFF in metres."""
+"""Image codecs, lossless: RGB and segmentation as PNG, depth as float32 TIFF in metres."""
 
 from typing import Any
 
@@ -12,43 +12,54 @@ PNG = (
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH),
 )
-"""One filter and no search for repetitions: 1.6 ms and 65 kB of a textured 224 × 224 picture. With a filter chosen for
-each row and run lengths it is 1 % smaller and takes 1.5 times as long; zlib's level 6 is 6 % smaller and takes seven
-times as long."""
+"""One filter and no search for repetitions: 1.6 ms and 65 kB of a textured 224 × 224 image. With a
+filter chosen for each row and run lengths it is 1 % smaller and takes 1.5 times as long; zlib's
+level 6 is 6 % smaller and takes seven times as long."""
 
 
 def encode(frame: np.ndarray) -> bytes:
-    """Encode (H, W, 3) uint8 RGB as PNG, (H, W, 1) uint8 as PNG of three equal channels, float32 as TIFF."""
+    """Encode (H, W, 3) uint8 RGB as PNG, (H, W, 1) uint8 as PNG of three equal channels, float32 as
+    TIFF.
+    """
     if frame.dtype == np.float32:
-        # Uncompressed TIFF: the parquet column around it is compressed, which is faster and smaller.
+        # Uncompressed TIFF: the parquet column around it is compressed, which is faster and
+        # smaller.
         done, content = cv2.imencode(".tiff", frame, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
     else:
-        picture = np.repeat(frame, 3, axis=2) if frame.shape[2] == 1 else cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-        done, content = cv2.imencode(".png", picture, PNG)
+        image = (
+            np.repeat(frame, 3, axis=2)
+            if frame.shape[2] == 1
+            else cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
+        )
+        done, content = cv2.imencode(".png", image, PNG)
     assert done
     return content.tobytes()
 
 
 DEPTH_NEAR, DEPTH_FAR = 0.02, 0.22
-"""Depths that a grey picture tells apart [m], in steps of 0.8 mm: all of the needle, the instruments and the phantom's
-middle in every camera (measured: 0.029 to 0.163 m)."""
+"""Depths that a grey image tells apart [m], in steps of 0.8 mm: all of the needle, the instruments
+and the phantom's middle in every camera (measured: 0.029 to 0.163 m)."""
 
 
 def grey(depth: np.ndarray) -> np.ndarray:
-    """Return depth (…, 1) float32 [m] as a picture (…, 3) uint8 of three equal channels, near is dark."""
+    """Return depth (…, 1) float32 [m] as an image (…, 3) uint8 of three equal channels, near is
+    dark.
+    """
     share = (depth - DEPTH_NEAR) * (255 / (DEPTH_FAR - DEPTH_NEAR))
     return np.repeat(np.clip(np.rint(share), 0, 255).astype(np.uint8), 3, axis=-1)
 
 
 def decode(content: Any, where: str) -> np.ndarray:
-    """Decode the buffer of a picture to (H, W, 3) uint8 RGB or (H, W, 1) float32.
+    """Decode the buffer of an image to (H, W, 3) uint8 RGB or (H, W, 1) float32.
 
     Raises:
-        BadFile: not a picture; `where` says which.
+        BadFile: not an image; `where` says which.
     """
-    frame = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
+    frame = (
+        cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
+    )
     if frame is None:
-        raise BadFile(f"{where}: its picture cannot be decoded.")
+        raise BadFile(f"{where}: its image cannot be decoded.")
     if frame.ndim == 2:
         return frame[..., None]
     return cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)

@@ -1,11 +1,12 @@
-"""Make a dataset from a dataset, without rendering: fewer views, or videos in the place of pictures.
+"""Make a dataset from a dataset, without rendering: fewer views, or videos in the place of images.
 
     view_dataset(Path("dataset"), Path("dataset-back"), views=("back",))
     made = view_dataset(Path("dataset"), Path("dataset-h264"), video="h264")
     made.video_error                # view → mean absolute error of its pixels, out of 255
 
-Columns, depth, segmentation and, without `video`, the pictures are taken over byte by byte. A video loses something:
-every frame is decoded again and compared with its picture, and what was lost is written into `meta/surgicai.json`.
+Columns, depth, segmentation and, without `video`, the images are taken over byte by byte. A video
+loses something: every frame is decoded again and compared with its image, and what was lost is
+written into `meta/surgicai.json`.
 """
 
 import dataclasses
@@ -44,7 +45,8 @@ class DatasetSummary:
         episodes: number of episodes.
         seconds: wall-clock time.
         digest: of the decoded content.
-        video_error: view → mean absolute error of its video, out of 255; none where pictures are lossless.
+        video_error: view → mean absolute error of its video, out of 255; none where images are
+            lossless.
     """
 
     frames: int
@@ -70,7 +72,7 @@ def view_dataset(
         path: a dataset of ours.
         out: dataset folder to make; the same request finds it finished.
         views: some of its views, in the order of the new dataset's columns; all by default.
-        video: codec, a key of `video.CODECS`; by default pictures stay as they are.
+        video: codec, a key of `video.CODECS`; by default images stay as they are.
         progress: called with (frames done, frames, "frames").
 
     Raises:
@@ -87,8 +89,14 @@ def view_dataset(
         raise InputError(f"views are {', '.join(views) or 'none'}; give at least one, each once.")
     check_video(video)
     if video and dataset.video:
-        raise InputError(f"{path} holds videos already ({dataset.video}); make others from a dataset of pictures.")
-    request = {"dataset": dataset.meta["digest"], "views": list(views), "video": video or dataset.video}
+        raise InputError(
+            f"{path} holds videos already ({dataset.video}); make others from a dataset of images."
+        )
+    request = {
+        "dataset": dataset.meta["digest"],
+        "views": list(views),
+        "video": video or dataset.video,
+    }
     check_output(out, may_resume=names.META_FILE)
     if not (out / names.META_FILE).exists():
         with building(out) as (store, result):
@@ -104,7 +112,9 @@ def check_video(video: str | None) -> None:
 
 
 def finished(out: Path, request: Mapping[str, Any], started: float) -> DatasetSummary:
-    """Return the summary of a finished dataset if it is the one asked for; `OutputExists` if it is another."""
+    """Return the summary of a finished dataset if it is the one asked for; `OutputExists` if it is
+    another.
+    """
     meta = read_json(out / names.META_FILE)
     if meta.get("request") != request:
         raise OutputExists(
@@ -114,7 +124,9 @@ def finished(out: Path, request: Mapping[str, Any], started: float) -> DatasetSu
     # Left by a run that was killed after its last step.
     shutil.rmtree(work_folder(out), ignore_errors=True)
     seconds = time.monotonic() - started
-    return DatasetSummary(meta["frames"], meta["episodes"], seconds, meta["digest"], meta.get("video_error", {}))
+    return DatasetSummary(
+        meta["frames"], meta["episodes"], seconds, meta["digest"], meta.get("video_error", {})
+    )
 
 
 def write_view(
@@ -129,17 +141,28 @@ def write_view(
     workers: int = 1,
     engine: Engine = LOCAL,
 ) -> None:
-    """Write the folder `out`, whole; `changes` go into its `meta/surgicai.json`, jobs in `store` make videos."""
+    """Write the folder `out`, whole; `changes` go into its `meta/surgicai.json`, jobs in `store`
+    make videos.
+    """
     files = LeRobotFiles(dataset.path)
     if len(files.rows) != int(dataset.meta["episodes"]):
         raise BadFile(f"{dataset.path} is damaged ({' '.join(files.problems)}); repair it first.")
-    keys = [key for key, _, _ in schema.picture_keys(views, dataset.has_depth, dataset.has_segmentation)]
+    keys = [
+        key for key, _, _ in schema.image_keys(views, dataset.has_depth, dataset.has_segmentation)
+    ]
     features = _features(files, dataset, keys, video)
     with whole_folder(out) as folder:
         encoded: list[dict[str, Encoded]] = []
         if video:
             encoded = encode_views(
-                dataset, folder, views, video, store=store, workers=workers, engine=engine, progress=progress
+                dataset,
+                folder,
+                views,
+                video,
+                store=store,
+                workers=workers,
+                engine=engine,
+                progress=progress,
             )
             places = [{key: item.place for key, item in episode.items()} for episode in encoded]
         else:
@@ -159,7 +182,9 @@ def write_view(
         write_json(folder / names.META_FILE, meta)
 
 
-def _features(files: LeRobotFiles, dataset: Dataset, keys: Sequence[str], video: str | None) -> dict[str, Any]:
+def _features(
+    files: LeRobotFiles, dataset: Dataset, keys: Sequence[str], video: str | None
+) -> dict[str, Any]:
     """Return the new dataset's features."""
     features = {key: files.features[key] for key in keys}
     for key, row in files.features.items():
@@ -184,7 +209,10 @@ def _features(files: LeRobotFiles, dataset: Dataset, keys: Sequence[str], video:
 
 
 def _write_data(
-    files: LeRobotFiles, folder: Path, features: Mapping[str, Any], places: Sequence[Mapping[str, Place]]
+    files: LeRobotFiles,
+    folder: Path,
+    features: Mapping[str, Any],
+    places: Sequence[Mapping[str, Place]],
 ) -> list[EpisodeRow]:
     """Write the data files; return the episodes' rows."""
     data = DataFiles(folder, features, files.fps)
@@ -207,7 +235,9 @@ def _copy_videos(files: LeRobotFiles, folder: Path, keys: Sequence[str]) -> list
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, target)
         for number, row in enumerate(files.rows):
-            file_number = row[f"videos/{key}/chunk_index"] * FILES_PER_CHUNK + row[f"videos/{key}/file_index"]
+            file_number = (
+                row[f"videos/{key}/chunk_index"] * FILES_PER_CHUNK + row[f"videos/{key}/file_index"]
+            )
             span = (row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"])
             places[number][key] = (file_number, *span)
     return places if keys else []
@@ -231,7 +261,9 @@ def _look(
                 continue
             for frame in dataset.decoded(key, row.start, row.stop):
                 digest.add(key, frame)
-        digests.append(digest.hexdigest({key: columns[key][row.start : row.stop] for key in schema.COLUMNS}))
+        digests.append(
+            digest.hexdigest({key: columns[key][row.start : row.stop] for key in schema.COLUMNS})
+        )
         if progress and not encoded:
             progress(row.stop, dataset.length, "frames")
     errors = {}

@@ -1,9 +1,10 @@
-"""Export a dataset with frozen features in place of pictures, for LeRobot's ACT and Diffusion.
+"""Export a dataset with frozen features in place of images, for LeRobot's ACT and Diffusion.
 
     export_features(dataset, rows, about, out)
 
-The features of all views stand side by side in `observation.environment_state`, which both policies take without
-any picture. `meta/surgicai.json` says in `features` which encoder they are of, so that the env shows the same.
+The features of all views stand side by side in `observation.environment_state`, which both policies
+take without any image. `meta/surgicai.json` says in `features` which encoder they are of, so that
+the env shows the same.
 """
 
 import tempfile
@@ -24,8 +25,10 @@ from surgicai_vision.dataset.stats import column_statistics
 from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, assemble
 
 
-def export_features(dataset: Dataset, rows: Sequence[np.ndarray], about: Mapping[str, Any], out: Path) -> None:
-    """Write `out`: the columns of `dataset` and its features, no pictures.
+def export_features(
+    dataset: Dataset, rows: Sequence[np.ndarray], about: Mapping[str, Any], out: Path
+) -> None:
+    """Write `out`: the columns of `dataset` and its features, no images.
 
     Args:
         dataset: an opened dataset.
@@ -41,7 +44,9 @@ def export_features(dataset: Dataset, rows: Sequence[np.ndarray], about: Mapping
         raise OutputExists(f"{out} exists; give a folder that does not exist yet.")
     for entry in rows:
         if len(entry) != dataset.length:
-            raise InputError(f"{len(entry)} features of {dataset.length} frames; encode this dataset.")
+            raise InputError(
+                f"{len(entry)} features of {dataset.length} frames; encode this dataset."
+            )
     width = sum(entry.shape[1] for entry in rows)
     features = schema.features((), dataset.image_size, depth=False, segmentation=False)
     features[names.ENVIRONMENT_STATE] = {"dtype": "float32", "shape": (width,), "names": None}
@@ -53,7 +58,9 @@ def export_features(dataset: Dataset, rows: Sequence[np.ndarray], about: Mapping
             where = np.flatnonzero(dataset.episode_index == episode)
             part = {key: values[where] for key, values in columns.items()}
             digests.append(schema.EpisodeDigest(()).hexdigest(part))
-            part[names.ENVIRONMENT_STATE] = np.concatenate([entry[where] for entry in rows], axis=1).astype(np.float32)
+            part[names.ENVIRONMENT_STATE] = np.concatenate(
+                [entry[where] for entry in rows], axis=1
+            ).astype(np.float32)
             shards.append(_write_shard(Path(scratch) / str(episode), part))
         meta = {
             **dataset.meta,
@@ -73,7 +80,9 @@ def _write_shard(folder: Path, columns: Mapping[str, np.ndarray]) -> Path:
     arrays = {}
     for key, values in columns.items():
         flat = pa.array(np.ascontiguousarray(values).ravel())
-        arrays[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim == 2 else flat
+        arrays[key] = (
+            pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim == 2 else flat
+        )
     pq.write_table(pa.table(arrays), folder / EPISODE_FILE)
     statistics = {key: column_statistics(values) for key, values in columns.items()}
     write_json(folder / SUMMARY_FILE, {"statistics": statistics})

@@ -58,12 +58,14 @@ class DatasetPart:
         return self._whole.episode_index[: self.length]
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return every column that is no picture, as `Dataset.columns`."""
+        """Return every column that is no image, as `Dataset.columns`."""
         return {key: values[: self.length] for key, values in self._whole.columns().items()}
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> Any:
-        """Return the RGB pictures of a view, (stop - start, H, W, 3) uint8."""
+        """Return the RGB images of a view, (stop - start, H, W, 3) uint8."""
         stop = self.length if stop is None else stop
         if stop > self.length:
-            raise InputError(f"frames {start} to {stop} were asked; this part has 0 to {self.length}.")
+            raise InputError(
+                f"frames {start} to {stop} were asked; this part has 0 to {self.length}."
+            )
         return self._whole.frames(view, start, stop)

@@ -1,11 +1,12 @@
-"""Share a dataset on the Hugging Face Hub: with a card that says what it is, checked before and after.
+"""Share a dataset on the Hugging Face Hub: with a card that says what it is, checked before and
+after.
 
     push_dataset(Path("dataset"), "somebody/suturing-grasp")
     pull_dataset("somebody/suturing-grasp", Path("dataset"))
     dataset_card(open_dataset(Path("dataset")), "somebody/suturing-grasp")
 
-A push is one commit, tagged with LeRobot's format version as its own loader asks for. Without a network both end at
-once with one line.
+A push is one commit, tagged with LeRobot's format version as its own loader asks for. Without a
+network both end at once with one line.
 """
 
 import io
@@ -40,7 +41,12 @@ KEPT = ("meta", "data", "videos")
 def dataset_card(dataset: Dataset, repo: str, licence: str = LICENCE) -> str:
     """Return the card of a dataset, Markdown with the Hub's header."""
     meta = dataset.meta
-    pictures = [key for key, _, _ in schema.picture_keys(dataset.views, dataset.has_depth, dataset.has_segmentation)]
+    images = [
+        key
+        for key, _, _ in schema.image_keys(
+            dataset.views, dataset.has_depth, dataset.has_segmentation
+        )
+    ]
     size = f"{dataset.image_size} × {dataset.image_size}"
     lost = "".join(
         f" The video of `{view}` is off by {error:.2f} of 255 on average."
@@ -48,7 +54,7 @@ def dataset_card(dataset: Dataset, repo: str, licence: str = LICENCE) -> str:
     )
     stored = f"as {dataset.video} video.{lost}" if dataset.video else "lossless."
     rows = "\n".join(f"| `{key}` | {text} |" for key, text in COLUMN_TEXTS.items())
-    shown = "\n".join(f"| `{key}` | {size} |" for key in pictures)
+    shown = "\n".join(f"| `{key}` | {size} |" for key in images)
     return f"""---
 license: {licence}
 task_categories:
@@ -69,7 +75,7 @@ configs:
 
 {meta["episodes"]} simulated demonstrations of the task `{dataset.task}` in robotic suturing: {dataset.length} frames
 at {dataset.fps} per second, by {", ".join(meta["sources"])}. LeRobot {CODEBASE_VERSION} format, by surgicai-vision
-({meta["code_version"]}). Pictures of {size} pixels, {stored}
+({meta["code_version"]}). Images of {size} pixels, {stored}
 
 | column | content |
 |---|---|
@@ -143,16 +149,25 @@ def push_dataset(
         api.create_repo(repo, repo_type="dataset", private=private, exist_ok=True)
         text = f"{dataset.meta['episodes']} episodes of {dataset.task}"
         commit = api.create_commit(repo, operations, commit_message=text, repo_type="dataset")
-        if any(tag.name == CODEBASE_VERSION for tag in api.list_repo_refs(repo, repo_type="dataset").tags):
+        if any(
+            tag.name == CODEBASE_VERSION
+            for tag in api.list_repo_refs(repo, repo_type="dataset").tags
+        ):
             api.delete_tag(repo, tag=CODEBASE_VERSION, repo_type="dataset")
         api.create_tag(repo, tag=CODEBASE_VERSION, revision=commit.oid, repo_type="dataset")
     return str(commit.commit_url)
 
 
 def pull_dataset(
-    repo: str, out: Path, *, revision: str | None = None, progress: Progress | None = None, api: Any = None
+    repo: str,
+    out: Path,
+    *,
+    revision: str | None = None,
+    progress: Progress | None = None,
+    api: Any = None,
 ) -> CheckReport:
-    """Fetch a dataset into the new folder `out` and check it; the same command goes on with what was fetched.
+    """Fetch a dataset into the new folder `out` and check it; the same command goes on with what
+    was fetched.
 
     Raises:
         InputError: a bad name.
@@ -167,7 +182,11 @@ def pull_dataset(
         with _hub(repo):
             wanted = [f"{name}/**" for name in KEPT]
             api.snapshot_download(
-                repo, repo_type="dataset", revision=revision, local_dir=fetched, allow_patterns=[*wanted, CARD]
+                repo,
+                repo_type="dataset",
+                revision=revision,
+                local_dir=fetched,
+                allow_patterns=[*wanted, CARD],
             )
         shutil.rmtree(fetched / ".cache", ignore_errors=True)  # the Hub client's notes
         report = check_dataset(fetched, progress)
@@ -180,7 +199,9 @@ def pull_dataset(
 
 def _whole(report: CheckReport, where: str) -> None:
     if not report.ok:
-        raise BadFile(f"{where} is damaged: {report.problems[0]} See `surgicai-vision dataset check --help`.")
+        raise BadFile(
+            f"{where} is damaged: {report.problems[0]} See `surgicai-vision dataset check --help`."
+        )
 
 
 def _api(repo: str, api: Any) -> Any:
@@ -197,14 +218,23 @@ def _api(repo: str, api: Any) -> Any:
         raise InputError(f"'{repo}' does not say whose it is; write user/name.")
     if api is not None:
         return api
-    if constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "TRUE", "YES", "ON"):
-        raise SurgicaiError("HF_HUB_OFFLINE is set: nothing is pushed or pulled; unset it to use the Hub.")
+    if constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in (
+        "1",
+        "TRUE",
+        "YES",
+        "ON",
+    ):
+        raise SurgicaiError(
+            "HF_HUB_OFFLINE is set: nothing is pushed or pulled; unset it to use the Hub."
+        )
     _reach(constants.ENDPOINT)
     return HfApi()
 
 
 def _reach(endpoint: str) -> None:
-    """Raise `SurgicaiError` at once where the Hub, or the proxy on the way to it, does not answer."""
+    """Raise `SurgicaiError` at once where the Hub, or the proxy on the way to it, does not
+    answer.
+    """
     wanted = urllib.parse.urlsplit(endpoint)
     proxy = urllib.request.getproxies().get(wanted.scheme)
     target = urllib.parse.urlsplit(proxy) if proxy else wanted
@@ -226,5 +256,7 @@ def _hub(repo: str) -> Iterator[None]:
     try:
         yield
     except (HfHubHTTPError, httpx.HTTPError, OSError) as error:
-        text = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        text = next(
+            (line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__
+        )
         raise SurgicaiError(f"The Hub refused {repo}: {text[:200]}") from None

@@ -1,10 +1,11 @@
 """LeRobot's v3 metadata, written without importing LeRobot.
 
-Its own writer would do, but importing it takes 11 s on an idle machine (torch, torchvision, datasets) where
-everything else here takes one. `tests/test_dataset.py` holds each of these against what lerobot 0.6.1 writes.
+Its own writer would do, but importing it takes 11 s on an idle machine (torch, torchvision,
+datasets) where everything else here takes one. `tests/test_dataset.py` holds each of these against
+what lerobot 0.6.1 writes.
 
-    schema = arrow_schema(features)               # of data files, with what `datasets` reads from it
-    write_metadata(folder, features, tasks, episodes)
+    schema = arrow_schema(features)               # of data files, with what `datasets` reads from
+    it write_metadata(folder, features, tasks, episodes)
 """
 
 import json
@@ -57,12 +58,16 @@ class EpisodeRow:
     file: int
     statistics: Mapping[str, Statistics]
     tasks: tuple[str, ...] = ()
-    videos: Mapping[str, tuple[int, float, float]] = field(default_factory=lambda: MappingProxyType({}))
+    videos: Mapping[str, tuple[int, float, float]] = field(
+        default_factory=lambda: MappingProxyType({})
+    )
 
 
 def all_features(features: Features) -> dict[str, Any]:
     """Return the features with the columns LeRobot adds."""
-    added = {key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in INDEX_FEATURES.items()}
+    added = {
+        key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in INDEX_FEATURES.items()
+    }
     return {**features, **added}
 
 
@@ -77,7 +82,9 @@ def data_path(file: int) -> str:
 
 
 def arrow_schema(features: Features) -> pa.Schema:
-    """Return the schema of a data file: Arrow types, and the same as Hugging Face's feature types."""
+    """Return the schema of a data file: Arrow types, and the same as Hugging Face's feature
+    types.
+    """
     fields: list[pa.Field] = []
     hub: dict[str, Any] = {}
     for key, feature in all_features(features).items():
@@ -91,7 +98,9 @@ def _types(dtype: str, shape: tuple[int, ...]) -> tuple[Any, dict[str, Any]]:
     """Return a feature's Arrow type and Hugging Face's."""
     if dtype == "image":
         return pa.struct({"bytes": pa.binary(), "path": pa.string()}), {"_type": "Image"}
-    kind = {"bool": pa.bool_(), "string": pa.string()}.get(dtype) or pa.from_numpy_dtype(np.dtype(dtype))
+    kind = {"bool": pa.bool_(), "string": pa.string()}.get(dtype) or pa.from_numpy_dtype(
+        np.dtype(dtype)
+    )
     value = {"dtype": dtype, "_type": "Value"}
     if shape == (1,):
         return kind, value
@@ -116,7 +125,8 @@ def write_metadata(
         features: its features, without the columns LeRobot adds.
         tasks: the sentence of every task, in the order of `task_index`.
         episodes: every episode, in order.
-        origin: the `meta/info.json` of the dataset it is made from; what is not counted here is kept.
+        origin: the `meta/info.json` of the dataset it is made from; what is not counted here is
+            kept.
     """
     import pandas
 
@@ -135,7 +145,9 @@ def write_metadata(
         "data_files_size_in_mb": DATA_FILE_MB,
         "video_files_size_in_mb": VIDEO_FILE_MB,
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4" if videos else None,
+        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+        if videos
+        else None,
         "robot_type": ROBOT_TYPE,
         "splits": {"train": f"0:{len(episodes)}"},
         **{key: origin[key] for key in kept if key in origin},
@@ -143,8 +155,12 @@ def write_metadata(
     # In the order of the features, which is the order LeRobot shows and policies stack them in.
     (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n")
     index = pandas.Index(list(tasks), name="task")
-    pandas.DataFrame({"task_index": range(len(tasks))}, index=index).to_parquet(meta / "tasks.parquet")
-    rows = [_row(number, episode.tasks or tasks, episode) for number, episode in enumerate(episodes)]
+    pandas.DataFrame({"task_index": range(len(tasks))}, index=index).to_parquet(
+        meta / "tasks.parquet"
+    )
+    rows = [
+        _row(number, episode.tasks or tasks, episode) for number, episode in enumerate(episodes)
+    ]
     table = pa.Table.from_pydict({key: [row[key] for row in rows] for key in rows[0]})
     pq.write_table(table, meta / "episodes/chunk-000/file-000.parquet")
     write_json(meta / "stats.json", aggregate([episode.statistics for episode in episodes]))
@@ -162,7 +178,9 @@ def _row(index: int, tasks: Sequence[str], episode: EpisodeRow) -> dict[str, Any
         "dataset_to_index": episode.stop,
     }
     for key, (file, begin, end) in episode.videos.items():
-        row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"] = divmod(file, FILES_PER_CHUNK)
+        row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"] = divmod(
+            file, FILES_PER_CHUNK
+        )
         row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"] = begin, end
     for key, statistics in episode.statistics.items():
         row.update({f"stats/{key}/{name}": value for name, value in statistics.items()})
@@ -180,16 +198,27 @@ def row_statistics(row: Mapping[str, Any]) -> dict[str, Statistics]:
 
 
 def aggregate(episodes: Sequence[Mapping[str, Statistics]]) -> dict[str, Statistics]:
-    """Return the statistics of all episodes together; quantiles are means weighted by frames, as LeRobot's."""
+    """Return the statistics of all episodes together; quantiles are means weighted by frames, as
+    LeRobot's.
+    """
     return {key: _aggregate([episode[key] for episode in episodes]) for key in episodes[0]}
 
 
 def _aggregate(rows: Sequence[Statistics]) -> Statistics:
     counts = np.array([row["count"][0] for row in rows], dtype=np.float64)
     weights = counts / counts.sum()
-    arrays = {name: np.array([row[name] for row in rows], dtype=np.float64) for name in rows[0] if name != "count"}
+    arrays = {
+        name: np.array([row[name] for row in rows], dtype=np.float64)
+        for name in rows[0]
+        if name != "count"
+    }
     mean = np.tensordot(weights, arrays["mean"], 1)
     variance = np.tensordot(weights, arrays["std"] ** 2 + (arrays["mean"] - mean) ** 2, 1)
     result = {name: np.tensordot(weights, values, 1) for name, values in arrays.items()}
-    result.update(min=arrays["min"].min(0), max=arrays["max"].max(0), mean=mean, std=np.sqrt(variance))
-    return {**{name: value.tolist() for name, value in result.items()}, "count": [int(counts.sum())]}
+    result.update(
+        min=arrays["min"].min(0), max=arrays["max"].max(0), mean=mean, std=np.sqrt(variance)
+    )
+    return {
+        **{name: value.tolist() for name, value in result.items()},
+        "count": [int(counts.sum())],
+    }

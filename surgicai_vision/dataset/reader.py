@@ -5,8 +5,8 @@
     dataset.frames("front", 0, 64)          # (64, 224, 224, 3) uint8 RGB
     dataset.depth("front", 0, 64)           # (64, 224, 224, 1) float32 [m]
 
-Frames are numbered over the whole dataset, as LeRobot's `index` column. Reading in order keeps one row group
-(one episode) of one column in memory.
+Frames are numbered over the whole dataset, as LeRobot's `index` column. Reading in order keeps one
+row group (one episode) of one column in memory.
 """
 
 import functools
@@ -49,10 +49,11 @@ class Dataset:
         task: the task's name.
         config: the task's configuration.
         views: cameras, in order.
-        image_size: side of the pictures [px].
+        image_size: side of the images [px].
         length: number of frames N.
-        fps: frames a second of simulated time; below `names.FPS` where only every so-manieth frame was rendered.
-        video: codec of the RGB views, None where they are lossless pictures.
+        fps: frames a second of simulated time; below `names.FPS` where only every so-manieth frame
+            was rendered.
+        video: codec of the RGB views, None where they are lossless images.
     """
 
     def __init__(self, path: Path):
@@ -65,15 +66,22 @@ class Dataset:
         self.meta = read_json(self.path / names.META_FILE)
         try:
             self.task: str = self.meta["task"]
-            self.config = from_mapping(TaskConfig, self.meta["task_config"], str(self.path / names.META_FILE))
+            self.config = from_mapping(
+                TaskConfig, self.meta["task_config"], str(self.path / names.META_FILE)
+            )
             self.views = tuple(str(view) for view in self.meta["views"])
             self.image_size = int(self.meta["image_size"])
             self.length, self.fps = int(self.meta["frames"]), int(self.meta["fps"])
             self.video: str | None = self.meta.get("video")
-            self.has_depth, self.has_segmentation = bool(self.meta["depth"]), bool(self.meta["segmentation"])
+            self.has_depth, self.has_segmentation = (
+                bool(self.meta["depth"]),
+                bool(self.meta["segmentation"]),
+            )
         except (KeyError, TypeError, ValueError, InputError) as error:
             raise BadFile(f"{self.path / names.META_FILE} is damaged ({error}).") from None
-        self._files = [_open(file) for file in sorted(self.path.glob("data/chunk-*/file-*.parquet"))]
+        self._files = [
+            _open(file) for file in sorted(self.path.glob("data/chunk-*/file-*.parquet"))
+        ]
         # (file, row group, first frame, frames) of every row group, in order.
         self._groups: list[tuple[int, int, int, int]] = []
         start = 0
@@ -83,7 +91,9 @@ class Dataset:
                 self._groups.append((index, group, start, count))
                 start += count
         if start != self.length:
-            raise BadFile(f"{self.path} holds {start} frames; its {names.META_FILE} says {self.length}.")
+            raise BadFile(
+                f"{self.path} holds {start} frames; its {names.META_FILE} says {self.length}."
+            )
 
     def __len__(self) -> int:
         return self.length
@@ -92,7 +102,10 @@ class Dataset:
     def fingerprint(self) -> str:
         """sha256 (hex) over the data files and `meta/surgicai.json`."""
         total = hashlib.sha256()
-        for file in [*sorted(self.path.glob("data/chunk-*/file-*.parquet")), self.path / names.META_FILE]:
+        for file in [
+            *sorted(self.path.glob("data/chunk-*/file-*.parquet")),
+            self.path / names.META_FILE,
+        ]:
             total.update(f"{file.relative_to(self.path)} {sha256_file(file)}\n".encode())
         return total.hexdigest()
 
@@ -109,7 +122,7 @@ class Dataset:
 
     @property
     def video_keys(self) -> frozenset[str]:
-        """Picture columns that are videos."""
+        """Image columns that are videos."""
         return frozenset(map(names.image_key, self.views)) if self.video else frozenset()
 
     def bounds(self) -> list[tuple[int, int]]:
@@ -118,27 +131,35 @@ class Dataset:
         return list(itertools.pairwise(starts)) if self.length else []
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return every column that is no picture, (N,) or (N, n): those of `layout.COLUMNS` and LeRobot's."""
-        return {key: self._column(key) for key in (*schema.COLUMNS, "frame_index", "timestamp", "index")}
+        """Return every column that is no image, (N,) or (N, n): those of `layout.COLUMNS` and
+        LeRobot's.
+        """
+        return {
+            key: self._column(key) for key in (*schema.COLUMNS, "frame_index", "timestamp", "index")
+        }
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Return the RGB pictures of a view, or a depth view's grey ones, (stop - start, H, W, 3) uint8."""
+        """Return the RGB images of a view, or a depth view's grey ones, (stop - start, H, W, 3)
+        uint8.
+        """
         if view in names.DEPTH_VIEWS:
             return codecs.grey(self.depth(names.camera_of(view), start, stop))
-        return self._pictures(names.image_key(self._view(view)), start, stop)
+        return self._images(names.image_key(self._view(view)), start, stop)
 
     def depth(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Return the depth pictures of a view, (stop - start, H, W, 1) float32 [m]."""
+        """Return the depth images of a view, (stop - start, H, W, 1) float32 [m]."""
         self._check("depth", self.has_depth)
-        return self._pictures(names.depth_key(self._view(view)), start, stop)
+        return self._images(names.depth_key(self._view(view)), start, stop)
 
     def segmentation(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Return the segmentation pictures of a view, (stop - start, H, W, 1) uint8, indices in `names.PARTS`."""
+        """Return the segmentation images of a view, (stop - start, H, W, 1) uint8, indices in
+        `names.PARTS`.
+        """
         self._check("segmentation", self.has_segmentation)
-        return self._pictures(names.segmentation_key(self._view(view)), start, stop)[..., :1]
+        return self._images(names.segmentation_key(self._view(view)), start, stop)[..., :1]
 
     def decoded(self, key: str, start: int, stop: int) -> Iterator[np.ndarray]:
-        """Yield the pictures start … stop - 1 of a column as they decode, whatever their size."""
+        """Yield the images start … stop - 1 of a column as they decode, whatever their size."""
         if key in self.video_keys:
             yield from self._from_videos(key, start, stop)
             return
@@ -169,7 +190,9 @@ class Dataset:
                 columns = ["dataset_from_index", "dataset_to_index", *wanted]
                 rows.extend(_open(file).read(columns).select(columns).to_pylist())
             except (KeyError, pa.ArrowException) as error:
-                raise BadFile(f"{file} does not say where the videos are ({_line(error)}).") from None
+                raise BadFile(
+                    f"{file} does not say where the videos are ({_line(error)})."
+                ) from None
         return rows
 
     def _view(self, view: str) -> str:
@@ -184,18 +207,24 @@ class Dataset:
         parts = [self._read(file, None, key) for file in range(len(self._files))]
         column = pa.chunked_array([chunk for part in parts for chunk in part.chunks])
         if pa.types.is_fixed_size_list(column.type):
-            values: np.ndarray = np.asarray(pc.list_flatten(column)).reshape(-1, column.type.list_size)
+            values: np.ndarray = np.asarray(pc.list_flatten(column)).reshape(
+                -1, column.type.list_size
+            )
         else:
             values = np.asarray(column)
         if values.dtype.kind not in "biuf" or len(values) != self.length:
-            raise BadFile(f"{self.path}: column {key} holds {column.type} or less than a number a frame.")
+            raise BadFile(
+                f"{self.path}: column {key} holds {column.type} or less than a number a frame."
+            )
         return values
 
-    def _pictures(self, key: str, start: int, stop: int | None) -> np.ndarray:
-        """Return the decoded pictures start … stop - 1 of a column."""
+    def _images(self, key: str, start: int, stop: int | None) -> np.ndarray:
+        """Return the decoded images start … stop - 1 of a column."""
         stop = self.length if stop is None else stop
         if not 0 <= start <= stop <= self.length:
-            raise InputError(f"frames {start} to {stop} were asked; the dataset has 0 to {self.length}.")
+            raise InputError(
+                f"frames {start} to {stop} were asked; the dataset has 0 to {self.length}."
+            )
         depth = key in [names.depth_key(view) for view in self.views]
         shape = (stop - start, self.image_size, self.image_size, 1 if depth else 3)
         batch = np.empty(shape, np.float32 if depth else np.uint8)
@@ -209,7 +238,7 @@ class Dataset:
         return batch
 
     def _content(self, key: str, position: int) -> list[pa.Buffer]:
-        """Return the encoded pictures of one row group; the last few are kept."""
+        """Return the encoded images of one row group; the last few are kept."""
         cache = self.__dict__.setdefault("_cache", {})
         if (key, position) not in cache:
             while len(cache) >= 2 * max(1, len(self.views)):
@@ -227,7 +256,9 @@ class Dataset:
             table = reader.read(columns) if group is None else reader.read_row_group(group, columns)
             return table.column(key or column)
         except (OSError, KeyError, pa.ArrowException) as error:
-            raise BadFile(f"{self.path}: column {key or column} cannot be read ({_line(error)}).") from None
+            raise BadFile(
+                f"{self.path}: column {key or column} cannot be read ({_line(error)})."
+            ) from None
 
 
 def _open(path: Path) -> pq.ParquetFile:

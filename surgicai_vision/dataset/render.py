@@ -1,12 +1,12 @@
-"""Render demonstrations: states → pictures, one job an episode, then one LeRobot dataset.
+"""Render demonstrations: states → images, one job an episode, then one LeRobot dataset.
 
-    summary = render_demos(Path("demos"), Path("dataset"), views=("front", "back"), depth=True, workers=2)
-    summary.frames, summary.episodes, summary.seconds, summary.digest
+    summary = render_demos(Path("demos"), Path("dataset"), views=("front", "back"), depth=True,
+    workers=2) summary.frames, summary.episodes, summary.seconds, summary.digest
 
-Every state of a demonstration is set in the environment as it was recorded and observed; frame t is the
-state before action t. An episode is committed whole to `<out>.work`, and when all are there the dataset is
-assembled and renamed whole to `out`. Killed anywhere, the same command continues; finished, it does nothing.
-Frames and their order do not depend on the number of workers.
+Every state of a demonstration is set in the environment as it was recorded and observed; frame t is
+the state before action t. An episode is committed whole to `<out>.work`, and when all are there the
+dataset is assembled and renamed whole to `out`. Killed anywhere, the same command continues;
+finished, it does nothing. Frames and their order do not depend on the number of workers.
 """
 
 import atexit
@@ -23,14 +23,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig, check_every, from_mapping, to_mapping
+from surgicai_vision.core.config import TaskConfig, check_frame_stride, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.executor import LOCAL, Engine, Job, Progress, building, run
-from surgicai_vision.core.files import check_output, code_version, read_json, sha256_file, write_json
+from surgicai_vision.core.files import (
+    check_output,
+    code_version,
+    read_json,
+    sha256_file,
+    write_json,
+)
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.convert import DatasetSummary, check_video, finished, write_view
 from surgicai_vision.dataset.reader import open_dataset
-from surgicai_vision.dataset.stats import PictureStatistics, column_statistics
+from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
 from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, assemble, compression
 from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo, read_marker
 
@@ -55,7 +61,7 @@ def render_demos(
     size: int = 224,
     depth: bool = False,
     segmentation: bool = False,
-    every: int = 1,
+    frame_stride: int = 1,
     video: str | None = None,
     workers: int = 1,
     engine: Engine = LOCAL,
@@ -64,15 +70,17 @@ def render_demos(
     """Render demonstrations into a LeRobot dataset.
 
     Args:
-        demos: folder of demonstrations, or several, one behind the other; all of one task and scene.
+        demos: folder of demonstrations, or several, one behind the other; all of one task and
+            scene.
         out: dataset folder to make; the same request continues it or finds it finished.
         views: cameras, in the order of the dataset's columns.
-        size: side of the square pictures [px].
+        size: side of the square images [px].
         depth: also render depth, float32 [m].
         segmentation: also render part indices (`names.PARTS`).
-        every: render every so-manieth frame of each episode alone, from its first; a divisor of `names.FPS`, so that
-            the dataset has `names.FPS / every` frames a second of simulated time. Actions stay those of one step.
-        video: codec of the RGB views, a key of `video.CODECS`; lossless pictures by default.
+        frame_stride: render every so-manieth frame of each episode alone, from its first; a divisor
+            of `names.FPS`, so that the dataset has `names.FPS / every` frames a second of simulated
+            time. Actions stay those of one step.
+        video: codec of the RGB views, a key of `video.CODECS`; lossless images by default.
         workers: number of processes.
         engine: what runs them.
         progress: called with (frames done, frames, "frames").
@@ -83,22 +91,32 @@ def render_demos(
         OutputExists: `out` holds something else.
     """
     started = time.monotonic()
-    _check_pictures(views, size, video)
-    check_every(every)
+    _check_images(views, size, video)
+    check_frame_stride(frame_stride)
     check_output(out, may_resume=names.META_FILE)
     sources = [demos] if isinstance(demos, Path) else list(demos)
     paths = [path for source in sources for path in list_demos(source)]
-    options: dict[str, Any] = {"views": list(views), "size": size, "depth": depth, "segmentation": segmentation}
-    options |= {"every": every} if every > 1 else {}
+    options: dict[str, Any] = {
+        "views": list(views),
+        "size": size,
+        "depth": depth,
+        "segmentation": segmentation,
+    }
+    options |= {"frame_stride": frame_stride} if frame_stride > 1 else {}
     request = {**options, "demos": demos_digest(paths), **({"video": video} if video else {})}
     if (out / names.META_FILE).exists():
         return finished(out, request, started)
     origins = [_Origin.of(read_demo(path)) for path in paths]
     config = _same_config(origins, paths)
-    jobs = [_job(path, options, len(range(0, row.length, every))) for path, row in zip(paths, origins, strict=True)]
+    jobs = [
+        _job(path, options, len(range(0, row.length, frame_stride)))
+        for path, row in zip(paths, origins, strict=True)
+    ]
     with building(out) as (store, result):
         shards = run(jobs, store, workers=workers, progress=progress, unit="frames", engine=engine)
-        meta = _meta(sources, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins)
+        meta = _meta(
+            sources, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins
+        )
         table = schema.features(views, size, depth, segmentation)
         lossless = store / "lossless" if video else result
         shutil.rmtree(lossless, ignore_errors=True)
@@ -111,10 +129,16 @@ def render_demos(
 
 def _job(path: Path, options: Mapping[str, Any], frames: int) -> Job:
     """Return the job that renders one demonstration."""
-    return Job("render-episode", {"demo": str(path.resolve()), **options}, (sha256_file(path),), frames, ("demo",))
+    return Job(
+        "render-episode",
+        {"demo": str(path.resolve()), **options},
+        (sha256_file(path),),
+        frames,
+        ("demo",),
+    )
 
 
-def _check_pictures(views: Sequence[str], size: int, video: str | None) -> None:
+def _check_images(views: Sequence[str], size: int, video: str | None) -> None:
     """Refuse views, sizes and codecs that cannot be rendered."""
     for view in views:
         check_name("view", view, names.CAMERAS)
@@ -126,7 +150,7 @@ def _check_pictures(views: Sequence[str], size: int, video: str | None) -> None:
 
 
 class _Origin(NamedTuple):
-    """What is kept of a demonstration while its pictures are made elsewhere."""
+    """What is kept of a demonstration while its images are made elsewhere."""
 
     length: int
     config: TaskConfig
@@ -137,7 +161,7 @@ class _Origin(NamedTuple):
     @classmethod
     def of(cls, demo: Demo) -> "_Origin":
         """Return a demonstration's origin."""
-        return cls(len(demo), demo.config, demo.scene_hash, demo.source, demo.code_version)
+        return cls(len(demo), demo.config, demo.scene_hash, demo.demonstrator, demo.code_version)
 
 
 def _same_config(origins: Sequence[_Origin], paths: Sequence[Path]) -> TaskConfig:
@@ -168,7 +192,7 @@ def _meta(
         "cameras": summaries[0]["cameras"],
         "units": {"length": "m", "angle": "rad", "depth": "m", "time": "s"},
         "parts": list(names.PARTS),
-        "fps": names.FPS // request.get("every", 1),
+        "fps": names.FPS // request.get("frame_stride", 1),
         "renderers": sorted({summary["renderer"] for summary in summaries}),
         "scene_hash": origins[0].scene_hash,
         "sources": sorted({origin.source for origin in origins}),
@@ -200,9 +224,15 @@ def _env(config: str, views: tuple[str, ...], size: int, depth: bool, segmentati
 
 
 def render_episode(
-    folder: Path, demo: str, views: Sequence[str], size: int, depth: bool, segmentation: bool, every: int = 1
+    folder: Path,
+    demo: str,
+    views: Sequence[str],
+    size: int,
+    depth: bool,
+    segmentation: bool,
+    frame_stride: int = 1,
 ) -> None:
-    """Job "render-episode": write one episode's columns and pictures into `folder`."""
+    """Job "render-episode": write one episode's columns and images into `folder`."""
     episode = read_demo(Path(demo))
     env = _env(json.dumps(to_mapping(episode.config)), tuple(views), size, depth, segmentation)
     if env.scene.hash != episode.scene_hash:
@@ -210,12 +240,12 @@ def render_episode(
             f"{demo} was recorded in another scene (hash {episode.scene_hash[:12]}, now {env.scene.hash[:12]}); "
             "record it again with this version."
         )
-    keys = schema.picture_keys(views, depth, segmentation)
+    keys = schema.image_keys(views, depth, segmentation)
     content: dict[str, list[bytes]] = {key: [] for key, _, _ in keys}
-    statistics = {key: PictureStatistics() for key, _, _ in keys}
+    statistics = {key: ImageStatistics() for key, _, _ in keys}
     hashes = schema.EpisodeDigest(content)
     measured: dict[str, list[np.ndarray]] = {key: [] for key in MEASURED}
-    for state in episode.state[:-1:every]:
+    for state in episode.state[:-1:frame_stride]:
         env.set_state_vector(state)
         observation = env.observe()
         for key, view, modality in keys:
@@ -226,8 +256,12 @@ def render_episode(
             hashes.add(key, frame)
         for key, measure in MEASURED.items():
             measured[key].append(measure(env))
-    columns = _columns(episode, every, {key: np.stack(rows) for key, rows in measured.items()})
-    _write_episode(folder, content, columns, [key for key, _, modality in keys if modality == names.DEPTH])
+    columns = _columns(
+        episode, frame_stride, {key: np.stack(rows) for key, rows in measured.items()}
+    )
+    _write_episode(
+        folder, content, columns, [key for key, _, modality in keys if modality == names.DEPTH]
+    )
     write_json(
         folder / SUMMARY_FILE,
         {
@@ -243,49 +277,67 @@ def render_episode(
     )
 
 
-def _columns(demo: Demo, every: int, measured: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return every column of `layout.COLUMNS`, (T,) or (T, n), of the T frames that are rendered."""
+def _columns(
+    demo: Demo, frame_stride: int, measured: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Return every column of `layout.COLUMNS`, (T,) or (T, n), of the T frames that are
+    rendered.
+    """
     frames = len(measured[names.STATE])
     return {
         **{key: rows.astype(np.float32) for key, rows in measured.items()},
-        names.ACTION: demo.action[::every],
-        names.REWARD: demo.reward[::every],
+        names.ACTION: demo.action[::frame_stride],
+        names.REWARD: demo.reward[::frame_stride],
         names.DONE: np.arange(frames) == frames - 1,
-        names.SUCCESS: demo.success[::every],
-        names.CONTACT: demo.contact[::every],
-        names.PHASE: demo.phase[::every].astype(np.int64),
+        names.SUCCESS: demo.success[::frame_stride],
+        names.CONTACT: demo.contact[::frame_stride],
+        names.PHASE: demo.phase[::frame_stride].astype(np.int64),
         names.SEED: np.full(frames, demo.seed, np.int64),
     }
 
 
 def _write_episode(
-    folder: Path, content: Mapping[str, list[bytes]], columns: Mapping[str, np.ndarray], depth: Sequence[str]
+    folder: Path,
+    content: Mapping[str, list[bytes]],
+    columns: Mapping[str, np.ndarray],
+    depth: Sequence[str],
 ) -> None:
-    """Write one episode as parquet: pictures as LeRobot's (bytes, path) pairs, columns as lists and scalars."""
+    """Write one episode as parquet: images as LeRobot's (bytes, path) pairs, columns as lists and
+    scalars.
+    """
     arrays: dict[str, pa.Array] = {}
-    for key, pictures_ in content.items():
-        paths = [f"frame-{index:06d}" for index in range(len(pictures_))]
+    for key, images_ in content.items():
+        paths = [f"frame-{index:06d}" for index in range(len(images_))]
         arrays[key] = pa.StructArray.from_arrays(
-            [pa.array(pictures_, pa.binary()), pa.array(paths, pa.string())], ["bytes", "path"]
+            [pa.array(images_, pa.binary()), pa.array(paths, pa.string())], ["bytes", "path"]
         )
     for key, values in columns.items():
         if key in schema.VECTORS:
-            arrays[key] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+            arrays[key] = pa.FixedSizeListArray.from_arrays(
+                pa.array(values.ravel()), values.shape[1]
+            )
         else:
             arrays[key] = pa.array(values)
     table = pa.table(arrays)
-    pq.write_table(table, folder / EPISODE_FILE, compression=compression(table.schema, depth), use_dictionary=False)
+    pq.write_table(
+        table,
+        folder / EPISODE_FILE,
+        compression=compression(table.schema, depth),
+        use_dictionary=False,
+    )
 
 
 def _renderer() -> str:
-    """Return the GL renderer that drew the pictures."""
+    """Return the GL renderer that drew the images."""
     from surgicai_vision.scene.rendering import renderer_string
 
     return renderer_string()
 
 
 def _camera(env: Any, view: str, size: int, states: np.ndarray) -> dict[str, Any]:
-    """Return a camera's intrinsics (3, 3) and, unless it moves, T_world_camera (4, 4) (OpenCV axes, [m])."""
+    """Return a camera's intrinsics (3, 3) and, unless it moves, T_world_camera (4, 4) (OpenCV axes,
+    [m]).
+    """
     from surgicai_vision.scene.cameras import extrinsics, intrinsics
 
     poses = []

@@ -1,8 +1,8 @@
 """Layout of our datasets: which LeRobot features there are, and the hash over what they hold.
 
-`features(views, size, …)` is the LeRobot feature table; `episode_digest` hashes one episode's decoded
-pictures and columns in a fixed order, and `dataset_digest` the episodes in theirs, so that a dataset has one
-digest however it was compressed, split into files or rendered.
+`features(views, size, …)` is the LeRobot feature table; `episode_digest` hashes one episode's
+decoded images and columns in a fixed order, and `dataset_digest` the episodes in theirs, so that a
+dataset has one digest however it was compressed, split into files or rendered.
 """
 
 import hashlib
@@ -23,7 +23,9 @@ VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         names.PRIVILEGED_STATE: names.PRIVILEGED_NAMES,
     }
 )
-"""float32 columns and the names of their elements; [m], [rad] and unit quaternions; privileged_state in [cm]."""
+"""float32 columns and the names of their elements; [m], [rad] and unit quaternions;
+privileged_state in [cm].
+"""
 
 SCALARS: Mapping[str, str] = MappingProxyType(
     {
@@ -35,16 +37,18 @@ SCALARS: Mapping[str, str] = MappingProxyType(
         names.SEED: "int64",
     }
 )
-"""One-element columns → dtype. Reward, done, success and contact are those after the frame's action."""
+"""One-element columns → dtype. Reward, done, success and contact are those after the frame's
+action.
+"""
 
 COLUMNS = (*VECTORS, *SCALARS)
-"""Every column of ours that is no picture, in the order of the digest."""
+"""Every column of ours that is no image, in the order of the digest."""
 
-PICTURE_AXES = ("height", "width", "channels")
+IMAGE_AXES = ("height", "width", "channels")
 
 
-def picture_keys(views: Sequence[str], depth: bool, segmentation: bool) -> list[tuple[str, str, str]]:
-    """Return (key, view, modality) of every picture column, in the order of the digest."""
+def image_keys(views: Sequence[str], depth: bool, segmentation: bool) -> list[tuple[str, str, str]]:
+    """Return (key, view, modality) of every image column, in the order of the digest."""
     keys = [(names.image_key(view), view, names.RGB) for view in views]
     if depth:
         keys += [(names.depth_key(view), view, names.DEPTH) for view in views]
@@ -53,16 +57,18 @@ def picture_keys(views: Sequence[str], depth: bool, segmentation: bool) -> list[
     return keys
 
 
-def features(views: Sequence[str], size: int, depth: bool, segmentation: bool) -> dict[str, dict[str, Any]]:
+def features(
+    views: Sequence[str], size: int, depth: bool, segmentation: bool
+) -> dict[str, dict[str, Any]]:
     """Return the LeRobot feature table.
 
-    A segmentation picture is stored as RGB with the part's index in all three channels: LeRobot admits
-    one-channel pictures as depth only.
+    A segmentation image is stored as RGB with the part's index in all three channels: LeRobot
+    admits one-channel images as depth only.
     """
     table: dict[str, dict[str, Any]] = {}
-    for key, _, modality in picture_keys(views, depth, segmentation):
+    for key, _, modality in image_keys(views, depth, segmentation):
         channels = 1 if modality == names.DEPTH else 3
-        table[key] = {"dtype": "image", "shape": (size, size, channels), "names": list(PICTURE_AXES)}
+        table[key] = {"dtype": "image", "shape": (size, size, channels), "names": list(IMAGE_AXES)}
         if modality == names.DEPTH:
             table[key]["info"] = {"is_depth_map": True, "depth_unit": "m"}
     for key, elements in VECTORS.items():
@@ -78,8 +84,8 @@ def column_bytes(key: str, values: np.ndarray) -> bytes:
     return np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
 
 
-class PictureDigest:
-    """sha256 over the decoded frames of one picture column."""
+class ImageDigest:
+    """sha256 over the decoded frames of one image column."""
 
     def __init__(self) -> None:
         self._total = hashlib.sha256()
@@ -95,18 +101,18 @@ class PictureDigest:
 
 
 class EpisodeDigest:
-    """sha256 over one episode: its columns in the order of `COLUMNS`, then each picture column."""
+    """sha256 over one episode: its columns in the order of `COLUMNS`, then each image column."""
 
     def __init__(self, keys: Iterable[str]):
-        self._pictures = {key: PictureDigest() for key in keys}
+        self._images = {key: ImageDigest() for key in keys}
         self._known: dict[str, str] = {}
 
     def add(self, key: str, frame: np.ndarray) -> None:
-        """Count the next decoded frame (H, W, channels) of a picture column."""
-        self._pictures[key].add(frame)
+        """Count the next decoded frame (H, W, channels) of an image column."""
+        self._images[key].add(frame)
 
     def take(self, key: str, digest: str) -> None:
-        """Take a picture column's digest, of a `PictureDigest`, in the place of its frames."""
+        """Take an image column's digest, of a `ImageDigest`, in the place of its frames."""
         self._known[key] = digest
 
     def hexdigest(self, columns: Mapping[str, np.ndarray]) -> str:
@@ -114,8 +120,10 @@ class EpisodeDigest:
         total = hashlib.sha256()
         for key in COLUMNS:
             total.update(key.encode() + b"\0" + column_bytes(key, columns[key]))
-        for key, picture in self._pictures.items():
-            total.update(key.encode() + b"\0" + bytes.fromhex(self._known.get(key) or picture.hexdigest()))
+        for key, image in self._images.items():
+            total.update(
+                key.encode() + b"\0" + bytes.fromhex(self._known.get(key) or image.hexdigest())
+            )
         return total.hexdigest()
 
 

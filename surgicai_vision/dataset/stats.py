@@ -1,6 +1,7 @@
-"""Statistics of one episode in LeRobot's form: min, max, mean, std, count and five quantiles per feature.
+"""Statistics of one episode in LeRobot's form: min, max, mean, std, count and five quantiles per
+feature.
 
-Pictures stream through `PictureStatistics` one at a time, so memory is bounded; RGB counts every pixel
+Images stream through `ImageStatistics` one at a time, so memory is bounded; RGB counts every pixel
 (values in [0, 1] as LeRobot stores them), depth a fixed sixteenth of them [m]. Columns are exact.
 """
 
@@ -13,13 +14,13 @@ QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 """LeRobot's quantiles (lerobot 0.6.1, datasets/compute_stats.py)."""
 
 DEPTH_STRIDE = 4
-"""Every fourth pixel of every fourth row of a depth picture is counted."""
+"""Every fourth pixel of every fourth row of a depth image is counted."""
 
 Statistics = dict[str, list[Any]]
 
 
-class PictureStatistics:
-    """Running statistics of one picture column: (H, W, 3) uint8 or (H, W, 1) float32 frames."""
+class ImageStatistics:
+    """Running statistics of one image column: (H, W, 3) uint8 or (H, W, 1) float32 frames."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -31,7 +32,9 @@ class PictureStatistics:
         self._count += 1
         if frame.dtype == np.uint8:
             for channel in range(3):
-                self._histogram[channel] += cv2.calcHist([frame], [channel], None, [256], [0, 256])[:, 0]
+                self._histogram[channel] += cv2.calcHist([frame], [channel], None, [256], [0, 256])[
+                    :, 0
+                ]
         else:
             self._depths.append(frame[::DEPTH_STRIDE, ::DEPTH_STRIDE].ravel())
 
@@ -75,5 +78,8 @@ def _histogram_statistics(histogram: np.ndarray) -> dict[str, float]:
         "max": float(present[-1]),
         "mean": mean,
         "std": float(np.sqrt(max(histogram @ (levels - mean) ** 2 / total, 0.0))),
-        **{name: float(levels[np.searchsorted(cumulative, q * total)]) for name, q in QUANTILES.items()},
+        **{
+            name: float(levels[np.searchsorted(cumulative, q * total)])
+            for name, q in QUANTILES.items()
+        },
     }

@@ -1,4 +1,6 @@
-"""Choosing: some frames of a dataset, as training and encoding read them; what `thinning` and `subtask` share."""
+"""Choosing: some frames of a dataset, as training and encoding read them; what `thinning` and
+`subtask` share.
+"""
 
 import functools
 from typing import Any
@@ -39,16 +41,22 @@ class ChosenFrames:
         return np.asarray(self._whole.episode_index)[self.rows]
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return every column that is no picture, as `Dataset.columns`."""
+        """Return every column that is no image, as `Dataset.columns`."""
         return {key: values[self.rows] for key, values in self._whole.columns().items()}
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> Any:
-        """Return the RGB pictures of a view, (stop - start, H, W, 3) uint8."""
+        """Return the RGB images of a view, (stop - start, H, W, 3) uint8."""
         stop = self.length if stop is None else stop
         if not 0 <= start <= stop <= self.length:
             said = ", ".join(f"{key} {value}" for key, value in self._chosen.items())
-            raise InputError(f"frames {start} to {stop} were asked; this part ({said}) has 0 to {self.length}.")
+            raise InputError(
+                f"frames {start} to {stop} were asked; this part ({said}) has 0 to {self.length}."
+            )
         rows = self.rows[start:stop]
-        runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)  # what lies together is read at once, in order
-        parts = [self._whole.frames(view, int(run[0]), int(run[-1]) + 1) for run in runs if len(run)]
+        runs = np.split(
+            rows, np.flatnonzero(np.diff(rows) != 1) + 1
+        )  # what lies together is read at once, in order
+        parts = [
+            self._whole.frames(view, int(run[0]), int(run[-1]) + 1) for run in runs if len(run)
+        ]
         return np.concatenate(parts) if parts else self._whole.frames(view, 0, 0)

@@ -2,9 +2,9 @@
 
     part = subtask_of(open_dataset(Path("outputs/datasets/suture")), "insert")
 
-A low-level policy of a chain is better trained on these than on demonstrations of the subtask alone, which end at the
-first success: in a whole procedure the subtask goes on until it is finished (`config.DWELL`), and it begins where
-the one before it left off.
+A low-level policy of a chain is better trained on these than on demonstrations of the subtask
+alone, which end at the first success: in a whole procedure the subtask goes on until it is finished
+(`config.DWELL`), and it begins where the one before it left off.
 """
 
 from dataclasses import replace
@@ -28,7 +28,9 @@ def subtask_of(dataset: Dataset, subtask: str) -> "SubtaskPart":
     """
     check_name("subtask", subtask, names.SUBTASKS)
     if dataset.task != names.SUTURE:
-        raise InputError(f"The dataset shows '{dataset.task}'; a subtask's frames are taken from '{names.SUTURE}'.")
+        raise InputError(
+            f"The dataset shows '{dataset.task}'; a subtask's frames are taken from '{names.SUTURE}'."
+        )
     part = SubtaskPart(dataset, subtask)
     if not part.length:
         raise InputError(f"The dataset holds no frame of '{subtask}'.")
@@ -37,7 +39,9 @@ def subtask_of(dataset: Dataset, subtask: str) -> "SubtaskPart":
 
 @final
 class SubtaskPart(ChosenFrames):
-    """A subtask's frames; its config is the whole's, with the subtask as its task and the subtask's step limit."""
+    """A subtask's frames; its config is the whole's, with the subtask as its task and the subtask's
+    step limit.
+    """
 
     def __init__(self, dataset: Dataset, subtask: str):
         rows = np.flatnonzero(dataset.columns()[names.PHASE] == names.SUBTASKS.index(subtask))
@@ -46,7 +50,11 @@ class SubtaskPart(ChosenFrames):
         self.config = replace(dataset.config, task=subtask, max_steps=limit)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return every column that is no picture, as `Dataset.columns`; index and time count from its beginning."""
+        """Return every column that is no image, as `Dataset.columns`; index and time count from its
+        beginning.
+        """
         columns = super().columns()
         first = np.searchsorted(self.episode_index, self.episode_index, side="left")
-        return columns | {key: columns[key] - columns[key][first] for key in ("frame_index", "timestamp")}
+        return columns | {
+            key: columns[key] - columns[key][first] for key in ("frame_index", "timestamp")
+        }

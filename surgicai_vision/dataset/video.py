@@ -46,8 +46,8 @@ class VideoWriter:
         """Append a frame, (H, W, 3) uint8 RGB."""
         import av
 
-        picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
-        self._mux(self._stream.encode(picture))
+        image = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+        self._mux(self._stream.encode(image))
 
     def close(self) -> None:
         """Write what the encoder still holds and the file's index."""
@@ -61,7 +61,9 @@ class VideoWriter:
     def __enter__(self) -> "VideoWriter":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None
+    ) -> None:
         self.close() if kind is None else self._container.close()
 
 
@@ -77,7 +79,9 @@ def read_frames(path: Path, first: int, count: int, fps: float) -> Iterator[np.n
     try:
         with av.open(str(path)) as container:
             stream: Any = container.streams.video[0]
-            stream.thread_type = "NONE"  # frames by slices in threads would cost more than they bring at this size
+            stream.thread_type = (
+                "NONE"  # frames by slices in threads would cost more than they bring at this size
+            )
             if first:
                 container.seek(int(first / fps / stream.time_base), stream=stream)
             for frame in container.decode(stream):
@@ -91,7 +95,9 @@ def read_frames(path: Path, first: int, count: int, fps: float) -> Iterator[np.n
                 if wanted == first + count:
                     return
     except (OSError, av.FFmpegError, IndexError, TypeError) as error:
-        raise BadFile(f"{path}: frame {wanted} cannot be decoded ({str(error).splitlines()[0]}).") from None
+        raise BadFile(
+            f"{path}: frame {wanted} cannot be decoded ({str(error).splitlines()[0]})."
+        ) from None
     if wanted < first + count:
         raise BadFile(f"{path} has no frame {wanted}.")
 

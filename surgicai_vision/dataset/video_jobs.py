@@ -1,6 +1,8 @@
-"""Encode a dataset's pictures as videos, one job for each view and block of episodes, and look at what came of it.
+"""Encode a dataset's images as videos, one job for each view and block of episodes, and look at
+what came of it.
 
-A block is a video file of its own. Blocks depend on the dataset alone, so files are the same for any workers.
+A block is a video file of its own. Blocks depend on the dataset alone, so files are the same for
+any workers.
 """
 
 import functools
@@ -53,10 +55,11 @@ def encode_views(
     engine: Engine = LOCAL,
     progress: Progress | None = None,
 ) -> list[dict[str, Encoded]]:
-    """Encode `views` into the videos of the LeRobot folder `folder`; return every episode's by their keys.
+    """Encode `views` into the videos of the LeRobot folder `folder`; return every episode's by
+    their keys.
 
     Args:
-        dataset: a dataset of pictures.
+        dataset: a dataset of images.
         folder: gets `videos/`.
         views: cameras.
         video: codec, a key of `video.CODECS`.
@@ -78,7 +81,9 @@ def encode_views(
         for view in views
         for first, stop in blocks
     ]
-    results = iter(run(jobs, store, workers=workers, engine=engine, unit="frames", progress=progress))
+    results = iter(
+        run(jobs, store, workers=workers, engine=engine, unit="frames", progress=progress)
+    )
     episodes: list[dict[str, Encoded]] = [{} for _ in bounds]
     for view in views:
         key = names.image_key(view)
@@ -110,16 +115,18 @@ def _dataset(folder: str) -> Dataset:
 
 
 def encode_block(folder: Path, dataset: str, video: str, view: str, first: int, stop: int) -> None:
-    """Job "encode-video": encode a view of the episodes first … stop - 1, and compare each frame with its picture."""
+    """Job "encode-video": encode a view of the episodes first … stop - 1, and compare each frame
+    with its image.
+    """
     data, key, path = _dataset(dataset), names.image_key(view), folder / VIDEO_FILE
     bounds = data.bounds()[first:stop]
     begin, end = bounds[0][0], bounds[-1][1]
     with VideoWriter(path, video, data.fps, data.image_size) as writer:
-        for picture in data.decoded(key, begin, end):
-            writer.add(picture)
+        for image in data.decoded(key, begin, end):
+            writer.add(image)
     rows, decoded = [], read_frames(path, 0, end - begin, data.fps)
     for low, high in bounds:
-        digest, error = schema.PictureDigest(), 0.0
+        digest, error = schema.ImageDigest(), 0.0
         for before, after in zip(data.decoded(key, low, high), decoded, strict=False):
             error += float(np.abs(after.astype(np.int16) - before).mean())
             digest.add(after)

@@ -2,10 +2,11 @@
 
     assemble(shards, out, features, text, meta)
 
-The episodes' parquet files are copied row group by row group into data files of at most 100 MB, with the index
-columns filled in, and LeRobot's metadata is written beside them. (LeRobot's own `aggregate_datasets` reads and
-rewrites the growing file for every episode: 7 to 20 ms a frame of two views with depth, where this takes below
-one.) Memory holds one episode. The folder appears under its name when it is complete.
+The episodes' parquet files are copied row group by row group into data files of at most 100 MB,
+with the index columns filled in, and LeRobot's metadata is written beside them. (LeRobot's own
+`aggregate_datasets` reads and rewrites the growing file for every episode: 7 to 20 ms a frame of
+two views with depth, where this takes below one.) Memory holds one episode. The folder appears
+under its name when it is complete.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +33,9 @@ EPISODE_FILE, SUMMARY_FILE = "episode.parquet", "summary.json"
 """What a rendered episode's folder holds."""
 
 
-def assemble(shards: Sequence[Path], out: Path, features: Features, text: str, meta: Mapping[str, Any]) -> None:
+def assemble(
+    shards: Sequence[Path], out: Path, features: Features, text: str, meta: Mapping[str, Any]
+) -> None:
     """Write the dataset `out` from rendered episodes.
 
     Args:
@@ -54,9 +57,10 @@ def assemble(shards: Sequence[Path], out: Path, features: Features, text: str, m
 
 
 def compression(schema: pa.Schema, depth: Sequence[str]) -> dict[str, str]:
-    """Return the codec of every parquet column; `depth` names the columns of depth pictures.
+    """Return the codec of every parquet column; `depth` names the columns of depth images.
 
-    PNG is compressed already; raw float32 TIFF is not, and zstd's first level makes it a tenth in 0.3 ms.
+    PNG is compressed already; raw float32 TIFF is not, and zstd's first level makes it a tenth in
+    0.3 ms.
     """
     codecs = {}
     for field in schema:
@@ -64,7 +68,11 @@ def compression(schema: pa.Schema, depth: Sequence[str]) -> dict[str, str]:
             codecs[f"{field.name}.bytes"] = "zstd" if field.name in depth else "none"
             codecs[f"{field.name}.path"] = "zstd"
         else:
-            codecs[f"{field.name}.list.element" if pa.types.is_fixed_size_list(field.type) else field.name] = "zstd"
+            codecs[
+                f"{field.name}.list.element"
+                if pa.types.is_fixed_size_list(field.type)
+                else field.name
+            ] = "zstd"
     return codecs
 
 
@@ -75,10 +83,14 @@ class DataFiles:
         self._folder, self._schema, self._fps = folder, arrow_schema(features), fps
         self._file, self._frames, self._bytes = -1, 0, 0
         self._writer: pq.ParquetWriter | None = None
-        self._compression = compression(self._schema, [key for key, row in features.items() if row.get("info")])
+        self._compression = compression(
+            self._schema, [key for key, row in features.items() if row.get("info")]
+        )
 
     def append(self, index: int, episode: pa.Table, statistics: Mapping[str, Any]) -> EpisodeRow:
-        """Write episode `index` and return its row; the index columns are made here, `task_index` if it is missing."""
+        """Write episode `index` and return its row; the index columns are made here, `task_index`
+        if it is missing.
+        """
         count, start = len(episode), self._frames
         indices = {
             "timestamp": (np.arange(count) / self._fps).astype(np.float32),
@@ -93,7 +105,9 @@ class DataFiles:
         for name, values in indices.items():
             episode = episode.append_column(name, pa.array(values))
         writer = self._present()
-        writer.write_table(episode.select(self._schema.names).cast(self._schema), row_group_size=count)
+        writer.write_table(
+            episode.select(self._schema.names).cast(self._schema), row_group_size=count
+        )
         self._bytes = (self._folder / data_path(self._file)).stat().st_size
         self._frames += count
         own = {key: column_statistics(values) for key, values in indices.items()}
@@ -106,7 +120,9 @@ class DataFiles:
             self._file += 1
             path = self._folder / data_path(self._file)
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = pq.ParquetWriter(path, self._schema, compression=self._compression, use_dictionary=False)
+            self._writer = pq.ParquetWriter(
+                path, self._schema, compression=self._compression, use_dictionary=False
+            )
         return self._writer
 
     def close(self) -> None:

@@ -1,11 +1,12 @@
 """Expert: a scripted surgeon for every subtask and for the whole, in the env's own actions.
 
-`Expert(env).action()` looks at the env's present state, privileged as it is, and returns the next action, (7,)
-float32. It keeps nothing between calls, so it answers on any state: from its own episodes, from a learner's
-(DAgger), from a restored one. No teleporting, no forces: the same seven numbers a policy has.
+`Expert(env).action()` looks at the env's present state, privileged as it is, and returns the next
+action, (7,) float32. It keeps nothing between calls, so it answers on any state: from its own
+episodes, from a learner's (DAgger), from a restored one. No teleporting, no forces: the same seven
+numbers a policy has.
 
-Each subtask's rule says where the commanded tool should be next; `toward` makes that one action, scaled as a
-whole so that translation and rotation stay in step on curved paths.
+Each subtask's rule says where the commanded tool should be next; `toward` makes that one action,
+scaled as a whole so that translation and rotation stay in step on curved paths.
 """
 
 import math
@@ -50,7 +51,9 @@ DRIVE = math.radians(1.8)
 LEAD = math.radians(9.0)
 """Furthest the command may run ahead of the needle [rad]."""
 BLOCKED = 0.001
-"""A needle this far off its path [m] is held back: in `3dmed_straight` PSM2's wrist meets the ridge's steep flank."""
+"""A needle this far off its path [m] is held back: in `3dmed_straight` PSM2's wrist meets the
+ridge's steep flank.
+"""
 HANDOFF_OFFSET = math.radians(4.0)
 """The expert takes the needle a little nearer to the tip than the goal, away from the tissue."""
 
@@ -67,12 +70,15 @@ class Expert:
 
     Args:
         env: the env.
-        noise: standard deviation of Gaussian noise on the six motions of an action, in units of its range. The jaw
-            stays as meant. The expert sees where the noise took it and recovers: recordings with states off the path.
+        noise: standard deviation of Gaussian noise on the six motions of an action, in units of its
+            range. The jaw stays as meant. The expert sees where the noise took it and recovers:
+            recordings with states off the path.
         rng: source of the noise; needed with it.
     """
 
-    def __init__(self, env: SuturingEnv, noise: float = 0.0, rng: np.random.Generator | None = None):
+    def __init__(
+        self, env: SuturingEnv, noise: float = 0.0, rng: np.random.Generator | None = None
+    ):
         if noise < 0.0 or (noise and rng is None):
             raise InputError(
                 f"Expert got noise {noise} and rng {rng}; noise is at least 0 and comes from a Generator."
@@ -80,7 +86,9 @@ class Expert:
         self.env, self.noise, self._rng = env, noise, rng
 
     def action(self) -> NDArray[np.float32]:
-        """Return the next action for the env's present state, (7,) float32 in [-1, 1], noise included."""
+        """Return the next action for the env's present state, (7,) float32 in [-1, 1], noise
+        included.
+        """
         action = self.meant()
         if self._rng is not None and self.noise:
             action[:6] = np.clip(action[:6] + self._rng.normal(0.0, self.noise, 6), -1.0, 1.0)
@@ -122,17 +130,24 @@ class Sight:
 def toward(scene: Sight, wish: Wish) -> NDArray[np.float32]:
     """Return the action that moves the command towards `wish`, scaled to at most 1 as a whole.
 
-    Closed jaws are closed with all of the range: the command stays at 0, and a policy that learns from it may be
-    off without letting go. (With a label of 0, its small errors add up: 7 of 50 learned placings dropped the needle.)
+    Closed jaws are closed with all of the range: the command stays at 0, and a policy that learns
+    from it may be off without letting go. (With a label of 0, its small errors add up: 7 of 50
+    learned placings dropped the needle.)
     """
     move = moves(scene, wish.tip)
     move /= max(1.0, float(np.abs(move).max()))
-    jaw = -1.0 if wish.jaw <= 0.0 else np.clip((wish.jaw - scene.command_jaw) / scene.step.jaw, -1.0, 1.0)
+    jaw = (
+        -1.0
+        if wish.jaw <= 0.0
+        else np.clip((wish.jaw - scene.command_jaw) / scene.step.jaw, -1.0, 1.0)
+    )
     return np.append(move, jaw).astype(np.float32)
 
 
 def moves(scene: Sight, tip: Matrix) -> Matrix:
-    """Return how many step sizes the command is from T_world_tip (4, 4), along and about the base's axes, (6,)."""
+    """Return how many step sizes the command is from T_world_tip (4, 4), along and about the base's
+    axes, (6,).
+    """
     inverse = scene.base[:3, :3].T
     shift = inverse @ (tip[:3, 3] - scene.command[:3, 3]) / scene.step.translation
     turn = matrix_to_rotvec(inverse @ tip[:3, :3] @ scene.command[:3, :3].T @ scene.base[:3, :3])
@@ -149,7 +164,7 @@ def _shifted(pose: Matrix, shift: Matrix) -> Matrix:
     return moved
 
 
-# -- taking the needle ------------------------------------------------------------------------------------------------
+# -- taking the needle -----------------------------------------------------------------------------
 
 
 def take(scene: Sight, goal: Matrix, back: float, opened: float) -> Wish:
@@ -179,22 +194,28 @@ def take(scene: Sight, goal: Matrix, back: float, opened: float) -> Wish:
 
 
 def _grasp(scene: Sight) -> Wish:
-    goal = scene.needle @ grasp_in_needle(scene.arm, scene.memory.grasp_angle, radius=scene.stitch.radius)
+    goal = scene.needle @ grasp_in_needle(
+        scene.arm, scene.memory.grasp_angle, radius=scene.stitch.radius
+    )
     return take(scene, goal, HOVER, OPEN_ABOVE)
 
 
 def _handoff(scene: Sight) -> Wish:
-    goal = scene.needle @ grasp_in_needle(scene.arm, HANDOFF_ANGLE + HANDOFF_OFFSET, radius=scene.stitch.radius)
+    goal = scene.needle @ grasp_in_needle(
+        scene.arm, HANDOFF_ANGLE + HANDOFF_OFFSET, radius=scene.stitch.radius
+    )
     return take(scene, goal, HANDOFF_BACK, OPEN_HANDOFF)
 
 
-# -- carrying the needle ----------------------------------------------------------------------------------------------
+# -- carrying the needle ---------------------------------------------------------------------------
 
 
 def on_path(stitch: Stitch, turned: float) -> Matrix:
-    """Return the needle's pose after turning by `turned` [rad] about the wound since `Stitch.place`.
+    """Return the needle's pose after turning by `turned` [rad] about the wound since
+    `Stitch.place`.
 
-    First about the tip, which stays in the entry, until the tangent meets the circle; then along the circle.
+    First about the tip, which stays in the entry, until the tangent meets the circle; then along
+    the circle.
     """
     start, circle = stitch.place(), stitch.on_arc(needle.TIP_ANGLE)
     pivot = turn_about_wound(start, circle)
@@ -208,7 +229,9 @@ def on_path(stitch: Stitch, turned: float) -> Matrix:
 
 
 def turn_about_wound(start: Matrix, pose: Matrix) -> float:
-    """Return the turn about the wound from `start` to `pose` in the needle's driving direction [rad], in (-π, π]."""
+    """Return the turn about the wound from `start` to `pose` in the needle's driving direction
+    [rad], in (-π, π].
+    """
     x, z = start[:3, 0], np.cross(WOUND, start[:3, 0])
     return -math.atan2(float(pose[:3, 0] @ z), float(pose[:3, 0] @ x))
 
@@ -229,7 +252,10 @@ def _place(scene: Sight) -> Wish:
 def _insert(scene: Sight) -> Wish:
     """Bring the tip in, then drive the needle along its path."""
     start = scene.stitch.place()
-    tip = scene.needle[:3, :3] @ needle.point(needle.TIP_ANGLE, scene.stitch.radius) + scene.needle[:3, 3]
+    tip = (
+        scene.needle[:3, :3] @ needle.point(needle.TIP_ANGLE, scene.stitch.radius)
+        + scene.needle[:3, 3]
+    )
     local = scene.stitch.pair.entry.rotation.T @ (tip - np.asarray(scene.stitch.pair.entry.centre))
     turned = turn_about_wound(start, scene.needle)
     if scene.memory.passed == 0.0:
@@ -238,12 +264,16 @@ def _insert(scene: Sight) -> Wish:
         if not (near and tilt < math.radians(4.0)):
             return _place(scene)
     pivot = turn_about_wound(start, scene.stitch.on_arc(needle.TIP_ANGLE))
-    last = pivot + needle.TIP_ANGLE - scene.stitch.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA)
+    last = (
+        pivot + needle.TIP_ANGLE - scene.stitch.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA)
+    )
     return _drive(scene, turned, last)
 
 
 def _drive(scene: Sight, turned: float, last: float) -> Wish:
-    """Move the needle on along its path, up to `last` [rad]; once it is through and off the path, press no further."""
+    """Move the needle on along its path, up to `last` [rad]; once it is through and off the path,
+    press no further.
+    """
     start = scene.stitch.place()
     commanded = turn_about_wound(start, scene.commanded_needle)
     ahead = max(min(commanded, turned + LEAD), turned - LEAD) + DRIVE
@@ -258,7 +288,9 @@ def _pullout(scene: Sight) -> Wish:
     stitch = scene.stitch
     if scene.memory.release > 30:
         return Wish(scene.command, 0.0)
-    line = (scene.needle[:3, :3] @ needle.polyline(13, scene.stitch.radius).T + scene.needle[:3, 3:4]).T
+    line = (
+        scene.needle[:3, :3] @ needle.polyline(13, scene.stitch.radius).T + scene.needle[:3, 3:4]
+    ).T
     outside = ((line - np.asarray(stitch.pair.exit.centre)) @ stitch.pair.exit.rotation)[:, 2]
     if float(outside.min()) > 0.0005:
         return Wish(scene.carrying(stitch.pulled()), 0.0)

@@ -2,10 +2,11 @@
 
     record(TaskConfig("grasp"), episodes=50, seed=0, out=Path("demos"), workers=2)
 
-Seeds are taken in order from the first one; a seed at which the expert fails is written down as skipped in
-`demos.json` and the next one is taken, so what is kept depends on the seeds alone. The same command
-continues a run that was killed (the finished episodes lie in `<out>.work` until the folder is complete) and
-does nothing when it is complete. How an episode goes is in `surgicai_vision.demos.rollout`.
+Seeds are taken in order from the first one; a seed at which the expert fails is written down as
+skipped in `demos.json` and the next one is taken, so what is kept depends on the seeds alone. The
+same command continues a run that was killed (the finished episodes lie in `<out>.work` until the
+folder is complete) and does nothing when it is complete. How an episode goes is in
+`surgicai_vision.demos.rollout`.
 """
 
 import dataclasses
@@ -23,23 +24,41 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, check_name
 from surgicai_vision.core.executor import LOCAL, Engine, Job, Progress, building, run, work_folder
-from surgicai_vision.core.files import check_output, code_version, read_json, sha256_file, whole_folder, write_json
+from surgicai_vision.core.files import (
+    check_output,
+    code_version,
+    read_json,
+    sha256_file,
+    whole_folder,
+    write_json,
+)
 from surgicai_vision.demos.rollout import CALM, Disturbance, Driver, roll
-from surgicai_vision.demos.store import MARKER, list_demos, read_demo, read_marker, write_demo, write_marker
+from surgicai_vision.demos.store import (
+    MARKER,
+    list_demos,
+    read_demo,
+    read_marker,
+    write_demo,
+    write_marker,
+)
 
-SOURCES: Mapping[str, str] = MappingProxyType(
+DEMONSTRATORS: Mapping[str, str] = MappingProxyType(
     {
         "expert": "surgicai_vision.demos.expert:Expert",
         "dmp": "surgicai_vision.demos.dmp.controller:Imitator",
         "search": "surgicai_vision.demos.search_expert:Searcher",
     }
 )
-"""Source → "module:class" of what acts; built as `class(env)`, or as `class(env, demos)` where it is `TAUGHT`."""
-TAUGHT = frozenset({"dmp"})
+"""Source → "module:class" of what acts; built as `class(env)`, or as `class(env, demos)` where it
+is `LEARNING`.
+"""
+LEARNING = frozenset({"dmp"})
 """Sources that learn from demonstrations."""
 
 MAX_FAILURES = 3
-"""Seeds tried per episode wanted, at most; below one success in three the expert is not fit to teach."""
+"""Seeds tried per episode wanted, at most; below one success in three the expert is not fit to
+teach.
+"""
 LABELS = ("demos", "learner")
 """Arguments of a job that say where a file lies, and not what it holds."""
 
@@ -68,22 +87,32 @@ def record_episode(folder: Path, task: Mapping[str, Any], **how: Any) -> None:
 def record_into(
     folder: Path,
     env: Any,
-    source: str,
+    demonstrator: str,
     seed: int,
     noise: float = 0.0,
-    recoveries: float = 0.0,
+    perturb_start_fraction: float = 0.0,
     noise_from: float | None = None,
-    linger: int = 0,
+    post_success_steps: int = 0,
     demos: Sequence[str] = (),
     driver: Driver | None = None,
 ) -> None:
     """Roll `seed` in `env` and write the episode, or why it failed, into `folder`."""
-    module, _, name = SOURCES[source].partition(":")
+    module, _, name = DEMONSTRATORS[demonstrator].partition(":")
     actor = getattr(importlib.import_module(module), name)(env, *([demos] if demos else []))
-    rollout = roll(env, actor, seed, source, Disturbance(noise, recoveries, noise_from), linger, driver)
+    rollout = roll(
+        env,
+        actor,
+        seed,
+        demonstrator,
+        Disturbance(noise, perturb_start_fraction, noise_from),
+        post_success_steps,
+        driver,
+    )
     if rollout.success:
         write_demo(folder, 0, rollout.demo)
-    write_json(folder / "result.json", {"seed": seed, "success": rollout.success, "reason": rollout.reason})
+    write_json(
+        folder / "result.json", {"seed": seed, "success": rollout.success, "reason": rollout.reason}
+    )
 
 
 def record(
@@ -91,10 +120,10 @@ def record(
     *,
     episodes: int,
     out: Path,
-    source: str = "expert",
+    demonstrator: str = "expert",
     seed: int = names.TRAIN_SEED,
     disturbance: Disturbance = CALM,
-    linger: int = 0,
+    post_success_steps: int = 0,
     workers: int = 1,
     engine: Engine = LOCAL,
     demos: Sequence[Path] = (),
@@ -107,29 +136,39 @@ def record(
         config: task and scene.
         episodes: how many to keep.
         out: folder to make; the same request continues it or finds it finished.
-        source: a key of `SOURCES`.
+        demonstrator: a key of `DEMONSTRATORS`.
         seed: first seed; the following ones are taken in order.
         disturbance: noise and pushes.
-        linger: control steps that an episode goes on after its success.
+        post_success_steps: control steps that an episode goes on after its success.
         workers: number of processes.
         engine: what runs them.
-        demos: files of the demonstrations that a source in `TAUGHT` learns from; their seeds are left out.
+        demos: files of the demonstrations that a demonstrator in `LEARNING` learns from; their
+            seeds are left out.
         learner: what drives until a step drawn by chance, while the labels stay the expert's.
         progress: called with (episodes kept, episodes wanted, "episodes").
 
     Raises:
-        InputError: fewer than one episode, a negative seed or linger, an unknown source, demonstrations for a source
-            that learns from none, or none for one that does.
+        InputError: fewer than one episode, a negative seed or post_success_steps, an unknown
+            demonstrator, demonstrations for a demonstrator that learns from none, or none for one
+            that does.
         OutputExists: `out` holds something else.
         SurgicaiError: the expert failed at too many seeds.
     """
-    check_name("source", source, SOURCES)
-    if episodes < 1 or min(seed, linger) < 0:
-        raise InputError(f"episodes is {episodes}, seed {seed}, linger {linger}; they must be at least 1, 0 and 0.")
-    _check_taught(source, demos)
-    request = {"task": to_mapping(config), "source": source, "seed": seed, "episodes": episodes, **_of(disturbance)}
-    if linger:
-        request["linger"] = linger
+    check_name("demonstrator", demonstrator, DEMONSTRATORS)
+    if episodes < 1 or min(seed, post_success_steps) < 0:
+        raise InputError(
+            f"episodes is {episodes}, seed {seed}, post_success_steps {post_success_steps}; they must be at least 1, 0 and 0."
+        )
+    _check_taught(demonstrator, demos)
+    request = {
+        "task": to_mapping(config),
+        "demonstrator": demonstrator,
+        "seed": seed,
+        "episodes": episodes,
+        **_of(disturbance),
+    }
+    if post_success_steps:
+        request["post_success_steps"] = post_success_steps
     if demos:
         request["demos"] = [sha256_file(path) for path in demos]
     if learner:
@@ -139,23 +178,29 @@ def record(
         return list_demos(out)
     with building(out) as (store, result):
         rolling = functools.partial(run, store=store, workers=workers, engine=engine)
-        kept, skipped = _take(request, demos, learner, rolling, progress or (lambda done, total, unit: None))
+        kept, skipped = _take(
+            request, demos, learner, rolling, progress or (lambda done, total, unit: None)
+        )
         with whole_folder(result) as folder:
             for index, path in enumerate(kept):
                 shutil.copyfile(path, folder / f"episode_{index:06d}.safetensors")
             details = {"request": request, "skipped": skipped, "episodes": episodes}
-            write_marker(folder, config.task, source, code=code_version(), **details)
+            write_marker(folder, config.task, demonstrator, code=code_version(), **details)
     return list_demos(out)
 
 
-def _check_taught(source: str, demos: Sequence[Path]) -> None:
-    """Refuse a source without the demonstrations it learns from, or with some that it does not."""
-    if source in TAUGHT and not demos:
-        raise InputError(f"Source '{source}' learns from demonstrations; give at least one (--from DEMOS).")
-    if demos and source not in TAUGHT:
-        taught = ", ".join(sorted(TAUGHT))
+def _check_taught(demonstrator: str, demos: Sequence[Path]) -> None:
+    """Refuse a demonstrator without the demonstrations it learns from, or with some that it does
+    not.
+    """
+    if demonstrator in LEARNING and not demos:
         raise InputError(
-            f"Source '{source}' learns from no demonstrations; leave them (--from) out or take source {taught}."
+            f"Source '{demonstrator}' learns from demonstrations; give at least one (--from DEMOS)."
+        )
+    if demos and demonstrator not in LEARNING:
+        taught = ", ".join(sorted(LEARNING))
+        raise InputError(
+            f"Source '{demonstrator}' learns from no demonstrations; leave them (--from) out or take demonstrator {taught}."
         )
 
 
@@ -166,7 +211,9 @@ def _of(disturbance: Disturbance) -> dict[str, float]:
 
 
 def finished(out: Path, request: Mapping[str, Any]) -> bool:
-    """Say whether `out` is the finished result of `request`; `OutputExists` if it is that of another one."""
+    """Say whether `out` is the finished result of `request`; `OutputExists` if it is that of
+    another one.
+    """
     if not (out / MARKER).exists():
         return False
     if read_marker(out).get("request") != request:
@@ -189,7 +236,11 @@ def _take(
     kept: list[Path] = []
     skipped: list[dict[str, Any]] = []
     wanted, inputs = request["episodes"], tuple(request.get("demos", ()))
-    same = {key: value for key, value in request.items() if key not in ("seed", "episodes", "demos", "learner")}
+    same = {
+        key: value
+        for key, value in request.items()
+        if key not in ("seed", "episodes", "demos", "learner")
+    }
     if demos:
         same["demos"] = [str(path.resolve()) for path in demos]
     if learner:
@@ -200,11 +251,16 @@ def _take(
         if len(kept) + len(skipped) >= MAX_FAILURES * wanted + 5:
             reasons = "; ".join(f"seed {row['seed']}: {row['reason']}" for row in skipped[:3])
             raise SurgicaiError(
-                f"The {request['source']} succeeded at {len(kept)} of {len(kept) + len(skipped)} starts of "
+                f"The {request['demonstrator']} succeeded at {len(kept)} of {len(kept) + len(skipped)} starts of "
                 f"{request['task']['task']}; {wanted} were wanted ({reasons}; …)."
             )
         jobs = [
-            Job("drive-episode" if learner else "record-episode", {**same, "seed": seed}, inputs, label=LABELS)
+            Job(
+                "drive-episode" if learner else "record-episode",
+                {**same, "seed": seed},
+                inputs,
+                label=LABELS,
+            )
             for seed in itertools.islice(seeds, wanted - len(kept))
         ]
         report = functools.partial(_report, progress, len(kept), wanted)

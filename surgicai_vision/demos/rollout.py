@@ -2,9 +2,10 @@
 
     rollout = roll(env, expert, seed)      # one episode, kept or not
 
-With a `Disturbance` the expert is shown states off its own path: noise on what is executed, while the label stays the
-expert's own answer (DART, Laskey et al. 2017), and starts that were pushed away before the recording begins. With a
-`Driver` these are states that a learner itself comes to (DAgger, Ross et al. 2011; `surgicai_vision.experiments.dagger`).
+With a `Disturbance` the expert is shown states off its own path: noise on what is executed, while
+the label stays the expert's own answer (DART, Laskey et al. 2017), and starts that were pushed away
+before the recording begins. With a `Driver` these are states that a learner itself comes to
+(DAgger, Ross et al. 2011; `surgicai_vision.experiments.dagger`).
 """
 
 from dataclasses import dataclass
@@ -27,27 +28,32 @@ class Disturbance:
     """What disturbs an episode.
 
     Attributes:
-        noise: standard deviation of the Gaussian noise on the six motions of an executed action, in units of its
-            range; the jaw is done as meant, since a random walk of it would drop the needle.
-        noise_from: lowest such deviation; each episode draws its own between the two. None takes `noise` throughout.
-        recoveries: share of episodes that start with a push in a random direction, which is not recorded.
+        noise: standard deviation of the Gaussian noise on the six motions of an executed action, in
+            units of its range; the jaw is done as meant, since a random walk of it would drop the
+            needle.
+        noise_from: lowest such deviation; each episode draws its own between the two. None takes
+            `noise` throughout.
+        perturb_start_fraction: share of episodes that start with a push in a random direction,
+            which is not recorded.
     """
 
     noise: float = 0.0
-    recoveries: float = 0.0
+    perturb_start_fraction: float = 0.0
     noise_from: float | None = None
 
     def __post_init__(self) -> None:
         if self.noise_from is not None and not 0.0 <= self.noise_from <= self.noise:
-            raise InputError(f"noise_from is {self.noise_from:g}; it must be within 0 and noise, {self.noise:g}.")
-        if not 0.0 <= self.noise <= 1.0 or not 0.0 <= self.recoveries <= 1.0:
             raise InputError(
-                f"noise is {self.noise:g} and recoveries {self.recoveries:g}; each must be within 0 and 1."
+                f"noise_from is {self.noise_from:g}; it must be within 0 and noise, {self.noise:g}."
+            )
+        if not 0.0 <= self.noise <= 1.0 or not 0.0 <= self.perturb_start_fraction <= 1.0:
+            raise InputError(
+                f"noise is {self.noise:g} and perturb_start_fraction {self.perturb_start_fraction:g}; each must be within 0 and 1."
             )
 
     def push(self, env: Any, rng: np.random.Generator) -> bool:
         """Push the tool away, or not, as chance has it; say whether the episode is still on."""
-        if rng.random() >= self.recoveries:
+        if rng.random() >= self.perturb_start_fraction:
             return True
         direction = np.append(rng.uniform(-1.0, 1.0, 6), 0.0).astype(np.float32)
         for _ in range(rng.integers(*PUSH, endpoint=True)):
@@ -58,7 +64,11 @@ class Disturbance:
 
     def deviation(self, rng: np.random.Generator) -> float:
         """Return the standard deviation of an episode's noise."""
-        return self.noise if self.noise_from is None else float(rng.uniform(self.noise_from, self.noise))
+        return (
+            self.noise
+            if self.noise_from is None
+            else float(rng.uniform(self.noise_from, self.noise))
+        )
 
     @staticmethod
     def executed(action: np.ndarray, deviation: float, rng: np.random.Generator) -> np.ndarray:
@@ -103,14 +113,15 @@ def roll(
     env: Any,
     actor: Actor,
     seed: int,
-    source: str = "expert",
+    demonstrator: str = "expert",
     disturbance: Disturbance = CALM,
-    linger: int = 0,
+    post_success_steps: int = 0,
     driver: Driver | None = None,
 ) -> Rollout:
     """Roll one episode of `env` from `seed` and return it with every state on the way.
 
-    It ends `linger` control steps after its success: what is shown there is that, and how, one stops.
+    It ends `post_success_steps` control steps after its success: what is shown there is that, and
+    how, one stops.
     """
     rng = np.random.default_rng([seed, DISTURBANCE_STREAM])
     env.reset(seed=seed)
@@ -122,13 +133,15 @@ def roll(
         driver.begin(env, seed, rng)
     states, rows = [env.get_state()], []
     info: dict[str, Any] = {}
-    left = env.config.max_steps if getattr(actor, "persists", False) else linger
+    left = env.config.max_steps if getattr(actor, "persists", False) else post_success_steps
     ended = reached = False
     while not ended:
         phase = env.phase
         action = np.asarray(actor.action(), dtype=np.float32)
         driven = driver.action(env, observation) if driver else None
-        executed = disturbance.executed(action, deviation, rng) if deviation and driven is None else action
+        executed = (
+            disturbance.executed(action, deviation, rng) if deviation and driven is None else action
+        )
         executed = executed if driven is None else driven
         observation, reward, _, truncated, info = env.step(executed)
         states.append(env.get_state())
@@ -136,11 +149,13 @@ def roll(
         left -= reached
         reached = reached or bool(info["is_success"])
         ended = (reached and left <= 0) or truncated or info["physics_error"]
-    actions, sent, phase, reward, success, contact = (list(column) for column in zip(*rows, strict=True))
+    actions, sent, phase, reward, success, contact = (
+        list(column) for column in zip(*rows, strict=True)
+    )
     demo = Demo(
         config=env.config,
         seed=seed,
-        source=source,
+        demonstrator=demonstrator,
         scene_hash=env.scene.hash,
         code_version=code_version(),
         state=np.stack(states).astype(np.float64),

@@ -1,12 +1,14 @@
-"""Searching: an expert that does not know which point of the needle is asked for, as a policy does not.
+"""Searching: an expert that does not know which point of the needle is asked for, as a policy does
+not.
 
-The goal of a grasp is a point of the needle drawn from 5° to 20° (2.7 mm of its arc), which no picture shows. Success
-is 1 mm: whoever takes the needle in the middle meets at most 11.3° of those 15°, and who sees it 1 mm off, fewer.
-`Searcher` takes it in the middle, and where the episode then has not ended by the next of its `ATTEMPTS`, opens, and
-takes it at another angle; beyond the range too, for a learner does not see exactly where it takes it. Its labels
-depend on what is seen and on the time, so that a policy with a clock can learn them (`benchmarks/grasp_ceiling.py`
-measures each way). It goes on after a success (`persists`), so that every demonstration shows every attempt. In every
-other subtask it is the expert.
+The goal of a grasp is a point of the needle drawn from 5° to 20° (2.7 mm of its arc), which no
+image shows. Success is 1 mm: whoever takes the needle in the middle meets at most 11.3° of those
+15°, and who sees it 1 mm off, fewer. `Searcher` takes it in the middle, and where the episode then
+has not ended by the next of its `ATTEMPTS`, opens, and takes it at another angle; beyond the range
+too, for a learner does not see exactly where it takes it. Its labels depend on what is seen and on
+the time, so that a policy with a clock can learn them (`benchmarks/grasp_ceiling.py` measures each
+way). It goes on after a success (`persists`), so that every demonstration shows every attempt. In
+every other subtask it is the expert.
 """
 
 import math
@@ -30,13 +32,14 @@ class Searcher:
     ATTEMPTS = (12.5, 6.5, 18.5, 2.5, 22.5)
     """Angles at which the needle is taken [deg], one attempt after the other."""
     AGAIN = 100
-    """Control step of the second attempt, for the expert's own grasp takes 70 to 85. Another follows every
-    `CLOCK_PERIOD`, in which the clock that policies have goes round once."""
+    """Control step of the second attempt, for the expert's own grasp takes 70 to 85. Another
+    follows every `CLOCK_PERIOD`, in which the clock that policies have goes round once."""
     LOOSEN, LOOSE = 8, 0.22
-    """Steps for which the jaws open before another attempt, and how far [rad]: to slide along the needle.
+    """Steps for which the jaws open before another attempt, and how far [rad]: to slide along the
+    needle.
 
-    What is done depends on the step, not on what was done before: a policy without a memory could not tell jaws that
-    open from jaws that close.
+    What is done depends on the step, not on what was done before: a policy without a memory could
+    not tell jaws that open from jaws that close.
     """
 
     def __init__(self, env: SuturingEnv):
@@ -61,4 +64,6 @@ class Searcher:
         if attempt and into < self.LOOSEN:
             return Wish(scene.command, self.LOOSE)
         goal = scene.needle @ grasp_in_needle(scene.arm, math.radians(self.ATTEMPTS[attempt]))
-        return take(scene, goal, 0.0, self.LOOSE) if attempt else take(scene, goal, HOVER, OPEN_ABOVE)
+        return (
+            take(scene, goal, 0.0, self.LOOSE) if attempt else take(scene, goal, HOVER, OPEN_ABOVE)
+        )

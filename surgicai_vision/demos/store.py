@@ -1,8 +1,9 @@
-"""Demonstrations on disk: state first, no pictures, one file an episode, each written whole.
+"""Demonstrations on disk: state first, no images, one file an episode, each written whole.
 
-A folder of demonstrations holds `demos.json` (format, version, task, source, what was skipped) and
-`episode_000000.safetensors`, `episode_000001.safetensors`, … An episode file holds the arrays of `Demo` and,
-in its metadata, everything else as JSON. Nothing in it is executable; a damaged file is a `BadFile`.
+A folder of demonstrations holds `demos.json` (format, version, task, demonstrator, what was
+skipped) and `episode_000000.safetensors`, `episode_000001.safetensors`, … An episode file holds the
+arrays of `Demo` and, in its metadata, everything else as JSON. Nothing in it is executable; a
+damaged file is a `BadFile`.
 
     write_demo(folder, 0, demo)        demo = read_demo(list_demos(folder)[0])
 """
@@ -46,7 +47,7 @@ class Demo:
     Attributes:
         config: the task and scene it was made in.
         seed: seed of the start state; -1 where the episode has none (a foreign recording).
-        source: "expert", "surgicai", …
+        demonstrator: "expert", "surgicai", …
         scene_hash: hash of the compiled scene.
         code_version: version of the code that made it.
         state: whole simulator state before each step and after the last, (T + 1, n) float64.
@@ -63,7 +64,7 @@ class Demo:
 
     config: TaskConfig
     seed: int
-    source: str
+    demonstrator: str
     scene_hash: str
     code_version: str
     state: np.ndarray
@@ -88,15 +89,21 @@ class Demo:
             )
         for name in ("phase", "reward", "success", "contact"):
             if len(getattr(self, name)) != len(self.action):
-                raise InputError(f"Demo has {len(getattr(self, name))} of {name} and {len(self.action)} actions.")
+                raise InputError(
+                    f"Demo has {len(getattr(self, name))} of {name} and {len(self.action)} actions."
+                )
         done = self.action if self.executed is None else self.executed
         if done.shape != self.action.shape or done.dtype != np.float32:
-            raise InputError(f"Demo.executed is {done.shape} {done.dtype}; it must be {self.action.shape} float32.")
+            raise InputError(
+                f"Demo.executed is {done.shape} {done.dtype}; it must be {self.action.shape} float32."
+            )
         if self.action.shape[1] != len(names.ACTION_NAMES):
             raise InputError(
                 f"Demo.action has {self.action.shape[1]} columns; it must have {len(names.ACTION_NAMES)}."
             )
-        if not all(np.isfinite(values).all() for values in (self.state, self.action, self.reward, done)):
+        if not all(
+            np.isfinite(values).all() for values in (self.state, self.action, self.reward, done)
+        ):
             raise InputError("Demo holds numbers that are not finite.")
 
     def __len__(self) -> int:
@@ -111,7 +118,7 @@ def demo_bytes(demo: Demo) -> bytes:
         "version": VERSION,
         "config": to_mapping(demo.config),
         "seed": int(demo.seed),
-        "source": demo.source,
+        "demonstrator": demo.demonstrator,
         "scene_hash": demo.scene_hash,
         "code_version": demo.code_version,
     }
@@ -142,7 +149,9 @@ def read_demo(path: Path) -> Demo:
         if not isinstance(details, dict) or details.pop("format", None) != FORMAT:
             raise BadFile(f"{path} is not a demonstration (no '{FORMAT}' in its metadata).")
         if details.pop("version") != VERSION:
-            raise BadFile(f"{path} has another format version; this release reads version {VERSION}.")
+            raise BadFile(
+                f"{path} has another format version; this release reads version {VERSION}."
+            )
         details["config"] = from_mapping(TaskConfig, details["config"], str(path))
         fields = {field.name for field in dataclasses.fields(Demo)} - {*ARRAYS, EXECUTED}
         if set(details) != fields:
@@ -154,9 +163,18 @@ def read_demo(path: Path) -> Demo:
         raise error if isinstance(error, BadFile) else BadFile(f"{path}: {error}") from None
 
 
-def write_marker(folder: Path, task: str, source: str, **details: Any) -> None:
+def write_marker(folder: Path, task: str, demonstrator: str, **details: Any) -> None:
     """Write `demos.json`, which says what the folder holds."""
-    write_json(folder / MARKER, {"format": FORMAT, "version": VERSION, "task": task, "source": source, **details})
+    write_json(
+        folder / MARKER,
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "task": task,
+            "demonstrator": demonstrator,
+            **details,
+        },
+    )
 
 
 def read_marker(folder: Path) -> dict[str, Any]:
@@ -167,7 +185,11 @@ def read_marker(folder: Path) -> dict[str, Any]:
             "'surgicai-vision record-demos' or 'import-demos'."
         )
     marker = read_json(folder / MARKER)
-    if not isinstance(marker, dict) or marker.get("format") != FORMAT or marker.get("version") != VERSION:
+    if (
+        not isinstance(marker, dict)
+        or marker.get("format") != FORMAT
+        or marker.get("version") != VERSION
+    ):
         raise BadFile(f"{folder / MARKER} is not of format {FORMAT} version {VERSION}.")
     return marker
 

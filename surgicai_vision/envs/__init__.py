@@ -1,8 +1,8 @@
 """Envs: the five subtasks and the whole procedure as gymnasium environments.
 
-Importing this package registers `names.ENV_IDS`. `make(TaskConfig(task="grasp"), obs_type="pixels")` returns an
-unwrapped env; `gymnasium.make("surgicai_vision/Grasp-v0", obs_type="pixels")` takes the same names, and the fields
-of `TaskConfig` besides.
+Importing this package registers `names.ENV_IDS`. `make(TaskConfig(task="grasp"),
+obs_type="pixels")` returns an unwrapped env; `gymnasium.make("surgicai_vision/Grasp-v0",
+obs_type="pixels")` takes the same names, and the fields of `TaskConfig` besides.
 """
 
 from typing import Any
@@ -49,7 +49,9 @@ def make(
     return SuturingEnv(config, (SUBTASKS[config.task],), view, render_mode)
 
 
-def make_task(task: str, scene: SceneConfig | dict[str, Any] | None = None, **arguments: Any) -> SuturingEnv:
+def make_task(
+    task: str, scene: SceneConfig | dict[str, Any] | None = None, **arguments: Any
+) -> SuturingEnv:
     """Return an env from flat arguments; the entry point of the gymnasium ids.
 
     Args:
@@ -58,14 +60,22 @@ def make_task(task: str, scene: SceneConfig | dict[str, Any] | None = None, **ar
         **arguments: fields of `TaskConfig` and arguments of `make`.
     """
     fields: dict[str, Any] = {
-        key: arguments.pop(key) for key in ("step", "tolerance", "reward", "max_steps") if key in arguments
+        key: arguments.pop(key)
+        for key in ("step", "tolerance", "reward", "max_steps")
+        if key in arguments
     }
     if "randomisation" in arguments:
         axes = arguments.pop("randomisation")
         fields["randomisation"] = (
-            from_mapping(RandomisationConfig, axes, "randomisation") if isinstance(axes, dict) else axes
+            from_mapping(RandomisationConfig, axes, "randomisation")
+            if isinstance(axes, dict)
+            else axes
         )
-    chosen = from_mapping(SceneConfig, scene, "scene") if isinstance(scene, dict) else scene or SceneConfig()
+    chosen = (
+        from_mapping(SceneConfig, scene, "scene")
+        if isinstance(scene, dict)
+        else scene or SceneConfig()
+    )
     return make(TaskConfig(task=task, scene=chosen, **fields), **arguments)
 
 

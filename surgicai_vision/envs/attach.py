@@ -1,7 +1,8 @@
 """Attach: the released code's rule of grasping, for comparison: grasp level "attach".
 
-While an arm's commanded jaw is closed and a pad touches the needle, a weld holds the needle where it is in the jaws;
-it goes when the jaw opens. Only scenes of this level have the welds; the default level, friction, has none.
+While an arm's commanded jaw is closed and a pad touches the needle, a weld holds the needle where
+it is in the jaws; it goes when the jaw opens. Only scenes of this level have the welds; the default
+level, friction, has none.
 """
 
 import mujoco
@@ -18,7 +19,9 @@ SIZE = 7 * len(names.ARMS)
 
 
 class Welds:
-    """The welds between both arms and the needle. The model must be the env's own: poses are written into it."""
+    """The welds between both arms and the needle. The model must be the env's own: poses are
+    written into it.
+    """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
         self._model, self._data = model, data
@@ -44,12 +47,19 @@ class Welds:
         self._data.eq_active[self._ids[arm]] = not active
         if not active:
             held = poses.relative(tip, needle)
-            self._model.eq_data[self._ids[arm], 3:10] = [*held[:3], *matrix_to_quaternion_flat(held[3:])]
+            self._model.eq_data[self._ids[arm], 3:10] = [
+                *held[:3],
+                *matrix_to_quaternion_flat(held[3:]),
+            ]
         return True
 
     def pack(self) -> list[float]:
         """Return both welds' poses, `SIZE` numbers."""
-        return [value for index in self._ids.values() for value in self._model.eq_data[index, 3:10].tolist()]
+        return [
+            value
+            for index in self._ids.values()
+            for value in self._model.eq_data[index, 3:10].tolist()
+        ]
 
     def unpack(self, values: list[float]) -> None:
         """Restore what `pack` returned; which welds are active is part of MuJoCo's state."""

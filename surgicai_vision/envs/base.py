@@ -1,14 +1,17 @@
 """SuturingEnv: a task of the suture as a gymnasium environment.
 
-Description: two da Vinci PSMs, a needle and a phantom; one subtask, or all five in a row (`suture`).
-Action: Box(-1, 1, (7,), float32): Δx Δy Δz Δroll Δpitch Δyaw of the active arm's tip in its own base frame and
+Description: two da Vinci PSMs, a needle and a phantom; one subtask, or all five in a row
+(`suture`). Action: Box(-1, 1, (7,), float32): Δx Δy Δz Δroll Δpitch Δyaw of the active arm's tip in
+its own base frame and
     Δjaw, each times the step size (`config.STEPS`); every step is 20 ms.
 Observation: see `observation`.
-Reward: sparse: 0 on success, else -1; dense: -(d_trans / 100 + d_angle / 10) with d_trans in cm and d_angle in rad.
-Success: from the measured state: position and geodesic angle within the tolerance, and what the subtask demands
+Reward: sparse: 0 on success, else -1; dense: -(d_trans / 100 + d_angle / 10) with d_trans in cm and
+d_angle in rad. Success: from the measured state: position and geodesic angle within the tolerance,
+and what the subtask demands
     (jaw contact, both holes passed, needle out). Never from the command.
 Start: random, seeded by `reset(seed=…)`; covers the end states of the subtask before.
-Termination: success, or a physics error (`info["physics_error"]`, never a success). Truncation: `max_steps`.
+Termination: success, or a physics error (`info["physics_error"]`, never a success). Truncation:
+`max_steps`.
 """
 
 from math import isfinite
@@ -22,7 +25,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError
 from surgicai_vision.envs import hole_crossing, observation, poses, randomisation
-from surgicai_vision.envs.camera_rig import Pictures
+from surgicai_vision.envs.camera_rig import Images
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.observation import ObservationConfig
@@ -72,10 +75,12 @@ class SuturingEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
         self._subtasks = subtasks
         self._step_size = StepSize.of(config.step)
-        self._pictures = Pictures(self.simulation.model)
+        self._images = Images(self.simulation.model)
 
     def _refuse_impossible(self, subtasks: tuple[Subtask, ...]) -> None:
-        """Refuse subtasks for which the holes are too far apart, with the smallest needle of all episodes."""
+        """Refuse subtasks for which the holes are too far apart, with the smallest needle of all
+        episodes.
+        """
         config, pair = self.config, self.scene.pair
         smallest = needle.RADIUS * (1.0 - config.randomisation.needle_size)
         if Stitch.of(pair, smallest).possible or not any(subtask.through for subtask in subtasks):
@@ -91,15 +96,18 @@ class SuturingEnv(gymnasium.Env):
             "surgicai_vision.envs.geometry). Allowed there: grasp, place. All tasks: simple, 3dmed_straight."
         )
 
-    # -- gymnasium ------------------------------------------------------------------------------------------------
+    # -- gymnasium ---------------------------------------------------------------------------------
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, Info]:
         """Draw a start state; `seed` makes it reproducible."""
         super().reset(seed=seed)
         simulation, first = self.simulation, self._subtasks[0]
         axes = self.config.randomisation
         if axes.on:
-            # Numbers of their own: a start is the same whatever is randomised, so that evaluations can be paired.
+            # Numbers of their own: a start is the same whatever is randomised, so that evaluations
+            # can be paired.
             simulation.randomise(randomisation.draw(axes, self.np_random.spawn(1)[0]))
             self._meet_draws()
         for _ in range(START_DRAWS):
@@ -108,7 +116,9 @@ class SuturingEnv(gymnasium.Env):
             if first.start(simulation, self.stitch, self.np_random):
                 break
         else:
-            raise PhysicsError(f"No start of '{self.config.task}' was physical in {START_DRAWS} draws.")
+            raise PhysicsError(
+                f"No start of '{self.config.task}' was physical in {START_DRAWS} draws."
+            )
         hole_crossing.remember_tip(simulation, simulation.memory)
         self._remember_tool()
         info = self.measure()
@@ -135,16 +145,18 @@ class SuturingEnv(gymnasium.Env):
         return seen, self.reward(info), terminated, memory.steps >= self.config.max_steps, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the front camera's picture, (480, 640, 3) uint8, when `render_mode` is "rgb_array"."""
+        """Return the front camera's image, (480, 640, 3) uint8, when `render_mode` is
+        "rgb_array".
+        """
         if self.render_mode is None:
             return None
-        return self._pictures.picture(self.data, RENDER_CAMERA, RENDER_SIZE)
+        return self._images.image(self.data, RENDER_CAMERA, RENDER_SIZE)
 
     def close(self) -> None:
         """Free the renderer."""
-        self._pictures.close()
+        self._images.close()
 
-    # -- what it is -----------------------------------------------------------------------------------------------
+    # -- what it is --------------------------------------------------------------------------------
 
     @property
     def model(self) -> Any:
@@ -197,7 +209,7 @@ class SuturingEnv(gymnasium.Env):
         """Return an element's id; a wrong name lists what exists."""
         return self.scene.named(kind, name)
 
-    # -- state ----------------------------------------------------------------------------------------------------
+    # -- state -------------------------------------------------------------------------------------
 
     def get_state(self) -> NDArray[np.float64]:
         """Return the whole state of the episode as one vector."""
@@ -211,7 +223,9 @@ class SuturingEnv(gymnasium.Env):
             self._meet_draws()
 
     def set_state(self, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
-        """Set positions and velocities, as gymnasium's MujocoEnv does; commands stay as they are."""
+        """Set positions and velocities, as gymnasium's MujocoEnv does; commands stay as they
+        are.
+        """
         if np.shape(qpos) != (self.model.nq,) or np.shape(qvel) != (self.model.nv,):
             raise InputError(
                 f"set_state got shapes {np.shape(qpos)} and {np.shape(qvel)}; "
@@ -220,11 +234,13 @@ class SuturingEnv(gymnasium.Env):
         self.data.qpos[:], self.data.qvel[:] = qpos, qvel
         self.simulation.refresh()
 
-    # -- measuring ------------------------------------------------------------------------------------------------
+    # -- measuring ---------------------------------------------------------------------------------
 
     def measure(self) -> Info:
         """Return the info dict of the present, measured state."""
-        return measure(self.simulation, self.subtask, self.stitch, self.config.tolerance, self._target())
+        return measure(
+            self.simulation, self.subtask, self.stitch, self.config.tolerance, self._target()
+        )
 
     def _target(self) -> Target:
         return self.subtask.target(self.simulation, self.stitch)
@@ -235,30 +251,45 @@ class SuturingEnv(gymnasium.Env):
             return 0.0 if info["is_success"] else -1.0
         return -(info["d_trans"] + info["d_angle"] / 10.0)
 
-    def compute_reward(self, achieved_goal: NDArray, desired_goal: NDArray, info: Any = None) -> NDArray[np.float64]:
+    def compute_reward(
+        self, achieved_goal: NDArray, desired_goal: NDArray, info: Any = None
+    ) -> NDArray[np.float64]:
         """Return the rewards of goals of obs_type "goal", (batch, 8) or (8,): vectorised, for HER.
 
-        On what was observed it is the reward of the step. A relabelled goal asks for what held when it was achieved:
-        an insertion that missed the holes is no example of one that passed them, but is one of reaching that pose.
+        On what was observed it is the reward of the step. A relabelled goal asks for what held when
+        it was achieved: an insertion that missed the holes is no example of one that passed them,
+        but is one of reaching that pose.
         """
         distance, turn = observation.goal_errors(achieved_goal, desired_goal)
         if self.config.reward == "dense":
             return -(distance + turn / 10.0)
         tolerance = self.subtask.tolerances[self.config.tolerance]
         met = np.asarray(achieved_goal)[..., 7] >= np.asarray(desired_goal)[..., 7]
-        return np.where((distance <= tolerance.distance) & (turn <= tolerance.angle) & met, 0.0, -1.0)
+        return np.where(
+            (distance <= tolerance.distance) & (turn <= tolerance.angle) & met, 0.0, -1.0
+        )
 
-    # -- observing ------------------------------------------------------------------------------------------------
+    # -- observing ---------------------------------------------------------------------------------
 
     def agent_pos(self) -> NDArray[np.float32]:
-        """Return x y z [m], roll pitch yaw, jaw [rad] of the active arm's measured tip in its base, (7,)."""
+        """Return x y z [m], roll pitch yaw, jaw [rad] of the active arm's measured tip in its base,
+        (7,).
+        """
         simulation, arm = self.simulation, self.subtask.arm
-        return np.array(observation.seven(arm, simulation.tip_in_base(arm), simulation.jaw(arm)), dtype=np.float32)
+        return np.array(
+            observation.seven(arm, simulation.tip_in_base(arm), simulation.jaw(arm)),
+            dtype=np.float32,
+        )
 
     def both_arms(self) -> NDArray[np.float32]:
-        """Return what `agent_pos` is for psm1, then for psm2, (14,): the proprioception of a high-level policy."""
+        """Return what `agent_pos` is for psm1, then for psm2, (14,): the proprioception of a
+        high-level policy.
+        """
         simulation = self.simulation
-        sevens = [observation.seven(arm, simulation.tip_in_base(arm), simulation.jaw(arm)) for arm in names.ARMS]
+        sevens = [
+            observation.seven(arm, simulation.tip_in_base(arm), simulation.jaw(arm))
+            for arm in names.ARMS
+        ]
         return np.array(sevens, dtype=np.float32).ravel()
 
     def state_vector(self) -> NDArray[np.float32]:
@@ -284,7 +315,7 @@ class SuturingEnv(gymnasium.Env):
                 "achieved_goal": observation.goal_vector(achieved, jaw, self._meets_demands()),
                 "desired_goal": observation.goal_vector(desired, 0.0, True),
             }
-        seen = self._pictures.look(self.data, self.view)
+        seen = self._images.look(self.data, self.view)
         if self.view.obs_type == "pixels_agent_pos":
             seen["agent_pos"] = self.agent_pos()
         return seen
@@ -298,7 +329,7 @@ class SuturingEnv(gymnasium.Env):
             return observation.state_vector(arm, simulation.tip_in_base(arm), goal, jaw)
         return observation.state_vector_in_world(arm, simulation.bases[arm], tip, *target, jaw)
 
-    # -- progress -------------------------------------------------------------------------------------------------
+    # -- progress ----------------------------------------------------------------------------------
 
     def _checked(self, action: NDArray[np.float32]) -> list[float]:
         """Return the action as seven floats in [-1, 1]."""
@@ -308,11 +339,16 @@ class SuturingEnv(gymnasium.Env):
         return [-1.0 if value < -1.0 else 1.0 if value > 1.0 else value for value in values]
 
     def _meet_draws(self) -> None:
-        """Follow a new randomisation: goals stand on the phantom, and a renderer keeps the needle's shape."""
-        pair, axes = randomisation.shifted(self.scene.pair, self.simulation.draws), self.config.randomisation
+        """Follow a new randomisation: goals stand on the phantom, and a renderer keeps the needle's
+        shape.
+        """
+        pair, axes = (
+            randomisation.shifted(self.scene.pair, self.simulation.draws),
+            self.config.randomisation,
+        )
         self.stitch = Stitch.of(pair, self.simulation.radius)
         if axes.needle_thickness or axes.needle_size:
-            self._pictures.close()
+            self._images.close()
 
     def _remember_tool(self) -> None:
         memory = self.simulation.memory
@@ -321,7 +357,9 @@ class SuturingEnv(gymnasium.Env):
     def _add_path(self, arm: str) -> None:
         memory = self.simulation.memory
         x, y, z = self.simulation.tip(arm)[:3]
-        memory.tip_path += ((x - memory.tool_x) ** 2 + (y - memory.tool_y) ** 2 + (z - memory.tool_z) ** 2) ** 0.5
+        memory.tip_path += (
+            (x - memory.tool_x) ** 2 + (y - memory.tool_y) ** 2 + (z - memory.tool_z) ** 2
+        ) ** 0.5
         memory.tool_x, memory.tool_y, memory.tool_z = x, y, z
 
     def _meets_demands(self) -> bool:

@@ -1,4 +1,6 @@
-"""Pictures: what an env's cameras see. One renderer at a time, made on first use, hence in the worker that uses it."""
+"""Images: what an env's cameras see. One renderer at a time, made on first use, hence in the worker
+that uses it.
+"""
 
 from typing import Any
 
@@ -9,7 +11,7 @@ from surgicai_vision.core import names
 from surgicai_vision.envs.observation import ObservationConfig
 
 
-class Pictures:
+class Images:
     """What the cameras of one env see."""
 
     def __init__(self, model: mujoco.MjModel):
@@ -17,25 +19,28 @@ class Pictures:
         self._renderer: Any = None
 
     def look(self, data: mujoco.MjData, view: ObservationConfig) -> dict[str, Any]:
-        """Return the pictures of an observation: group → camera → picture."""
+        """Return the images of an observation: group → camera → image."""
         renderer = self._sized(view.image_size)
         groups = {"pixels": names.RGB}
         if view.depth:
             groups["depth"] = names.DEPTH
         if view.segmentation:
             groups["segmentation"] = names.SEGMENTATION
-        seen = {camera: renderer.render_all(data, camera, groups.values()) for camera in view.cameras}
+        seen = {
+            camera: renderer.render_all(data, camera, groups.values()) for camera in view.cameras
+        }
         return {
-            group: {camera: seen[camera][modality] for camera in view.cameras} for group, modality in groups.items()
+            group: {camera: seen[camera][modality] for camera in view.cameras}
+            for group, modality in groups.items()
         }
 
-    def picture(self, data: mujoco.MjData, camera: str, size: tuple[int, int]) -> NDArray[Any]:
-        """Return one RGB picture, (height, width, 3) uint8."""
-        picture: NDArray[Any] = self._sized(size).render(data, camera, names.RGB)
-        return picture
+    def image(self, data: mujoco.MjData, camera: str, size: tuple[int, int]) -> NDArray[Any]:
+        """Return one RGB image, (height, width, 3) uint8."""
+        image: NDArray[Any] = self._sized(size).render(data, camera, names.RGB)
+        return image
 
     def close(self) -> None:
-        """Free the renderer; the next picture makes a new one."""
+        """Free the renderer; the next image makes a new one."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

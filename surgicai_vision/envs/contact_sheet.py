@@ -1,4 +1,4 @@
-"""Pictures for people: what a view shows, film strips, and the sheet of all cameras."""
+"""Images for people: what a view shows, film strips, and the sheet of all cameras."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,10 +10,18 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 
-Picture = NDArray[np.uint8]
+Image = NDArray[np.uint8]
 
 PALETTE = np.array(
-    [(22, 27, 34), (222, 150, 130), (255, 214, 10), (120, 200, 120), (88, 166, 255), (188, 140, 255)], np.uint8
+    [
+        (22, 27, 34),
+        (222, 150, 130),
+        (255, 214, 10),
+        (120, 200, 120),
+        (88, 166, 255),
+        (188, 140, 255),
+    ],
+    np.uint8,
 )
 """RGB of each of `names.PARTS` in a coloured segmentation."""
 
@@ -23,7 +31,7 @@ BEYOND = 1.0
 
 @contextmanager
 def stage(config: TaskConfig, size: int, quality: str = "high") -> Iterator[Any]:
-    """Yield a function `picture(state, view, modality) -> (size, size, 3) uint8`.
+    """Yield a function `image(state, view, modality) -> (size, size, 3) uint8`.
 
     The state is that of the env's `get_state`; depth and segmentation are coloured.
     """
@@ -34,19 +42,21 @@ def stage(config: TaskConfig, size: int, quality: str = "high") -> Iterator[Any]
     env.reset(seed=0)
     renderer = FrameRenderer(env.model, size, size, quality=quality)
 
-    def picture(state: NDArray[np.float64], view: str, modality: str = names.RGB) -> Picture:
+    def image(state: NDArray[np.float64], view: str, modality: str = names.RGB) -> Image:
         env.set_state_vector(state)
         return coloured(renderer.render(env.data, view, modality), modality)
 
     try:
-        yield picture
+        yield image
     finally:
         renderer.close()
         env.close()
 
 
-def coloured(frame: NDArray[Any], modality: str) -> Picture:
-    """Return a frame as RGB (H, W, 3): depth by a colour map, segmentation by the parts' palette."""
+def coloured(frame: NDArray[Any], modality: str) -> Image:
+    """Return a frame as RGB (H, W, 3): depth by a colour map, segmentation by the parts'
+    palette.
+    """
     if modality == names.RGB:
         return frame
     if modality == names.SEGMENTATION:
@@ -55,13 +65,17 @@ def coloured(frame: NDArray[Any], modality: str) -> Picture:
 
     near, far = depth_range(frame)
     scaled = np.clip((frame[..., 0] - near) / max(far - near, 1e-6), 0, 1)
-    rgb = cv2.applyColorMap((255 * (1 - scaled)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    rgb = cv2.applyColorMap((255 * (1 - scaled)).astype(np.uint8), cv2.COLORMAP_TURBO)[
+        ..., ::-1
+    ].copy()
     rgb[frame[..., 0] >= BEYOND] = PALETTE[0]
     return rgb
 
 
 def depth_range(frame: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the 2nd and 90th percentile of the depths before `BEYOND` [m], between which colours are spread."""
+    """Return the 2nd and 90th percentile of the depths before `BEYOND` [m], between which colours
+    are spread.
+    """
     inside = frame[frame < BEYOND]
     if not inside.size:
         return 0.0, BEYOND
@@ -69,17 +83,17 @@ def depth_range(frame: NDArray[np.float32]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def sheet(rows: Sequence[tuple[str, Sequence[Picture]]], columns: Sequence[str], title: str) -> Any:
-    """Return a matplotlib figure: a grid of pictures with a name for each row and column."""
+def sheet(rows: Sequence[tuple[str, Sequence[Image]]], columns: Sequence[str], title: str) -> Any:
+    """Return a matplotlib figure: a grid of images with a name for each row and column."""
     from matplotlib.figure import Figure
 
     width, height = 2.1 * len(columns) + 1.0, 2.1 * len(rows) + 0.8
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(title, fontsize=13, fontweight="bold")
     axes = figure.subplots(len(rows), len(columns), squeeze=False)
-    for (name, pictures), line in zip(rows, axes, strict=True):
-        for picture, axis in zip(pictures, line, strict=True):
-            axis.imshow(picture)
+    for (name, images), line in zip(rows, axes, strict=True):
+        for image, axis in zip(images, line, strict=True):
+            axis.imshow(image)
             axis.set_xticks([])
             axis.set_yticks([])
             for edge in axis.spines.values():
@@ -90,28 +104,28 @@ def sheet(rows: Sequence[tuple[str, Sequence[Picture]]], columns: Sequence[str],
     return figure
 
 
-def jpeg(picture: Picture, quality: int = 85) -> bytes:
-    """Return an RGB picture as JPEG."""
-    return _encoded(picture, ".jpg", [1, quality])  # 1 is cv2.IMWRITE_JPEG_QUALITY
+def jpeg(image: Image, quality: int = 85) -> bytes:
+    """Return an RGB image as JPEG."""
+    return _encoded(image, ".jpg", [1, quality])  # 1 is cv2.IMWRITE_JPEG_QUALITY
 
 
-def png(picture: Picture) -> bytes:
-    """Return an RGB picture as PNG."""
-    return _encoded(picture, ".png", [])
+def png(image: Image) -> bytes:
+    """Return an RGB image as PNG."""
+    return _encoded(image, ".png", [])
 
 
-def decoded(content: bytes) -> Picture:
+def decoded(content: bytes) -> Image:
     """Return a JPEG or PNG as RGB (H, W, 3)."""
     import cv2
 
-    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-    assert picture is not None
-    return np.asarray(picture[..., ::-1], np.uint8)
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return np.asarray(image[..., ::-1], np.uint8)
 
 
-def _encoded(picture: Picture, suffix: str, options: list[int]) -> bytes:
+def _encoded(image: Image, suffix: str, options: list[int]) -> bytes:
     import cv2
 
-    done, buffer = cv2.imencode(suffix, np.ascontiguousarray(picture[..., ::-1]), options)
+    done, buffer = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]), options)
     assert done
     return bytes(buffer)

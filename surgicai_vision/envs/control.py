@@ -1,12 +1,13 @@
 """Control: an action of the env becomes joint commands of one arm.
 
-The command is a pose of the tool tip in the arm's own base frame plus the jaw angle. An action in [-1, 1]⁷ moves
-it by at most one step size: translation along the base's axes, rotation by a rotation vector in the base's axes
-(for steps of 2° this equals the released code's roll-pitch-yaw increments to first order, and it has no
-singularity), and the jaw. A command that leaves the workspace or a joint limit is not taken: the command stays.
+The command is a pose of the tool tip in the arm's own base frame plus the jaw angle. An action in
+[-1, 1]⁷ moves it by at most one step size: translation along the base's axes, rotation by a
+rotation vector in the base's axes (for steps of 2° this equals the released code's roll-pitch-yaw
+increments to first order, and it has no singularity), and the jaw. A command that leaves the
+workspace or a joint limit is not taken: the command stays.
 
-Plain floats throughout: a pose is the tuple of twelve floats of `scene.kinematics`; numpy on 3 × 3 arrays would
-cost more than the physics saves.
+Plain floats throughout: a pose is the tuple of twelve floats of `scene.kinematics`; numpy on 3 × 3
+arrays would cost more than the physics saves.
 """
 
 import math
@@ -20,14 +21,16 @@ from surgicai_vision.scene.rotations import multiply_flat, rotvec_to_matrix_flat
 JAW_OPEN = 1.0
 """Largest commanded jaw angle [rad]; 0 is closed."""
 SQUEEZE, SQUEEZE_BELOW = 0.3, 0.1
-"""Below a command of 0.1 rad the jaw's servo is led up to 0.3 rad past it, gently at first: the motor's torque limit
-then sets the force of the grip, and the pads do not slam."""
+"""Below a command of 0.1 rad the jaw's servo is led up to 0.3 rad past it, gently at first: the
+motor's torque limit then sets the force of the grip, and the pads do not slam."""
 WORKSPACE = ((-0.09, -0.09, 0.060), (0.09, 0.14, 0.165))
 """Corners of the box the tips may move in [m, world]."""
 
 
 class Command(NamedTuple):
-    """What an arm is told to do: tip pose in its base, jaw angle [rad], and the joints that put it there."""
+    """What an arm is told to do: tip pose in its base, jaw angle [rad], and the joints that put it
+    there.
+    """
 
     pose: Pose
     jaw: float
@@ -57,7 +60,9 @@ def moved(pose: Pose, action: list[float], step: StepSize) -> Pose:
     return (pose[0] + x * shift, pose[1] + y * shift, pose[2] + z * shift, *rotation)
 
 
-def follow(command: Command, action: list[float], step: StepSize, base: Pose, instrument: str) -> Command:
+def follow(
+    command: Command, action: list[float], step: StepSize, base: Pose, instrument: str
+) -> Command:
     """Return the command after `action`; the pose stays where the new one cannot be reached.
 
     Args:

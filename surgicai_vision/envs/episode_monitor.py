@@ -1,16 +1,20 @@
-"""Gauge: what one episode does to needle and tissue, read from the measured state after every control step.
+"""Gauge: what one episode does to needle and tissue, read from the measured state after every
+control step.
 
-A `Gauge` only looks: neither the env's state nor its physics know of it, so an episode is the same with and without.
+A `Gauge` only looks: neither the env's state nor its physics know of it, so an episode is the same
+with and without.
 
-* Where the needle's tip goes through the stitch's planes: `entry_error` and `exit_error`, the distance of that point
-  from the hole's centre in the hole's plane [m]; NaN where the tip did not go through in this episode. The openings
-  are squares of `holes.OPENING`, so an error is at most their half diagonal, 2.7 mm. A tip that goes back and through
-  again counts anew.
-* `wrong_hole`: the tip went through an opening of another stitch, or through this exit from outside, and has not left
-  through the right exit since.
-* `slip`, `turn`: the needle's largest shift [m] and turn [rad] in the active jaws since they took it.
-* `tissue_force`: largest net force [N] of needle and instruments (not of the thread) on the phantom, as a force plate
-  under it would show. Sampled when a control step ends, at 50 Hz: a shorter blow can be missed.
+* Where the needle's tip goes through the stitch's planes: `entry_error` and `exit_error`, the
+  distance of that point from the hole's centre in the hole's plane [m]; NaN where the tip did not
+  go through in this episode. The openings are squares of `holes.OPENING`, so an error is at most
+  their half diagonal, 2.7 mm. A tip that goes back and through again counts anew.
+* `wrong_hole`: the tip went through an opening of another stitch, or through this exit from
+  outside, and has not left through the right exit since.
+* `slip`, `turn`: the needle's largest shift [m] and turn [rad] in the active jaws since they took
+  it.
+* `tissue_force`: largest net force [N] of needle and instruments (not of the thread) on the
+  phantom, as a force plate under it would show. Sampled when a control step ends, at 50 Hz: a
+  shorter blow can be missed.
 """
 
 import math
@@ -90,17 +94,23 @@ class Gauge:
         for index, other in enumerate(self._pairs):
             if index != self._chosen:
                 holes = (other.entry, other.exit)
-                self.wrong_hole |= any(crossing(before, now, hole, inward=True) is not None for hole in holes)
+                self.wrong_hole |= any(
+                    crossing(before, now, hole, inward=True) is not None for hole in holes
+                )
 
 
 def crossing(before: Point, now: Point, hole: Hole, *, inward: bool) -> float | None:
-    """Return how far from the hole's centre [m] the way from `before` to `now` crosses its plane, or None.
+    """Return how far from the hole's centre [m] the way from `before` to `now` crosses its plane,
+    or None.
 
     None as well where it crosses outside the opening or in the other direction.
     """
     cosine, sine = math.cos(hole.tilt), math.sin(hole.tilt)
     x, _, z = hole.centre
-    start, end = sine * (before[0] - x) + cosine * (before[2] - z), sine * (now[0] - x) + cosine * (now[2] - z)
+    start, end = (
+        sine * (before[0] - x) + cosine * (before[2] - z),
+        sine * (now[0] - x) + cosine * (now[2] - z),
+    )
     if not (start > 0.0 >= end if inward else start <= 0.0 < end):
         return None
     share = start / (start - end)
@@ -112,8 +122,8 @@ def crossing(before: Point, now: Point, hole: Hole, *, inward: bool) -> float | 
 class Plate:
     """A force plate under the phantom: what needle and instruments press it with.
 
-    Contact forces are not part of a state that ends with MuJoCo's position stage, and computing them in place would
-    change the state's warm start. They are computed on data of the plate's own.
+    Contact forces are not part of a state that ends with MuJoCo's position stage, and computing
+    them in place would change the state's warm start. They are computed on data of the plate's own.
 
     Args:
         model: the env's model, its own copy where the env has one.
@@ -125,7 +135,8 @@ class Plate:
         phantom, needle_id = model.body("phantom").id, model.body("needle").id
         of_geom = model.geom_bodyid
         self._tissue = of_geom == phantom
-        # The thread hangs on the needle and is not meant; every other moving body is part of an instrument.
+        # The thread hangs on the needle and is not meant; every other moving body is part of an
+        # instrument.
         thread = (model.body_rootid[of_geom] == needle_id) & (of_geom != needle_id)
         self._presses = (model.body_weldid[of_geom] != 0) & ~thread
 
@@ -141,7 +152,9 @@ class Plate:
     def _touching(self, data: mujoco.MjData) -> NDArray[np.bool_]:
         """Return which contacts are of the tissue with the needle or an instrument, (contacts,)."""
         one, other = data.contact.geom[:, 0], data.contact.geom[:, 1]
-        return (self._tissue[one] & self._presses[other]) | (self._tissue[other] & self._presses[one])
+        return (self._tissue[one] & self._presses[other]) | (
+            self._tissue[other] & self._presses[one]
+        )
 
     def _net(self, data: mujoco.MjData) -> NDArray[np.float64]:
         """Return the net force in world (3,) [N]."""
@@ -149,6 +162,8 @@ class Plate:
         for index in np.flatnonzero(self._touching(data)):
             contact = data.contact[int(index)]
             mujoco.mj_contactForce(self._model, data, int(index), wrench)
-            sign = 1.0 if self._tissue[contact.geom[1]] else -1.0  # MuJoCo's force is that on the second geom
+            sign = (
+                1.0 if self._tissue[contact.geom[1]] else -1.0
+            )  # MuJoCo's force is that on the second geom
             net += sign * (contact.frame.reshape(3, 3).T @ wrench[:3])
         return net

@@ -1,25 +1,28 @@
 """Geometry of the stitch: grasp frames on the needle, the path through the holes, and the goals.
 
-A grasp: the jaws approach along the normal of the needle's plane from its +z side and close in the radial
-direction. One such grasp serves the pick-up from the tissue, the drive through the holes and the pull. With the
-tool's frame (z along the jaws, y across them, x their hinge) and θ the grasped point's angle:
-y = ± radial(θ), z = -normal, tip frame at `GRASP_DEPTH` above the plane. PSM2 takes +radial, PSM1 -radial: the
-signs for which no joint limit is met on the whole path (and those of SurgicAI's demonstrations).
+A grasp: the jaws approach along the normal of the needle's plane from its +z side and close in the
+radial direction. One such grasp serves the pick-up from the tissue, the drive through the holes and
+the pull. With the tool's frame (z along the jaws, y across them, x their hinge) and θ the grasped
+point's angle: y = ± radial(θ), z = -normal, tip frame at `GRASP_DEPTH` above the plane. PSM2 takes
++radial, PSM1 -radial: the signs for which no joint limit is met on the whole path (and those of
+SurgicAI's demonstrations).
 
-The path: the holes of layout `simple` lie 7.8 mm apart on flanks tilted 46.1°, their axes 43.9° below the
-horizontal. A circle of the needle's radius R through both centres has its centre √(R² - (gap/2)²) = 9.4 mm above
-their middle and runs there at asin(gap / 2R) = 22.6° to the horizontal: 21° off the holes' axes. No rigid arc
-of this radius is perpendicular at both holes, so the needle starts perpendicular at the entry (place), turns
-those 21° about its tip while the tip enters, then follows the circle. In the 3.8 mm openings the needle's
-skin keeps at least 0.7 mm of clearance all the way (0.71 to 0.82 mm by pair; `tests/test_scene.py` measures it).
+The path: the holes of layout `simple` lie 7.8 mm apart on flanks tilted 46.1°, their axes 43.9°
+below the horizontal. A circle of the needle's radius R through both centres has its centre √(R² -
+(gap/2)²) = 9.4 mm above their middle and runs there at asin(gap / 2R) = 22.6° to the horizontal:
+21° off the holes' axes. No rigid arc of this radius is perpendicular at both holes, so the needle
+starts perpendicular at the entry (place), turns those 21° about its tip while the tip enters, then
+follows the circle. In the 3.8 mm openings the needle's skin keeps at least 0.7 mm of clearance all
+the way (0.71 to 0.82 mm by pair; `tests/test_scene.py` measures it).
 
-Room for PSM2's jaws: at the end of the insertion the needle's point at `angle_at_entry(INSERT_ANGLE, INSERT_DEPTH)`
-is in the entry, 100° - 11.3° - 2 asin(gap / 2R), and the jaws, `PAD_WIDTH` wide, must still be outside. With the
-`EXTRA` drive that makes room for PSM1 this leaves grasps up to 27° in `simple` and up to 8° to 15° in
-`3dmed_straight` (gaps 9.8 to 10.9 mm): there PSM2 grasps nearer the base. The gaps of `3dmed` (12.2 to 14.1 mm, 74° to
-88° of the needle's 120°) leave less than nothing: a third of this needle cannot stand out of the exit while PSM2 holds
-its base. Those holes are for their challenge's needle of 133°. In `3dmed` grasp and place are possible; what follows
-is refused.
+Room for PSM2's jaws: at the end of the insertion the needle's point at
+`angle_at_entry(INSERT_ANGLE, INSERT_DEPTH)` is in the entry, 100° - 11.3° - 2 asin(gap / 2R), and
+the jaws, `PAD_WIDTH` wide, must still be outside. With the `EXTRA` drive that makes room for PSM1
+this leaves grasps up to 27° in `simple` and up to 8° to 15° in `3dmed_straight` (gaps 9.8 to 10.9
+mm): there PSM2 grasps nearer the base. The gaps of `3dmed` (12.2 to 14.1 mm, 74° to 88° of the
+needle's 120°) leave less than nothing: a third of this needle cannot stand out of the exit while
+PSM2 holds its base. Those holes are for their challenge's needle of 133°. In `3dmed` grasp and
+place are possible; what follows is refused.
 """
 
 import functools
@@ -42,20 +45,28 @@ GRASP_SIGNS = {PSM1: -1.0, PSM2: 1.0}
 WOUND = np.array([0.0, 1.0, 0.0])
 """Direction of the wound in world: the normal of the needle's plane during the stitch."""
 INSERT_ANGLE = math.radians(100.0)
-"""The needle's point that the insertion brings to `INSERT_DEPTH` beyond the exit (released code)."""
+"""The needle's point that the insertion brings to `INSERT_DEPTH` beyond the exit (released
+code).
+"""
 INSERT_DEPTH = 0.002
 EXTRA = 0.0014
-"""How far the expert drives the insertion past its goal where the episode lets it [m]: room for PSM1's jaws."""
+"""How far the expert drives the insertion past its goal where the episode lets it [m]: room for
+PSM1's jaws.
+"""
 FIRST_GRASP = math.radians(6.5)
 """Needle angle from which on a grasp off by its error has the needle between the pads."""
 HANDOFF_ANGLE = math.radians(105.0)
 """The needle's point that PSM1 grasps (released code)."""
 PULLOUT_SHIFT = np.array([0.030, 0.0, 0.030])
 PULLOUT_TURN = math.radians(-50.0)
-"""End of the pull-out: the exit shifted by `PULLOUT_SHIFT`, the handoff grasp turned about y (released code)."""
+"""End of the pull-out: the exit shifted by `PULLOUT_SHIFT`, the handoff grasp turned about y
+(released code).
+"""
 
 
-def grasp_in_needle(arm: str, angle: float, depth: float = GRASP_DEPTH, radius: float = needle.RADIUS) -> Matrix:
+def grasp_in_needle(
+    arm: str, angle: float, depth: float = GRASP_DEPTH, radius: float = needle.RADIUS
+) -> Matrix:
     """Return T_needle_tip (4, 4): the tool's pose that grasps the needle's point at `angle` [rad].
 
     Args:
@@ -112,21 +123,29 @@ class Stitch:
         return cls(pair, centre, math.asin(half / radius), radius)
 
     def on_arc(self, angle_at_entry: float) -> Matrix:
-        """Return the needle's pose on the circle with its point at `angle_at_entry` [rad] in the entry."""
+        """Return the needle's pose on the circle with its point at `angle_at_entry` [rad] in the
+        entry.
+        """
         radial = (np.asarray(self.pair.entry.centre) - self.centre) / self.radius
         return _needle_pose(angle_at_entry, radial, self.centre)
 
     def angle_at_entry(self, angle: float, beyond: float) -> float:
-        """Return which needle angle is in the entry when the point at `angle` is `beyond` the exit [m]."""
+        """Return which needle angle is in the entry when the point at `angle` is `beyond` the exit
+        [m].
+        """
         return angle - beyond / self.radius - 2 * self.half
 
     def place(self) -> Matrix:
-        """Return the needle's pose with its tip in the entry, perpendicular to the entry's plane."""
+        """Return the needle's pose with its tip in the entry, perpendicular to the entry's
+        plane.
+        """
         entry = self.pair.entry
         inward = -entry.rotation[:, 2]
         radial = np.cross(WOUND, inward)
         pose = _needle_pose(needle.TIP_ANGLE, radial, np.zeros(3))
-        pose[:3, 3] = np.asarray(entry.centre) - pose[:3, :3] @ needle.point(needle.TIP_ANGLE, self.radius)
+        pose[:3, 3] = np.asarray(entry.centre) - pose[:3, :3] @ needle.point(
+            needle.TIP_ANGLE, self.radius
+        )
         return pose
 
     def inserted(self, extra: float = 0.0) -> Matrix:
@@ -134,24 +153,32 @@ class Stitch:
         return self.on_arc(self.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + extra))
 
     def pulled(self) -> Matrix:
-        """Return the goal of the pull-out: the handoff point at the end point, turned with the inserted needle."""
+        """Return the goal of the pull-out: the handoff point at the end point, turned with the
+        inserted needle.
+        """
         cosine, sine = math.cos(PULLOUT_TURN), math.sin(PULLOUT_TURN)
         turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
         pose = np.eye(4)
         pose[:3, :3] = turn @ self.inserted()[:3, :3]
         pose[:3, 3] = (
-            np.asarray(self.pair.exit.centre) + PULLOUT_SHIFT - pose[:3, :3] @ needle.point(HANDOFF_ANGLE, self.radius)
+            np.asarray(self.pair.exit.centre)
+            + PULLOUT_SHIFT
+            - pose[:3, :3] @ needle.point(HANDOFF_ANGLE, self.radius)
         )
         return pose
 
     @functools.cached_property
     def last_grasp(self) -> float:
-        """Return the largest needle angle at which PSM2's jaws stay outside the entry to the end [rad]."""
+        """Return the largest needle angle at which PSM2's jaws stay outside the entry to the end
+        [rad].
+        """
         return self.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA) - PAD_WIDTH / 2 / self.radius
 
     @property
     def possible(self) -> bool:
-        """Say whether the holes leave room for PSM2's jaws; where not, only grasp and place can be done."""
+        """Say whether the holes leave room for PSM2's jaws; where not, only grasp and place can be
+        done.
+        """
         return self.last_grasp >= FIRST_GRASP
 
     def grasps(self, low: float, high: float) -> tuple[float, float]:

@@ -25,15 +25,21 @@ def lying_needle(rng: np.random.Generator) -> np.ndarray:
     """Draw T_world_needle (4, 4) of a needle that lies on the tissue."""
     pose = np.eye(4)
     pose[:3, :3] = rpy_to_matrix(0.0, 0.0, rng.uniform(-SPREAD_TURN, SPREAD_TURN))
-    pose[:3, 3] = needle.HOME + np.array([rng.uniform(-SPREAD_X, SPREAD_X), rng.uniform(-SPREAD_Y, SPREAD_Y), 0.0])
+    pose[:3, 3] = needle.HOME + np.array(
+        [rng.uniform(-SPREAD_X, SPREAD_X), rng.uniform(-SPREAD_Y, SPREAD_Y), 0.0]
+    )
     return pose
 
 
 class Grasp(Subtask):
-    """Close PSM2's jaws on the needle at the grasp angle: 1 mm and 10°, both pads in contact (paper)."""
+    """Close PSM2's jaws on the needle at the grasp angle: 1 mm and 10°, both pads in contact
+    (paper).
+    """
 
     name, through = "grasp", False
-    tolerances = MappingProxyType({"paper": Tolerance.of(1.0, 10.0), "released": Tolerance.of(3.0, 10.0)})
+    tolerances = MappingProxyType(
+        {"paper": Tolerance.of(1.0, 10.0), "released": Tolerance.of(3.0, 10.0)}
+    )
     demands = MappingProxyType({"paper": Demands(contact=True), "released": Demands()})
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:

@@ -1,4 +1,6 @@
-"""Handoff (SurgicAI: Regrasp): PSM1 takes the needle's tip side while PSM2 holds it through the tissue."""
+"""Handoff (SurgicAI: Regrasp): PSM1 takes the needle's tip side while PSM2 holds it through the
+tissue.
+"""
 
 import math
 from types import MappingProxyType
@@ -34,14 +36,18 @@ class Handoff(Subtask):
     """Close PSM1's jaws on the needle's 105° point: 2 mm and 15°, both pads in contact (paper)."""
 
     name = "handoff"
-    tolerances = MappingProxyType({"paper": Tolerance.of(2.0, 15.0), "released": Tolerance.of(2.0, 40.0)})
+    tolerances = MappingProxyType(
+        {"paper": Tolerance.of(2.0, 15.0), "released": Tolerance.of(2.0, 40.0)}
+    )
     demands = MappingProxyType({"paper": Demands(contact=True), "released": Demands()})
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the inserted needle with PSM2, PSM1 at home."""
         needle_pose = inserted_needle(stitch, rng)
         simulation.memory.passed = 2.0
-        held = hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch), STRAIGHT)
+        held = hold_needle(
+            simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch), STRAIGHT
+        )
         return held and not simulation.touches_phantom(needle=False)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:

@@ -1,9 +1,10 @@
 """Passage: did the needle go through both holes, in travel direction, through the openings?
 
-Tests that must agree, so that tunnelling or teleporting never counts. In time: the tip crosses the entry's plane
-inwards, then the exit's plane outwards, each inside the opening; from then on the needle stays in the exit's
-opening until the whole of it is beyond; and the tip never moves further than `JUMP` in one control step. In space:
-the needle's polyline crosses both planes inside the openings now.
+Tests that must agree, so that tunnelling or teleporting never counts. In time: the tip crosses the
+entry's plane inwards, then the exit's plane outwards, each inside the opening; from then on the
+needle stays in the exit's opening until the whole of it is beyond; and the tip never moves further
+than `JUMP` in one control step. In space: the needle's polyline crosses both planes inside the
+openings now.
 """
 
 import math
@@ -18,7 +19,9 @@ JUMP = 0.004
 OUT = 3.0
 """`Memory.passed` of a needle whose base has left the exit too."""
 EJECTED = 5.0
-"""A way in one control step [m] that no fall explains: the contact solver shot the needle away (250 m/s)."""
+"""A way in one control step [m] that no fall explains: the contact solver shot the needle away (250
+m/s).
+"""
 
 Point = tuple[float, float, float]
 
@@ -57,20 +60,24 @@ def in_both(simulation: Simulation, pair: HolePair) -> bool:
 
 
 def enters(simulation: Simulation, hole: Hole) -> bool:
-    """Say whether the needle, from base to tip, crosses the hole's plane inwards inside the opening now."""
+    """Say whether the needle, from base to tip, crosses the hole's plane inwards inside the opening
+    now.
+    """
     return _crosses(simulation, hole, inward=True)
 
 
 def leaves(simulation: Simulation, hole: Hole) -> bool:
-    """Say whether the needle, from base to tip, crosses the hole's plane outwards inside the opening now."""
+    """Say whether the needle, from base to tip, crosses the hole's plane outwards inside the
+    opening now.
+    """
     return _crosses(simulation, hole, inward=False)
 
 
 def _crosses(simulation: Simulation, hole: Hole, *, inward: bool) -> bool:
     """Do what `holes.crossing` does on a fine polyline, in closed form for every control step.
 
-    Along the arc the height over the plane is a + R (c sin θ - b cos θ) = a + reach sin(θ - φ); it rises through 0
-    at one angle and falls through it at one.
+    Along the arc the height over the plane is a + R (c sin θ - b cos θ) = a + reach sin(θ - φ); it
+    rises through 0 at one angle and falls through it at one.
     """
     height, reach, phase = _heights(simulation, hole)
     if abs(height) >= reach:
@@ -86,17 +93,27 @@ def is_out(simulation: Simulation, pair: HolePair) -> bool:
     """Say whether the whole needle is beyond the exit's plane: its lowest point is."""
     height, reach, phase = _heights(simulation, pair.exit)
     low = math.remainder(phase - math.pi / 2, 2 * math.pi)
-    lowest = -1.0 if 0.0 <= low <= needle.TIP_ANGLE else min(math.sin(-phase), math.sin(needle.TIP_ANGLE - phase))
+    lowest = (
+        -1.0
+        if 0.0 <= low <= needle.TIP_ANGLE
+        else min(math.sin(-phase), math.sin(needle.TIP_ANGLE - phase))
+    )
     return height + reach * lowest > 0.0
 
 
 def _heights(simulation: Simulation, hole: Hole) -> tuple[float, float, float]:
-    """Return a [m], reach [m] and φ [rad]: a + reach sin(θ - φ) is the height of the needle's point at θ."""
+    """Return a [m], reach [m] and φ [rad]: a + reach sin(θ - φ) is the height of the needle's point
+    at θ.
+    """
     cosine, sine = hole.slope
     x, _, z = hole.centre
     px, _, pz, r0, r1, _, _, _, _, r6, r7, _ = simulation.needle()
     b, c = sine * r0 + cosine * r6, sine * r1 + cosine * r7
-    return sine * (px - x) + cosine * (pz - z), simulation.radius * math.hypot(b, c), math.atan2(b, c)
+    return (
+        sine * (px - x) + cosine * (pz - z),
+        simulation.radius * math.hypot(b, c),
+        math.atan2(b, c),
+    )
 
 
 def _within(point: Point, hole: Hole) -> bool:
@@ -109,7 +126,10 @@ def _passes(before: Point, now: Point, hole: Hole, inward: bool) -> bool:
     """Say whether the way from `before` to `now` crosses the hole's plane inside the opening."""
     cosine, sine = hole.slope
     x, _, z = hole.centre
-    start, end = sine * (before[0] - x) + cosine * (before[2] - z), sine * (now[0] - x) + cosine * (now[2] - z)
+    start, end = (
+        sine * (before[0] - x) + cosine * (before[2] - z),
+        sine * (now[0] - x) + cosine * (now[2] - z),
+    )
     if not (start > 0.0 >= end if inward else start <= 0.0 < end):
         return False
     share = start / (start - end)

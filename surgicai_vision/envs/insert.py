@@ -23,7 +23,9 @@ class Insert(Subtask):
     """Bring the needle's 100° point 2 mm beyond the exit: 5 mm, 10°, through both holes (paper)."""
 
     name = "insert"
-    tolerances = MappingProxyType({"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(1.0, 5.0)})
+    tolerances = MappingProxyType(
+        {"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(1.0, 5.0)}
+    )
     demands = MappingProxyType({"paper": Demands(holes=2), "released": Demands()})
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
@@ -40,7 +42,9 @@ class Insert(Subtask):
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at 100° and where it ends."""
-        return poses.compose(simulation.needle(), needle_frame_flat(INSERT_ANGLE, stitch.radius)), stitch.insert_point
+        return poses.compose(
+            simulation.needle(), needle_frame_flat(INSERT_ANGLE, stitch.radius)
+        ), stitch.insert_point
 
 
 def draw_in_ball(rng: np.random.Generator, radius: float) -> np.ndarray:

@@ -1,17 +1,24 @@
 """Observation: what a policy may see, chosen by one argument.
 
-`state`             (21,) float32: tip now (7), tip that would meet the goal (7), error (7); each 7 is x y z [cm],
-                    roll pitch yaw [rad], jaw [rad] in the active arm's base (released code's layout). The error's
-                    rotation is the rotation vector from now to the goal, so it never wraps.
-`goal`              Dict for hindsight relabelling: `observation` (7), `achieved_goal` (8), `desired_goal` (8): the
-                    measured frame that success is judged by and its goal, in world, x y z [m], rotation vector, jaw,
-                    and 1 where what success needs besides the pose holds (contact, holes passed, needle out), else 0.
-`pixels`            Dict with `pixels`: view → (height, width, 3) uint8 RGB; with depth=True `depth`: view →
-                    (height, width, 1) float32 [m]; with segmentation=True `segmentation`: view → (…, 1) uint8.
-`pixels_agent_pos`  the same and `agent_pos` (7,) float32: x y z [m], roll pitch yaw [rad], jaw [rad] of the active
+`state`             (21,) float32: tip now (7), tip that would meet the goal (7), error (7); each 7
+is x y z [cm],
+                    roll pitch yaw [rad], jaw [rad] in the active arm's base (released code's
+                    layout). The error's rotation is the rotation vector from now to the goal, so it
+                    never wraps.
+`goal`              Dict for hindsight relabelling: `observation` (7), `achieved_goal` (8),
+`desired_goal` (8): the
+                    measured frame that success is judged by and its goal, in world, x y z [m],
+                    rotation vector, jaw, and 1 where what success needs besides the pose holds
+                    (contact, holes passed, needle out), else 0.
+`pixels`            Dict with `pixels`: view → (height, width, 3) uint8 RGB; with depth=True
+`depth`: view →
+                    (height, width, 1) float32 [m]; with segmentation=True `segmentation`: view →
+                    (…, 1) uint8.
+`pixels_agent_pos`  the same and `agent_pos` (7,) float32: x y z [m], roll pitch yaw [rad], jaw
+[rad] of the active
                     arm's measured tip in its own base, as a dVRK reports it.
 
-Pictures and proprioception are all that vision types hold: no goal, no needle pose.
+Images and proprioception are all that vision types hold: no goal, no needle pose.
 """
 
 import struct
@@ -44,9 +51,9 @@ class ObservationConfig:
     Attributes:
         obs_type: one of `names.OBS_TYPES`.
         cameras: views, in order.
-        image_size: height and width of a picture.
-        depth: add depth pictures.
-        segmentation: add segmentation pictures.
+        image_size: height and width of an image.
+        depth: add depth images.
+        segmentation: add segmentation images.
     """
 
     obs_type: str = "state"
@@ -64,11 +71,13 @@ class ObservationConfig:
         if self.visual and not self.cameras:
             raise InputError(f"cameras is empty; allowed: {', '.join(names.CAMERAS)}.")
         if min(self.image_size) < 16 or self.image_size[0] > 960 or self.image_size[1] > 1280:
-            raise InputError(f"image_size is {self.image_size}; allowed: 16 × 16 to 960 × 1280 (height × width).")
+            raise InputError(
+                f"image_size is {self.image_size}; allowed: 16 × 16 to 960 × 1280 (height × width)."
+            )
 
     @property
     def visual(self) -> bool:
-        """Say whether it holds pictures."""
+        """Say whether it holds images."""
         return self.obs_type in ("pixels", "pixels_agent_pos")
 
     def space(self) -> spaces.Space:
@@ -76,9 +85,13 @@ class ObservationConfig:
         if self.obs_type == "state":
             return _box(21)
         if self.obs_type == "goal":
-            return spaces.Dict({"observation": _box(7), "achieved_goal": _box(8), "desired_goal": _box(8)})
+            return spaces.Dict(
+                {"observation": _box(7), "achieved_goal": _box(8), "desired_goal": _box(8)}
+            )
         height, width = self.image_size
-        groups: dict[str, spaces.Space] = {"pixels": self._views(spaces.Box(0, 255, (height, width, 3), np.uint8))}
+        groups: dict[str, spaces.Space] = {
+            "pixels": self._views(spaces.Box(0, 255, (height, width, 3), np.uint8))
+        }
         if self.depth:
             groups["depth"] = self._views(spaces.Box(0.0, np.inf, (height, width, 1), np.float32))
         if self.segmentation:
@@ -99,7 +112,8 @@ def _box(size: int) -> spaces.Box:
 def seven(arm: str, pose: Pose, jaw: float, scale: float = 1.0) -> list[float]:
     """Return x y z (times `scale`), roll pitch yaw, jaw of a tip pose in the arm's base.
 
-    Roll is in (-2π, 0] as in the released code; yaw is unwrapped about the arm's start, half a turn either way.
+    Roll is in (-2π, 0] as in the released code; yaw is unwrapped about the arm's start, half a turn
+    either way.
     """
     roll, pitch, yaw = matrix_to_rpy_flat(pose[3:])
     home = STARTS[arm][5]
@@ -113,7 +127,9 @@ def state_vector(arm: str, now: Pose, goal: Pose, jaw: float) -> np.ndarray:
     r = now[3:]
     turn = multiply_flat(goal[3:], (r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
     error = [b - a for a, b in zip(current[:3], wanted[:3], strict=True)]
-    return np.array([*current, *wanted, *error, *matrix_to_rotvec_flat(turn), -jaw], dtype=np.float32)
+    return np.array(
+        [*current, *wanted, *error, *matrix_to_rotvec_flat(turn), -jaw], dtype=np.float32
+    )
 
 
 def state_vector_in_world(
@@ -124,7 +140,8 @@ def state_vector_in_world(
     Args:
         arm: the active arm.
         base: T_world_base.
-        tip: T_world_tip; the goal is where the tip is when `achieved`, moving with it, is at `desired`.
+        tip: T_world_tip; the goal is where the tip is when `achieved`, moving with it, is at
+            `desired`.
         achieved: the frame that success is judged by.
         desired: where it should be.
         jaw: [rad].
@@ -133,20 +150,42 @@ def state_vector_in_world(
     tx, ty, tz, r0, r1, r2, r3, r4, r5, r6, r7, r8 = tip
     ax, ay, az, a0, a1, a2, a3, a4, a5, a6, a7, a8 = achieved
     gx, gy, gz, g0, g1, g2, g3, g4, g5, g6, g7, g8 = desired
-    # The turn from achieved to desired, the tip in the base, the way to the goal in world and in the base.
-    d0, d1, d2 = g0 * a0 + g1 * a1 + g2 * a2, g0 * a3 + g1 * a4 + g2 * a5, g0 * a6 + g1 * a7 + g2 * a8
-    d3, d4, d5 = g3 * a0 + g4 * a1 + g5 * a2, g3 * a3 + g4 * a4 + g5 * a5, g3 * a6 + g4 * a7 + g5 * a8
-    d6, d7, d8 = g6 * a0 + g7 * a1 + g8 * a2, g6 * a3 + g7 * a4 + g8 * a5, g6 * a6 + g7 * a7 + g8 * a8
+    # The turn from achieved to desired, the tip in the base, the way to the goal in world and in
+    # the base.
+    d0, d1, d2 = (
+        g0 * a0 + g1 * a1 + g2 * a2,
+        g0 * a3 + g1 * a4 + g2 * a5,
+        g0 * a6 + g1 * a7 + g2 * a8,
+    )
+    d3, d4, d5 = (
+        g3 * a0 + g4 * a1 + g5 * a2,
+        g3 * a3 + g4 * a4 + g5 * a5,
+        g3 * a6 + g4 * a7 + g5 * a8,
+    )
+    d6, d7, d8 = (
+        g6 * a0 + g7 * a1 + g8 * a2,
+        g6 * a3 + g7 * a4 + g8 * a5,
+        g6 * a6 + g7 * a7 + g8 * a8,
+    )
     x, y, z = tx - bx, ty - by, tz - bz
     px, py, pz = b0 * x + b3 * y + b6 * z, b1 * x + b4 * y + b7 * z, b2 * x + b5 * y + b8 * z
     x, y, z = tx - ax, ty - ay, tz - az
     ex = gx + d0 * x + d1 * y + d2 * z - tx
     ey = gy + d3 * x + d4 * y + d5 * z - ty
     ez = gz + d6 * x + d7 * y + d8 * z - tz
-    ex, ey, ez = b0 * ex + b3 * ey + b6 * ez, b1 * ex + b4 * ey + b7 * ez, b2 * ex + b5 * ey + b8 * ez
+    ex, ey, ez = (
+        b0 * ex + b3 * ey + b6 * ez,
+        b1 * ex + b4 * ey + b7 * ez,
+        b2 * ex + b5 * ey + b8 * ez,
+    )
     vx, vy, vz = matrix_to_rotvec_flat((d0, d1, d2, d3, d4, d5, d6, d7, d8))
-    # Of both rotations in the base, what roll, pitch and yaw need: the first column and the end of the last row.
-    cx, cy, cz = b0 * r0 + b3 * r3 + b6 * r6, b1 * r0 + b4 * r3 + b7 * r6, b2 * r0 + b5 * r3 + b8 * r6
+    # Of both rotations in the base, what roll, pitch and yaw need: the first column and the end of
+    # the last row.
+    cx, cy, cz = (
+        b0 * r0 + b3 * r3 + b6 * r6,
+        b1 * r0 + b4 * r3 + b7 * r6,
+        b2 * r0 + b5 * r3 + b8 * r6,
+    )
     x, y, z = d0 * r0 + d1 * r3 + d2 * r6, d3 * r0 + d4 * r3 + d5 * r6, d6 * r0 + d7 * r3 + d8 * r6
     fx, fy, fz = b0 * x + b3 * y + b6 * z, b1 * x + b4 * y + b7 * z, b2 * x + b5 * y + b8 * z
     x, y, z = b2 * d0 + b5 * d3 + b8 * d6, b2 * d1 + b5 * d4 + b8 * d7, b2 * d2 + b5 * d5 + b8 * d8
@@ -177,15 +216,26 @@ def _roll(sine: float, cosine: float) -> float:
 
 
 def goal_vector(pose: Pose, jaw: float, met: bool) -> np.ndarray:
-    """Return x y z [m], rotation vector [rad], jaw [rad] of a pose in world, and whether demands are met, (8,)."""
-    return np.array([*pose[:3], *matrix_to_rotvec_flat(pose[3:]), jaw, float(met)], dtype=np.float32)
+    """Return x y z [m], rotation vector [rad], jaw [rad] of a pose in world, and whether demands
+    are met, (8,).
+    """
+    return np.array(
+        [*pose[:3], *matrix_to_rotvec_flat(pose[3:]), jaw, float(met)], dtype=np.float32
+    )
 
 
 def goal_errors(achieved: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance [m] and geodesic angle [rad] between goal vectors of shape (8,) or (batch, 8)."""
+    """Return distance [m] and geodesic angle [rad] between goal vectors of shape (8,) or (batch,
+    8).
+    """
     from scipy.spatial.transform import Rotation
 
-    one, other = np.atleast_2d(achieved).astype(np.float64), np.atleast_2d(desired).astype(np.float64)
+    one, other = (
+        np.atleast_2d(achieved).astype(np.float64),
+        np.atleast_2d(desired).astype(np.float64),
+    )
     distance = np.linalg.norm(one[:, :3] - other[:, :3], axis=1)
-    turn = (Rotation.from_rotvec(other[:, 3:6]) * Rotation.from_rotvec(one[:, 3:6]).inv()).magnitude()
+    turn = (
+        Rotation.from_rotvec(other[:, 3:6]) * Rotation.from_rotvec(one[:, 3:6]).inv()
+    ).magnitude()
     return (distance, turn) if np.ndim(achieved) > 1 else (distance[0], turn[0])

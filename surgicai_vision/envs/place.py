@@ -10,7 +10,13 @@ from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import Stitch, needle_frame_flat
 from surgicai_vision.envs.grasp import lying_needle
 from surgicai_vision.envs.simulation import Simulation
-from surgicai_vision.envs.starts import GRASP_ANGLES, SAFE_ANGLES, draw_grasp_error, grasp_pose, hold_needle
+from surgicai_vision.envs.starts import (
+    GRASP_ANGLES,
+    SAFE_ANGLES,
+    draw_grasp_error,
+    grasp_pose,
+    hold_needle,
+)
 from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.kinematics import Pose
@@ -19,7 +25,9 @@ GRASP_SHIFT, GRASP_TILT = 0.0015, math.radians(12.0)
 """How far PSM2's grasp may be off at the start of place and insert (paper)."""
 
 
-def draw_psm2_grasp(rng: np.random.Generator, needle_pose: np.ndarray, stitch: Stitch) -> np.ndarray:
+def draw_psm2_grasp(
+    rng: np.random.Generator, needle_pose: np.ndarray, stitch: Stitch
+) -> np.ndarray:
     """Draw T_world_tip (4, 4) of PSM2's imperfect grasp of a needle, within the angles that work.
 
     Args:
@@ -33,10 +41,14 @@ def draw_psm2_grasp(rng: np.random.Generator, needle_pose: np.ndarray, stitch: S
 
 
 class Place(Subtask):
-    """Put the needle's tip into the entry: 5 mm and 10° of the needle's whole orientation (paper)."""
+    """Put the needle's tip into the entry: 5 mm and 10° of the needle's whole orientation
+    (paper).
+    """
 
     name, through = "place", False
-    tolerances = MappingProxyType({"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(5.0, 10.0)})
+    tolerances = MappingProxyType(
+        {"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(5.0, 10.0)}
+    )
     demands = MappingProxyType({"paper": Demands(), "released": Demands()})
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
@@ -46,4 +58,6 @@ class Place(Subtask):
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at its tip and that frame in the entry."""
-        return poses.compose(simulation.needle(), needle_frame_flat(needle.TIP_ANGLE, stitch.radius)), stitch.place_tip
+        return poses.compose(
+            simulation.needle(), needle_frame_flat(needle.TIP_ANGLE, stitch.radius)
+        ), stitch.place_tip

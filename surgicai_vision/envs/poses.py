@@ -1,4 +1,6 @@
-"""Poses in plain floats: composition and inversion of the twelve-float poses of `scene.kinematics`."""
+"""Poses in plain floats: composition and inversion of the twelve-float poses of
+`scene.kinematics`.
+"""
 
 from math import sqrt
 

@@ -25,7 +25,9 @@ class Pullout(Subtask):
     """Bring the needle's 105° point to the end point: 5 mm, 20°, wholly out (paper)."""
 
     name = "pullout"
-    tolerances = MappingProxyType({"paper": Tolerance.of(5.0, 20.0), "released": Tolerance.of(5.0, 5.0)})
+    tolerances = MappingProxyType(
+        {"paper": Tolerance.of(5.0, 20.0), "released": Tolerance.of(5.0, 5.0)}
+    )
     demands = MappingProxyType({"paper": Demands(out=True), "released": Demands()})
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:

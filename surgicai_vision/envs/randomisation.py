@@ -1,8 +1,9 @@
-"""Randomisation: what differs from episode to episode besides the start, by `config.RandomisationConfig`.
+"""Randomisation: what differs from episode to episode besides the start, by
+`config.RandomisationConfig`.
 
-`draw` gives one episode's numbers, `apply` writes them into an env's own copy of the model. The numbers are part of
-the whole state, so a restored state looks and moves as it did. All axes are drawn whichever are on: turning one on
-leaves the others as they were.
+`draw` gives one episode's numbers, `apply` writes them into an env's own copy of the model. The
+numbers are part of the whole state, so a restored state looks and moves as it did. All axes are
+drawn whichever are on: turning one on leaves the others as they were.
 """
 
 import dataclasses
@@ -19,7 +20,11 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig
 from surgicai_vision.scene import Scene, needle
 from surgicai_vision.scene.holes import Hole, HolePair
-from surgicai_vision.scene.rotations import matrix_to_quaternion, quaternion_to_matrix, rotvec_to_matrix
+from surgicai_vision.scene.rotations import (
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+    rotvec_to_matrix,
+)
 
 Array = NDArray[np.float64]
 Draws = tuple[float, ...]
@@ -30,7 +35,9 @@ RIGS = (
     ("wrist_psm1",),
     ("wrist_psm2",),
 )
-"""Cameras that move as one, about the first; those that follow the jaws are shifted with them, and see them still."""
+"""Cameras that move as one, about the first; those that follow the jaws are shifted with them, and
+see them still.
+"""
 TISSUE, SURROUNDINGS = ("tissue", "flesh"), ("drape", "tray")
 """Materials of one tint."""
 JOINT_ERROR = (math.radians(5.0), math.radians(5.0), 0.005)
@@ -50,11 +57,15 @@ UNITS = MappingProxyType(
         "needle_size": (1.0,),
     }
 )
-"""Axis → what a magnitude of 1 is in each of its numbers (fractions, m, rad; the field of view in degrees)."""
+"""Axis → what a magnitude of 1 is in each of its numbers (fractions, m, rad; the field of view in
+degrees).
+"""
 DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0")
 """What MuJoCo derives from masses and places."""
 _EDGES = tuple(accumulate((len(unit) for unit in UNITS.values()), initial=0))
-_PLACES = {axis: slice(start, end) for axis, (start, end) in zip(UNITS, pairwise(_EDGES), strict=True)}
+_PLACES = {
+    axis: slice(start, end) for axis, (start, end) in zip(UNITS, pairwise(_EDGES), strict=True)
+}
 SIZE = _EDGES[-1]
 """Numbers of one episode."""
 NOTHING: Draws = (0.0,) * SIZE
@@ -70,7 +81,9 @@ def draw(config: RandomisationConfig, rng: np.random.Generator) -> Draws:
 
 def report(config: RandomisationConfig, draws: Draws) -> dict[str, Any]:
     """Return axis → drawn numbers of the axes that are on, for `info["randomisation"]`."""
-    drawn: dict[str, Any] = {axis: np.array(draws[_PLACES[axis]]) for axis in config.on if axis in UNITS}
+    drawn: dict[str, Any] = {
+        axis: np.array(draws[_PLACES[axis]]) for axis in config.on if axis in UNITS
+    }
     return drawn | ({"latency": config.latency} if config.latency else {})
 
 
@@ -79,7 +92,10 @@ def joint_offsets(draws: Draws) -> dict[str, Draws]:
     values = draws[_PLACES["kinematic_error"]]
     if not any(values):
         return {}
-    return {arm: (*values[3 * index : 3 * index + 3], 0.0, 0.0, 0.0) for index, arm in enumerate(names.ARMS)}
+    return {
+        arm: (*values[3 * index : 3 * index + 3], 0.0, 0.0, 0.0)
+        for index, arm in enumerate(names.ARMS)
+    }
 
 
 def needle_radius(draws: Draws) -> float:
@@ -92,7 +108,9 @@ def shifted(pair: HolePair, draws: Draws) -> HolePair:
     x, y = draws[_PLACES["phantom_shift"]]
 
     def moved(hole: Hole) -> Hole:
-        return dataclasses.replace(hole, centre=(hole.centre[0] + x, hole.centre[1] + y, hole.centre[2]))
+        return dataclasses.replace(
+            hole, centre=(hole.centre[0] + x, hole.centre[1] + y, hole.centre[2])
+        )
 
     return HolePair(moved(pair.entry), moved(pair.exit))
 
@@ -105,7 +123,9 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
     shifts, turns = numbers["camera_shift"].reshape(-1, 3), numbers["camera_turn"].reshape(-1, 3)
     for cameras, shift, turn, fovy in zip(RIGS, shifts, turns, numbers["camera_fovy"], strict=True):
         _aim(source, model, cameras, shift, turn, fovy)
-    size, thickness = (1.0 + float(numbers[axis][0]) for axis in ("needle_size", "needle_thickness"))
+    size, thickness = (
+        1.0 + float(numbers[axis][0]) for axis in ("needle_size", "needle_thickness")
+    )
     _shape_needle(source, model, scene.needle_geoms, size, thickness)
     model.geom_friction[:] = source.geom_friction * (1.0 + float(numbers["friction"][0]))
     phantom = source.body("phantom").id
@@ -128,9 +148,15 @@ def _tint(source: mujoco.MjModel, model: mujoco.MjModel, factors: Array) -> None
 
 
 def _aim(
-    source: mujoco.MjModel, model: mujoco.MjModel, cameras: tuple[str, ...], shift: Array, turn: Array, fovy: float
+    source: mujoco.MjModel,
+    model: mujoco.MjModel,
+    cameras: tuple[str, ...],
+    shift: Array,
+    turn: Array,
+    fovy: float,
 ) -> None:
-    """Shift a rig [m], turn it about its first camera [rad], both in its carrier's axes; widen its view [deg].
+    """Shift a rig [m], turn it about its first camera [rad], both in its carrier's axes; widen its
+    view [deg].
 
     Where a rig's first camera sees so much more, the others see more by the same factor.
     """
@@ -139,12 +165,18 @@ def _aim(
     for name in cameras:
         index = source.camera(name).id
         model.cam_pos[index] = pivot + rotation @ (source.cam_pos[index] - pivot) + shift
-        model.cam_quat[index] = matrix_to_quaternion(rotation @ quaternion_to_matrix(source.cam_quat[index]))
+        model.cam_quat[index] = matrix_to_quaternion(
+            rotation @ quaternion_to_matrix(source.cam_quat[index])
+        )
         model.cam_fovy[index] = source.cam_fovy[index] * (1.0 + fovy / source.cam_fovy[first])
 
 
-def _shape_needle(source: mujoco.MjModel, model: mujoco.MjModel, geoms: range, size: float, thickness: float) -> None:
-    """Scale the needle's arc and its thickness: what collides, the bounds that find collisions, and what is drawn."""
+def _shape_needle(
+    source: mujoco.MjModel, model: mujoco.MjModel, geoms: range, size: float, thickness: float
+) -> None:
+    """Scale the needle's arc and its thickness: what collides, the bounds that find collisions, and
+    what is drawn.
+    """
     of, body = slice(geoms.start, geoms.stop), source.body("needle").id
     radius, half = source.geom_size[of, 0] * thickness, source.geom_size[of, 1] * size
     model.geom_size[of, 0], model.geom_size[of, 1] = radius, half
@@ -161,12 +193,17 @@ def _shape_needle(source: mujoco.MjModel, model: mujoco.MjModel, geoms: range, s
     turn, origin = quaternion_to_matrix(source.mesh_quat[mesh]), source.mesh_pos[mesh]
     points = source.mesh_vert[of] @ turn.T + origin
     angles = np.clip(np.arctan2(points[:, 1], -points[:, 0]), 0.0, needle.TIP_ANGLE)
-    line = np.stack([-needle.RADIUS * np.cos(angles), needle.RADIUS * np.sin(angles), np.zeros_like(angles)], axis=1)
+    line = np.stack(
+        [-needle.RADIUS * np.cos(angles), needle.RADIUS * np.sin(angles), np.zeros_like(angles)],
+        axis=1,
+    )
     model.mesh_vert[of] = (line * size + (points - line) * thickness - origin) @ turn
 
 
 def _weigh_needle(source: mujoco.MjModel, model: mujoco.MjModel, body: int, size: float) -> None:
-    """Scale mass and inertia with the arc's length, move what is fixed to it, and derive MuJoCo's constants anew."""
+    """Scale mass and inertia with the arc's length, move what is fixed to it, and derive MuJoCo's
+    constants anew.
+    """
     model.body_mass[body] = source.body_mass[body] * size
     model.body_inertia[body] = source.body_inertia[body] * size**3
     model.body_ipos[body] = source.body_ipos[body] * size
@@ -180,4 +217,7 @@ def _weigh_needle(source: mujoco.MjModel, model: mujoco.MjModel, body: int, size
         return
     extent, centre = source.stat.extent, source.stat.center.copy()
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    model.stat.extent, model.stat.center[:] = extent, centre  # they place the cameras' near and far planes
+    model.stat.extent, model.stat.center[:] = (
+        extent,
+        centre,
+    )  # they place the cameras' near and far planes

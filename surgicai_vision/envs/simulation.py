@@ -1,15 +1,18 @@
-"""Simulation: one scene in motion. Physics, commands of both arms, measured poses and contacts, the whole state.
+"""Simulation: one scene in motion. Physics, commands of both arms, measured poses and contacts, the
+whole state.
 
 Interface:
     Simulation(scene)                     owns a MjData
     .advance(arm, action) -> bool         one control step; False when the physics diverged
-    .tip(arm) .grasp(arm) .needle()       measured poses in world, twelve floats (`scene.kinematics.Pose`)
-    .touching(arm) -> (bool, bool)        does the left, the right jaw pad touch the needle
-    .get_state() / .set_state(vector)     everything: MuJoCo's integration state and `memory`
+    .tip(arm) .grasp(arm) .needle()       measured poses in world, twelve floats
+    (`scene.kinematics.Pose`) .touching(arm) -> (bool, bool)        does the left, the right jaw pad
+    touch the needle .get_state() / .set_state(vector)     everything: MuJoCo's integration state
+    and `memory`
 
-A control step is ten physics steps of 2 ms, cut so that it *ends* with MuJoCo's position and velocity stages
-(`mj_step1`): measured poses, contacts and pictures belong to the state they are read with, and a restored state
-gives the same ones, bit for bit. MuJoCo resets itself on divergence; the clock shows it.
+A control step is ten physics steps of 2 ms, cut so that it *ends* with MuJoCo's position and
+velocity stages (`mj_step1`): measured poses, contacts and images belong to the state they are read
+with, and a restored state gives the same ones, bit for bit. MuJoCo resets itself on divergence; the
+clock shows it.
 """
 
 import copy
@@ -36,12 +39,16 @@ from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
 SUBSTEPS = 10
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 CLOCK_START = 1.0
-"""Time at the start of an episode [s]: not 0, so that MuJoCo's own reset to 0 shows in the first step too."""
+"""Time at the start of an episode [s]: not 0, so that MuJoCo's own reset to 0 shows in the first
+step too.
+"""
 _SET_SEVEN = struct.Struct("7d").pack_into
 _THREE, _NINE = struct.Struct("3d").unpack_from, struct.Struct("9d").unpack_from
 """One row of positions, of rotations, as floats: half the time of `array[row].tolist()`."""
 RELEASE_STEPS, RELEASE_JAW, RELEASE_SHIFT = 40, 0.1, 0.001
-"""How PSM2 lets go after the handoff: jaw opened by 0.1 rad a step to 0.5, then drawn back 1 mm a step."""
+"""How PSM2 lets go after the handoff: jaw opened by 0.1 rad a step to 0.5, then drawn back 1 mm a
+step.
+"""
 
 
 COMMAND_SIZE = 12 + 1 + 6
@@ -51,7 +58,9 @@ _DRAWS = _COMMANDS + COMMAND_SIZE * len(names.ARMS)
 _WELDS = _DRAWS + randomisation.SIZE
 _QUEUE = _WELDS + attach.SIZE
 USED = _QUEUE + 7 * LATENCY_LIMIT
-"""What the user data hold, in this order: memory, commands, an episode's randomisation, welds, waiting actions."""
+"""What the user data hold, in this order: memory, commands, an episode's randomisation, welds,
+waiting actions.
+"""
 
 
 class Simulation:
@@ -59,7 +68,8 @@ class Simulation:
 
     Args:
         scene: the compiled scene.
-        own_model: keep a copy of its model, to be randomised; scenes of grasp level "attach" always have one.
+        own_model: keep a copy of its model, to be randomised; scenes of grasp level "attach" always
+            have one.
         latency: control steps an action waits.
     """
 
@@ -76,7 +86,9 @@ class Simulation:
         self._own = own_model
         self._instrument = scene.config.instrument
         self._fingers = {arm: scene.arms[arm].finger_qpos for arm in names.ARMS}
-        self._servos = {arm: self._ctrl.itemsize * scene.arms[arm].actuators.start for arm in names.ARMS}
+        self._servos = {
+            arm: self._ctrl.itemsize * scene.arms[arm].actuators.start for arm in names.ARMS
+        }
         self.memory = Memory()
         self.commands: dict[str, Command] = {}
         self._read: dict[str, Pose] | None = None
@@ -87,7 +99,9 @@ class Simulation:
         self._pads = {arm: scene.arms[arm].pads for arm in names.ARMS}
         self._needle_geoms = (scene.needle_geoms.start, scene.needle_geoms.stop)
         self._control_time = SUBSTEPS * float(self.model.opt.timestep)
-        self._bodies = {arm: scene.arms[arm].tip_body for arm in names.ARMS} | {"needle": self._needle_id}
+        self._bodies = {arm: scene.arms[arm].tip_body for arm in names.ARMS} | {
+            "needle": self._needle_id
+        }
         self.reset()
 
     def reset(self) -> None:
@@ -110,7 +124,9 @@ class Simulation:
             InputError: the model is shared with other envs.
         """
         if not self._own:
-            raise InputError("The state is of a randomised episode; make the env with its randomisation.")
+            raise InputError(
+                "The state is of a randomised episode; make the env with its randomisation."
+            )
         randomisation.apply(self.scene, self.model, draws)
         self.draws, self.offsets = draws, randomisation.joint_offsets(draws)
         self.radius = randomisation.needle_radius(draws)
@@ -120,7 +136,7 @@ class Simulation:
         mujoco.mj_step1(self.model, self.data)
         self._read = None
 
-    # -- setting --------------------------------------------------------------------------------------------------
+    # -- setting -----------------------------------------------------------------------------------
 
     def pose_arm(self, arm: str, pose: Pose, jaw: float, measured_jaw: float | None = None) -> None:
         """Put an arm's joints at a true tip pose in its base, at rest, and command it to stay.
@@ -173,13 +189,13 @@ class Simulation:
         if self._welds:
             self._attach(self._welds)
 
-    # -- moving ---------------------------------------------------------------------------------------------------
+    # -- moving ------------------------------------------------------------------------------------
 
     def advance(self, arm: str, action: list[float], step: StepSize) -> bool:
         """Take one control step of 20 ms; return False on a physics error.
 
-        That is: MuJoCo diverged and reset itself, or somebody wrote a command that is not finite into `data.ctrl`,
-        in whose place MuJoCo would take zeros for all servos.
+        That is: MuJoCo diverged and reset itself, or somebody wrote a command that is not finite
+        into `data.ctrl`, in whose place MuJoCo would take zeros for all servos.
 
         Args:
             arm: the arm the action moves.
@@ -193,7 +209,9 @@ class Simulation:
         if not finite:
             for name, command in self.commands.items():
                 self.command(name, command)
-        self.command(arm, control.follow(self.commands[arm], action, step, self.bases[arm], self._instrument))
+        self.command(
+            arm, control.follow(self.commands[arm], action, step, self.bases[arm], self._instrument)
+        )
         if self.memory.release > 0:
             self._let_go()
         due = data.time + self._control_time
@@ -220,7 +238,9 @@ class Simulation:
         command = self.commands[arm]
         for index in range(self.latency):
             action = self.data.userdata[_QUEUE + 7 * index : _QUEUE + 7 * index + 7].tolist()
-            command = control.follow(command, action, step, self.bases[arm], self.scene.config.instrument)
+            command = control.follow(
+                command, action, step, self.bases[arm], self.scene.config.instrument
+            )
         return command
 
     def _attach(self, welds: Welds) -> None:
@@ -243,13 +263,17 @@ class Simulation:
         if jaw >= 0.5:
             back[:3] = [-command.pose[5], -command.pose[8], -command.pose[11]]
         step = StepSize(RELEASE_SHIFT, 0.0, 0.0)
-        moved = control.follow(command, back, step, self.bases[names.PSM2], self.scene.config.instrument)
+        moved = control.follow(
+            command, back, step, self.bases[names.PSM2], self.scene.config.instrument
+        )
         self.command(names.PSM2, moved._replace(jaw=jaw))
 
-    # -- measuring ------------------------------------------------------------------------------------------------
+    # -- measuring ---------------------------------------------------------------------------------
 
     def keep_reads(self) -> None:
-        """Read each pose only once from now on, until `forget_reads`: nothing may move in between."""
+        """Read each pose only once from now on, until `forget_reads`: nothing may move in
+        between.
+        """
         self._read = {}
 
     def forget_reads(self) -> None:
@@ -284,17 +308,23 @@ class Simulation:
         return read["needle"] if read is not None and "needle" in read else self._body("needle")
 
     def tip_in_base(self, arm: str) -> Pose:
-        """Return T_base_tip as the arm reports it: its kinematics do not know of an error of its joints."""
+        """Return T_base_tip as the arm reports it: its kinematics do not know of an error of its
+        joints.
+        """
         if not self.offsets:
             return self.to_base(arm, self.tip(arm))
         joints = tuple(self.data.qpos[self.scene.arms[arm].qpos].tolist())
-        return kinematics.forward_flat(self._without_error(arm, joints), self.scene.config.instrument)
+        return kinematics.forward_flat(
+            self._without_error(arm, joints), self.scene.config.instrument
+        )
 
     def true_pose(self, arm: str, command: Command) -> Pose:
         """Return where a command really brings the tip, in the arm's base."""
         if not self.offsets:
             return command.pose
-        return kinematics.forward_flat(self._with_error(arm, command.joints), self.scene.config.instrument)
+        return kinematics.forward_flat(
+            self._with_error(arm, command.joints), self.scene.config.instrument
+        )
 
     def _with_error(self, arm: str, joints: kinematics.Joints) -> kinematics.Joints:
         a, b, c, d, e, f = joints
@@ -314,14 +344,23 @@ class Simulation:
         """Return the needle's point at `angle` [rad] in world [m]."""
         x, y, z, r0, r1, _, r3, r4, _, r6, r7, _ = self.needle()
         along, across = -self.radius * math.cos(angle), self.radius * math.sin(angle)
-        return x + r0 * along + r1 * across, y + r3 * along + r4 * across, z + r6 * along + r7 * across
+        return (
+            x + r0 * along + r1 * across,
+            y + r3 * along + r4 * across,
+            z + r6 * along + r7 * across,
+        )
 
     def touching(self, arm: str) -> tuple[bool, bool]:
-        """Say whether the left and the right jaw pad touch the needle: the jaws' contact sensors."""
+        """Say whether the left and the right jaw pad touch the needle: the jaws' contact
+        sensors.
+        """
         left, right = self._pads[arm]
         first, last = self._needle_geoms
         found_left = found_right = False
-        for one, other in self.data.contact.geom.tolist():  # MuJoCo sorts a pair by type: capsules before boxes
+        for (
+            one,
+            other,
+        ) in self.data.contact.geom.tolist():  # MuJoCo sorts a pair by type: capsules before boxes
             if other == left:
                 found_left = found_left or first <= one < last
             elif other == right:
@@ -329,14 +368,18 @@ class Simulation:
         return found_left, found_right
 
     def holds(self, arm: str) -> bool:
-        """Say whether both jaw pads of an arm touch the needle, or, at grasp level "attach", it is attached."""
+        """Say whether both jaw pads of an arm touch the needle, or, at grasp level "attach", it is
+        attached.
+        """
         if self._welds:
             return self._welds.active(arm)
         left, right = self.touching(arm)
         return left and right
 
     def touches_phantom(self, *, needle: bool) -> bool:
-        """Say whether an instrument, or with `needle` the needle too, touches the phantom; the thread always may."""
+        """Say whether an instrument, or with `needle` the needle too, touches the phantom; the
+        thread always may.
+        """
         bodies = self.model.geom_bodyid[self.data.contact.geom]
         may = self.model.body_rootid[bodies] == self._needle_id  # the thread hangs on the needle
         if needle:
@@ -344,10 +387,12 @@ class Simulation:
         touching = (bodies == self._phantom_id).any(axis=1) & ~may.any(axis=1)
         return bool(touching.any())
 
-    # -- state ----------------------------------------------------------------------------------------------------
+    # -- state -------------------------------------------------------------------------------------
 
     def get_state(self) -> NDArray[np.float64]:
-        """Return everything as one vector: MuJoCo's integration state, commands and memory inside its user data."""
+        """Return everything as one vector: MuJoCo's integration state, commands and memory inside
+        its user data.
+        """
         values = [*self.memory.pack()]
         for arm in names.ARMS:
             values += [*self.commands[arm].pose, self.commands[arm].jaw, *self.commands[arm].joints]
@@ -362,12 +407,15 @@ class Simulation:
         """Restore a vector of `get_state`.
 
         Raises:
-            InputError: of another length, not finite, or of a randomised episode where this env has no randomisation.
+            InputError: of another length, not finite, or of a randomised episode where this env has
+                no randomisation.
         """
         vector = np.ascontiguousarray(state, dtype=np.float64)
         size = mujoco.mj_stateSize(self.model, STATE)
         if vector.shape != (size,):
-            raise InputError(f"The state has shape {vector.shape}; this scene's states have shape ({size},).")
+            raise InputError(
+                f"The state has shape {vector.shape}; this scene's states have shape ({size},)."
+            )
         if not np.isfinite(vector).all():
             raise InputError("The state holds numbers that are not finite.")
         mujoco.mj_setState(self.model, self.data, vector, STATE)
@@ -375,7 +423,10 @@ class Simulation:
         self.memory = Memory.unpack(values)
         for index, arm in enumerate(names.ARMS):
             start = _COMMANDS + COMMAND_SIZE * index
-            pose, joints = tuple(values[start : start + 12]), tuple(values[start + 13 : start + COMMAND_SIZE])
+            pose, joints = (
+                tuple(values[start : start + 12]),
+                tuple(values[start + 13 : start + COMMAND_SIZE]),
+            )
             self.commands[arm] = Command(pose, values[start + 12], joints)
         draws = tuple(values[_DRAWS:_WELDS])
         if draws != self.draws:

@@ -1,7 +1,8 @@
-"""Starts: put the needle into an arm's jaws by solving for the pose, not by playing the subtasks before.
+"""Starts: put the needle into an arm's jaws by solving for the pose, not by playing the subtasks
+before.
 
-The jaws are posed closed around the needle and the physics settles for `SETTLE` steps; a start that then is not
-a grasp, or that touches the phantom where it should not, is refused and drawn again.
+The jaws are posed closed around the needle and the physics settles for `SETTLE` steps; a start that
+then is not a grasp, or that touches the phantom where it should not, is refused and drawn again.
 """
 
 import math
@@ -23,13 +24,17 @@ Matrix = NDArray[np.float64]
 SETTLE = 60
 """Physics steps (2 ms) a start state settles."""
 REST_SPEED, REST_TURN = 0.010, 1.0
-"""A held needle faster than this [m/s, rad/s] is slipping out: one closing of the jaws in 150 does that."""
+"""A held needle faster than this [m/s, rad/s] is slipping out: one closing of the jaws in 150 does
+that.
+"""
 CLOSED_JAW = (needle.BODY_RADIUS - PAD_OFFSET) / GRASP_DEPTH
 """Finger angle [rad] at which the pads touch the needle."""
 GRASP_ANGLES = (math.radians(5.0), math.radians(20.0))
 """Needle angle of PSM2's grasp (released code, Approach)."""
 SAFE_ANGLES = (FIRST_GRASP, math.radians(27.0))
-"""Where a grasp off by its error still has the needle between the pads and passes the entry of `simple`."""
+"""Where a grasp off by its error still has the needle between the pads and passes the entry of
+`simple`.
+"""
 
 
 class GraspError(NamedTuple):
@@ -44,9 +49,11 @@ class GraspError(NamedTuple):
 
 
 def draw_grasp_error(rng: np.random.Generator, shift: float, angle: float) -> GraspError:
-    """Draw a grasp error: at most `shift` [m] along the needle and in depth, at most `angle` [rad] about two axes.
+    """Draw a grasp error: at most `shift` [m] along the needle and in depth, at most `angle` [rad]
+    about two axes.
 
-    The third rotation and the third translation do not exist: the jaws' flat pads take them away on closing.
+    The third rotation and the third translation do not exist: the jaws' flat pads take them away on
+    closing.
     """
     along = rng.uniform(-shift, shift)
     depth = rng.uniform(-0.6, 0.2) * math.sqrt(shift**2 - along**2)
@@ -55,12 +62,20 @@ def draw_grasp_error(rng: np.random.Generator, shift: float, angle: float) -> Gr
 
 
 def grasp_pose(
-    arm: str, needle_pose: Matrix, angle: float, error: GraspError | None = None, radius: float = needle.RADIUS
+    arm: str,
+    needle_pose: Matrix,
+    angle: float,
+    error: GraspError | None = None,
+    radius: float = needle.RADIUS,
 ) -> Matrix:
-    """Return T_world_tip (4, 4) of a grasp of the point at `angle` [rad] of an arc of `radius` [m], off by `error`."""
+    """Return T_world_tip (4, 4) of a grasp of the point at `angle` [rad] of an arc of `radius` [m],
+    off by `error`.
+    """
     if error is None:
         return needle_pose @ grasp_in_needle(arm, angle, radius=radius)
-    grasp = needle_pose @ grasp_in_needle(arm, angle + error.along / radius, GRASP_DEPTH - error.depth, radius)
+    grasp = needle_pose @ grasp_in_needle(
+        arm, angle + error.along / radius, GRASP_DEPTH - error.depth, radius
+    )
     pivot = np.eye(4)
     pivot[2, 3] = GRASP_DEPTH - error.depth
     turn = np.eye(4)
@@ -69,9 +84,14 @@ def grasp_pose(
 
 
 def hold_needle(
-    simulation: Simulation, arm: str, needle_pose: Matrix, tip: Matrix, turn: float = math.radians(8.0)
+    simulation: Simulation,
+    arm: str,
+    needle_pose: Matrix,
+    tip: Matrix,
+    turn: float = math.radians(8.0),
 ) -> bool:
-    """Pose the needle and `arm` around it, close, settle; say whether both pads hold it where it was put.
+    """Pose the needle and `arm` around it, close, settle; say whether both pads hold it where it
+    was put.
 
     Args:
         simulation: already reset.
@@ -96,7 +116,9 @@ def _at_rest(simulation: Simulation) -> bool:
     """Say whether the needle has stopped, not slipping out of the jaws."""
     first = simulation.model.joint("needle").dofadr[0]
     velocity = simulation.data.qvel[first : first + 6]
-    return bool(np.linalg.norm(velocity[:3]) < REST_SPEED and np.linalg.norm(velocity[3:]) < REST_TURN)
+    return bool(
+        np.linalg.norm(velocity[:3]) < REST_SPEED and np.linalg.norm(velocity[3:]) < REST_TURN
+    )
 
 
 def draw_rotation(rng: np.random.Generator, angle: float) -> Matrix:

@@ -1,7 +1,8 @@
 """Subtask: what one step of the procedure is. One file a subtask; this is what they share.
 
-A subtask says which arm moves, how an episode starts, which measured pose must meet which goal, and what else
-success needs. It keeps no state: everything an episode remembers is in the simulation's `Memory`.
+A subtask says which arm moves, how an episode starts, which measured pose must meet which goal, and
+what else success needs. It keeps no state: everything an episode remembers is in the simulation's
+`Memory`.
 """
 
 import math
@@ -36,7 +37,8 @@ class Demands:
 
     Attributes:
         contact: both jaw pads of the active arm touch the needle.
-        holes: 2 where the needle must be in both holes, passed in travel direction; 0 where it does not matter.
+        holes: 2 where the needle must be in both holes, passed in travel direction; 0 where it does
+            not matter.
         out: the needle must be wholly out of the tissue, after having passed both holes.
     """
 
@@ -65,7 +67,9 @@ class Subtask(ABC):
 
     @abstractmethod
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
-        """Put the simulation into a random start state; False where the draw is not physical (draw again)."""
+        """Put the simulation into a random start state; False where the draw is not physical (draw
+        again).
+        """
 
     @abstractmethod
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:

@@ -1,9 +1,9 @@
 """Suture: the whole procedure, all five subtasks in one episode.
 
-The present subtask's success must hold for `DWELL` control steps before the next one begins: the paper's
-tolerances are met before a subtask is finished (an insertion counts 5 mm before its goal), and the next one needs
-it finished. When the pull-out begins PSM2 lets go by itself, as in the released code. A high-level policy may choose
-another subtask by `begin`.
+The present subtask's success must hold for `DWELL` control steps before the next one begins: the
+paper's tolerances are met before a subtask is finished (an insertion counts 5 mm before its goal),
+and the next one needs it finished. When the pull-out begins PSM2 lets go by itself, as in the
+released code. A high-level policy may choose another subtask by `begin`.
 """
 
 from surgicai_vision.core.config import DWELL
@@ -34,7 +34,10 @@ class Suture(SuturingEnv):
 
     def _meets_demands(self) -> bool:
         """Say so of the last subtask alone: it is the one whose success is the whole's."""
-        return int(self.simulation.memory.phase) == len(self._subtasks) - 1 and super()._meets_demands()
+        return (
+            int(self.simulation.memory.phase) == len(self._subtasks) - 1
+            and super()._meets_demands()
+        )
 
     @property
     def dwell(self) -> int:
@@ -48,7 +51,9 @@ class Suture(SuturingEnv):
             phase: index in `names.SUBTASKS`; that of the present subtask changes nothing.
         """
         if not 0 <= phase < len(self._subtasks):
-            raise InputError(f"There is no subtask {phase}; allowed: 0 to {len(self._subtasks) - 1}.")
+            raise InputError(
+                f"There is no subtask {phase}; allowed: 0 to {len(self._subtasks) - 1}."
+            )
         if phase != self.phase:
             self._enter(phase)
 

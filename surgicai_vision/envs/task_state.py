@@ -1,6 +1,7 @@
 """Memory: what an episode must remember beyond the physics, so that one vector is its whole state.
 
-Fields are plain floats; `pack` and `unpack` turn them into the start of MuJoCo's user data and back.
+Fields are plain floats; `pack` and `unpack` turn them into the start of MuJoCo's user data and
+back.
 """
 
 from dataclasses import dataclass, fields
@@ -18,7 +19,8 @@ class Memory:
         phase: index of the present subtask in `names.SUBTASKS`.
         steps: control steps taken.
         tip_path: length of the active tip's way so far [m].
-        passed: hole planes passed by the tip in travel direction, 0..2; 3 when the base is out as well.
+        passed: hole planes passed by the tip in travel direction, 0..2; 3 when the base is out as
+            well.
         grasp_angle: needle angle of this episode's grasp goal [rad].
         held: 1 when `hold` is set.
         dwell: control steps the present subtask's success has held (whole procedure).
@@ -66,6 +68,10 @@ class Memory:
         record, start = cls(), 0
         for item in fields(cls):
             length = len(item.default) if isinstance(item.default, tuple) else 0
-            setattr(record, item.name, tuple(values[start : start + length]) if length else values[start])
+            setattr(
+                record,
+                item.name,
+                tuple(values[start : start + length]) if length else values[start],
+            )
             start += length or 1
         return record

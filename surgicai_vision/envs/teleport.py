@@ -1,7 +1,8 @@
 """Posing: put an env into a foreign state, for replaying motions that were recorded elsewhere.
 
-A replay is kinematic: tools and needle stand where the recording had them, at rest, and commands match. Pictures,
-observations and measurements are those of that state; nothing is claimed about the forces between.
+A replay is kinematic: tools and needle stand where the recording had them, at rest, and commands
+match. Images, observations and measurements are those of that state; nothing is claimed about the
+forces between.
 """
 
 import numpy as np
@@ -19,7 +20,10 @@ ArmPose = tuple[Matrix, float]
 
 
 def pose_scene(
-    env: SuturingEnv, psm1: ArmPose | None = None, psm2: ArmPose | None = None, T_world_needle: Matrix | None = None
+    env: SuturingEnv,
+    psm1: ArmPose | None = None,
+    psm2: ArmPose | None = None,
+    T_world_needle: Matrix | None = None,
 ) -> None:
     """Set a kinematic state: arms, needle, no velocity, commands to match.
 
@@ -36,7 +40,9 @@ def pose_scene(
     for arm, wanted in ((names.PSM1, psm1), (names.PSM2, psm2)):
         if wanted is not None:
             pose, jaw = wanted
-            simulation.pose_arm(arm, poses.flat(pose), float(np.clip(jaw, 0.0, 1.0)), max(jaw, CLOSED_JAW))
+            simulation.pose_arm(
+                arm, poses.flat(pose), float(np.clip(jaw, 0.0, 1.0)), max(jaw, CLOSED_JAW)
+            )
     if T_world_needle is not None:
         simulation.pose_needle(poses.flat(T_world_needle))
     simulation.data.qvel[:] = 0.0

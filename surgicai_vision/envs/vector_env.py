@@ -2,10 +2,11 @@
 
     gymnasium.make_vec("surgicai_vision/Insert-v0", 16, workers=2)
 
-gymnasium's own `async` mode gives each env a process and a message a step; in state mode the message costs as much
-as the step, so two workers are no faster than one. Here a worker steps its share of the envs by a `SyncVectorEnv`
-and answers once for all of them; observations come back through shared memory. Trajectories, infos and autoreset are
-those of `SyncVectorEnv`, whatever the number of workers: `benchmarks/speed.py --only workers` measures it.
+gymnasium's own `async` mode gives each env a process and a message a step; in state mode the
+message costs as much as the step, so two workers are no faster than one. Here a worker steps its
+share of the envs by a `SyncVectorEnv` and answers once for all of them; observations come back
+through shared memory. Trajectories, infos and autoreset are those of `SyncVectorEnv`, whatever the
+number of workers: `benchmarks/speed.py --only workers` measures it.
 """
 
 import contextlib
@@ -46,7 +47,9 @@ def make_vector(
         **arguments: what `envs.make_task` takes.
     """
     if num_envs < 1 or workers < 0:
-        raise InputError(f"num_envs is {num_envs}, workers is {workers}; allowed: at least 1, at least 0.")
+        raise InputError(
+            f"num_envs is {num_envs}, workers is {workers}; allowed: at least 1, at least 0."
+        )
     mode = AutoresetMode(autoreset_mode)
     if workers:
         return SuturingVectorEnv(num_envs, min(workers, num_envs), mode, arguments)
@@ -63,12 +66,20 @@ class SuturingVectorEnv(VectorEnv):
         self._workers: list[tuple[multiprocessing.process.BaseProcess, Connection]] = []
         self.num_envs = num_envs
         first = _make(arguments)
-        self.single_observation_space, self.single_action_space = first.observation_space, first.action_space
-        self.metadata, self.render_mode = dict(first.metadata) | {"autoreset_mode": mode}, first.render_mode
+        self.single_observation_space, self.single_action_space = (
+            first.observation_space,
+            first.action_space,
+        )
+        self.metadata, self.render_mode = (
+            dict(first.metadata) | {"autoreset_mode": mode},
+            first.render_mode,
+        )
         first.close()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        context = multiprocessing.get_context("spawn")  # a GL context must be made in the process that uses it
+        context = multiprocessing.get_context(
+            "spawn"
+        )  # a GL context must be made in the process that uses it
         self._memory = _reserve(self.observation_space, context)
         self._seen = _view(self.observation_space, self._memory)
         edges = [num_envs * index // workers for index in range(workers + 1)]
@@ -85,13 +96,17 @@ class SuturingVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Tree, dict[str, Any]]:
-        """Reset all envs, or those of `options["reset_mask"]`; an int seeds them seed, seed + 1, …"""
+        """Reset all envs, or those of `options["reset_mask"]`; an int seeds them seed, seed + 1,
+        …
+        """
         self._check_open()
         seeds = [None if seed is None else seed + index for index in range(self.num_envs)] if not isinstance(
             seed, list | tuple
         ) else list(seed)  # fmt: skip
         if len(seeds) != self.num_envs:
-            raise InputError(f"seed holds {len(seeds)} seeds; this vector env has {self.num_envs} envs.")
+            raise InputError(
+                f"seed holds {len(seeds)} seeds; this vector env has {self.num_envs} envs."
+            )
         mask = (options or {}).get("reset_mask")
         chosen = []
         for share in self._shares:
@@ -111,14 +126,24 @@ class SuturingVectorEnv(VectorEnv):
             )
         actions = np.asarray(actions)
         answers = self._ask_all("step", [(actions[share],) for share in self._shares])
-        rewards, terminated, truncated = (np.concatenate([answer[index] for answer in answers]) for index in range(3))
-        return deepcopy(self._seen), rewards, terminated, truncated, self._merge([answer[3] for answer in answers])
+        rewards, terminated, truncated = (
+            np.concatenate([answer[index] for answer in answers]) for index in range(3)
+        )
+        return (
+            deepcopy(self._seen),
+            rewards,
+            terminated,
+            truncated,
+            self._merge([answer[3] for answer in answers]),
+        )
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Return an attribute of each env, or what its method returns."""
         self._check_open()
         return tuple(
-            value for part in self._ask_all("call", [(name, args, kwargs)] * len(self._shares)) for value in part
+            value
+            for part in self._ask_all("call", [(name, args, kwargs)] * len(self._shares))
+            for value in part
         )
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -130,11 +155,13 @@ class SuturingVectorEnv(VectorEnv):
         self._check_open()
         rows = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
         if len(rows) != self.num_envs:
-            raise InputError(f"values holds {len(rows)} values; this vector env has {self.num_envs} envs.")
+            raise InputError(
+                f"values holds {len(rows)} values; this vector env has {self.num_envs} envs."
+            )
         self._ask_all("set_attr", [(name, rows[share]) for share in self._shares])
 
     def render(self) -> tuple[Any, ...]:
-        """Return each env's picture."""
+        """Return each env's image."""
         return self.call("render")
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -162,7 +189,9 @@ class SuturingVectorEnv(VectorEnv):
         except (EOFError, OSError) as error:
             codes = [process.exitcode for process, _ in self._workers]
             self.close()
-            raise SurgicaiError(f"A worker of the vector env died (exit codes {codes}); make a new one.") from error
+            raise SurgicaiError(
+                f"A worker of the vector env died (exit codes {codes}); make a new one."
+            ) from error
         for answer in answers:
             if isinstance(answer, _Failure):
                 self.close()
@@ -238,7 +267,7 @@ def _answer(vector: SyncVectorEnv, what: str, part: Any, seen: Tree, share: slic
     return None
 
 
-# -- trees of arrays --------------------------------------------------------------------------------------------------
+# -- trees of arrays -------------------------------------------------------------------------------
 
 
 def _reserve(space: spaces.Space, context: Any) -> Tree:

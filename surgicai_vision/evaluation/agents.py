@@ -1,4 +1,6 @@
-"""Agents: what acts in an evaluation. The expert, two baselines, and a policy with its frozen encoder."""
+"""Agents: what acts in an evaluation. The expert, two baselines, and a policy with its frozen
+encoder.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,7 +17,7 @@ from surgicai_vision.core.errors import UnreachablePose
 
 @final
 class ExpertAgent:
-    """The scripted expert: reads the env's state, needs no pictures."""
+    """The scripted expert: reads the env's state, needs no images."""
 
     name = "expert"
     cameras: tuple[str, ...] = ()
@@ -30,7 +32,9 @@ class ExpertAgent:
 
         self._experts[slot] = Expert(env)
 
-    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+    def act(
+        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
         """Return the experts' actions (n, 7); not a number where the expert knows no way on."""
         actions = np.full((len(slots), 7), np.nan, np.float32)
         for row, slot in enumerate(slots):
@@ -56,9 +60,13 @@ class RandomAgent:
         """Seed the slot's generator."""
         self._generators[slot] = np.random.default_rng(seed)
 
-    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+    def act(
+        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
         """Return actions (n, 7) in [-1, 1]."""
-        return np.stack([self._generators[slot].uniform(-1, 1, 7).astype(np.float32) for slot in slots])
+        return np.stack(
+            [self._generators[slot].uniform(-1, 1, 7).astype(np.float32) for slot in slots]
+        )
 
 
 @final
@@ -72,7 +80,9 @@ class ZeroAgent:
     def begin(self, slot: int, env: Any, seed: int) -> None:
         """Nothing to forget."""
 
-    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+    def act(
+        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
         """Return zeros (n, 7)."""
         return np.zeros((len(slots), 7), np.float32)
 
@@ -97,15 +107,20 @@ class ReplayAgent:
         """Start from the first action."""
         self._steps[slot] = 0
 
-    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+    def act(
+        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
         """Return the actions of the slots' steps (n, 7)."""
         steps = [min(self._steps[slot], len(self._actions) - 1) for slot in slots]
         self._steps.update({slot: self._steps[slot] + 1 for slot in slots})
         return self._actions[steps]
 
 
-def mean_demonstration(action: NDArray[np.float32], episode_index: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Return the mean action of each control step (T, 7) over the demonstrations that still run then.
+def mean_demonstration(
+    action: NDArray[np.float32], episode_index: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Return the mean action of each control step (T, 7) over the demonstrations that still run
+    then.
 
     Args:
         action: (N, 7) actions of all frames.
@@ -113,7 +128,9 @@ def mean_demonstration(action: NDArray[np.float32], episode_index: NDArray[np.in
     """
     episodes = [action[episode_index == episode] for episode in np.unique(episode_index)]
     longest = max(map(len, episodes))
-    steps = [np.mean([e[step] for e in episodes if len(e) > step], axis=0) for step in range(longest)]
+    steps = [
+        np.mean([e[step] for e in episodes if len(e) > step], axis=0) for step in range(longest)
+    ]
     return np.stack(steps).astype(np.float32)
 
 
@@ -137,12 +154,13 @@ Shared = dict[tuple[str, tuple[str, ...]], dict[int, NDArray[np.float32]]]
 
 @final
 class PolicyAgent:
-    """A trained policy; sees the pictures of its views and the measured pose of its tip, nothing else.
+    """A trained policy; sees the images of its views and the measured pose of its tip, nothing
+    else.
 
     Args:
         name: how tables call it.
         policy: has `act(features (B, F) or None, agent_pos (B, 7)) -> (B, 7)`.
-        encoder: frames (B, H, W, 3) → features (B, dim), or None for a policy without pictures.
+        encoder: frames (B, H, W, 3) → features (B, dim), or None for a policy without images.
         views: the policy's views, in the order of its features.
         image_size: height and width the policy was trained on [px].
         vector: what it is fed beside its features, a key of `VECTORS`.
@@ -166,7 +184,9 @@ class PolicyAgent:
         self._shared: Shared | None = None
 
     def share(self, features: "Shared") -> None:
-        """Look features up in a table that agents share, and put new ones there; its owner empties it each step."""
+        """Look features up in a table that agents share, and put new ones there; its owner empties
+        it each step.
+        """
         self._shared = features
 
     def begin(self, slot: int, env: Any, seed: int) -> None:
@@ -177,7 +197,9 @@ class PolicyAgent:
         """Start the slot's clock anew: its subtask begins."""
         self._ticks[slot] = 0
 
-    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+    def act(
+        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
         """Return the policy's actions (n, 7)."""
         ticks = [self._ticks[slot] for slot in slots]
         self._ticks.update({slot: tick + 1 for slot, tick in zip(slots, ticks, strict=True)})
@@ -196,11 +218,15 @@ class PolicyAgent:
         with one_thread():
             vectors = np.stack([self._vector(env) for env in envs])
             if self._clocked and ticks is not None:
-                vectors = np.concatenate([vectors, clock(np.array(ticks))], axis=1, dtype=np.float32)
+                vectors = np.concatenate(
+                    [vectors, clock(np.array(ticks))], axis=1, dtype=np.float32
+                )
             return np.asarray(self._policy.act(self._features(observations), vectors), np.float32)
 
     def _features(self, observations: Sequence[Any]) -> NDArray[np.float32] | None:
-        """Encode all views of all slots in one call, (n, views · dim): an encoder computes whole batches."""
+        """Encode all views of all slots in one call, (n, views · dim): an encoder computes whole
+        batches.
+        """
         if not self.cameras:
             return None
         if self._shared is None:
@@ -250,7 +276,9 @@ class NoisyAgent:
         """Share features: see `PolicyAgent.share`."""
         self._agent.share(features)
 
-    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+    def act(
+        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
         """Return the agent's actions (n, 7), their translations off by up to the noise."""
         actions = np.array(self._agent.act(slots, envs, observations), np.float32)
         for row, slot in enumerate(slots):

@@ -1,8 +1,10 @@
-"""Survival: how far episodes of a chain come, and how far they would with the expert in the place of one policy.
+"""Survival: how far episodes of a chain come, and how far they would with the expert in the place
+of one policy.
 
-`swapped(subject, …)` is a chain with the expert in for one subtask; `survival_curves` evaluates the chain as it is and
-with every subtask swapped in turn, on the same starts, one evaluation folder each, and writes `survival.parquet`: for
-every variant and subtask the episodes that finished it and all before it.
+`swapped(subject, …)` is a chain with the expert in for one subtask; `survival_curves` evaluates the
+chain as it is and with every subtask swapped in turn, on the same starts, one evaluation folder
+each, and writes `survival.parquet`: for every variant and subtask the episodes that finished it and
+all before it.
 """
 
 import dataclasses
@@ -27,7 +29,10 @@ EXPERT, ALL, AS_IT_IS = "expert", "all", "as-it-is"
 
 
 def swapped(
-    config: hierarchical.Chain, subtask: str | None, weights: str | None = None, accept_licence: bool = False
+    config: hierarchical.Chain,
+    subtask: str | None,
+    weights: str | None = None,
+    accept_licence: bool = False,
 ) -> Subject:
     """Return the subject of a chain with the expert in the place of one subtask's policy.
 
@@ -48,7 +53,9 @@ def swapped(
     make = functools.partial(_named, other.make_agent, plain.name)
     # With experts in every place a chain knows no scene; the task stays that of the chain as it is.
     about = {**other.about, "swap": subtask}
-    return dataclasses.replace(other, name=plain.name, config=plain.config, make_agent=make, about=about)
+    return dataclasses.replace(
+        other, name=plain.name, config=plain.config, make_agent=make, about=about
+    )
 
 
 def _named(make: MakeAgent, name: str) -> Agent:
@@ -59,7 +66,11 @@ def _named(make: MakeAgent, name: str) -> Agent:
 
 
 def survival_curves(
-    variants: dict[str, Subject], seeds: Sequence[int], out: Path, stage: Stage, workers: int | None = None
+    variants: dict[str, Subject],
+    seeds: Sequence[int],
+    out: Path,
+    stage: Stage,
+    workers: int | None = None,
 ) -> list[dict[str, Any]]:
     """Evaluate a chain as it is and swapped into `out`, and return the rows of `survival.parquet`.
 
@@ -88,7 +99,10 @@ def survival_curves(
         rows += _stages(str(subject.about["swap"] or ""), [row["stages"] for row in episodes])
     others = [name for name in variants if name != AS_IT_IS]
     p_values = [mcnemar(successes[AS_IT_IS], successes[name]) for name in others]
-    found = {name: (p, corrected) for name, p, corrected in zip(others, p_values, holm(p_values), strict=True)}
+    found = {
+        name: (p, corrected)
+        for name, p, corrected in zip(others, p_values, holm(p_values), strict=True)
+    }
     for row in rows:
         row["p"], row["p_holm"] = found.get(row["swap"], (None, None))
     files.write_bytes(out / CURVES, parquet_bytes(rows))
@@ -98,7 +112,9 @@ def survival_curves(
 def variants_of(
     config: hierarchical.Chain, weights: str | None = None, accept_licence: bool = False
 ) -> dict[str, Subject]:
-    """Return folder name → subject: the chain as it is, then each subtask that is not the expert's already swapped."""
+    """Return folder name → subject: the chain as it is, then each subtask that is not the expert's
+    already swapped.
+    """
     learned = [subtask for subtask in names.SUBTASKS if getattr(config, subtask) != EXPERT]
     swaps = {subtask: swapped(config, subtask, weights, accept_licence) for subtask in learned}
     return {AS_IT_IS: swapped(config, None, weights, accept_licence), **swaps}
@@ -110,7 +126,17 @@ def _stages(swap: str, stages: Sequence[int]) -> list[dict[str, Any]]:
     for index, subtask in enumerate(names.SUBTASKS):
         k, n = sum(stage > index for stage in stages), len(stages)
         low, high = clopper_pearson(k, n)
-        rows.append({"swap": swap, "stage": index + 1, "subtask": subtask, "k": k, "n": n, "low": low, "high": high})
+        rows.append(
+            {
+                "swap": swap,
+                "stage": index + 1,
+                "subtask": subtask,
+                "k": k,
+                "n": n,
+                "low": low,
+                "high": high,
+            }
+        )
     return rows
 
 

@@ -1,10 +1,13 @@
 """Chain: the whole procedure by a high-level policy and one low-level policy for each subtask.
 
-HLP → LLP → termination → HLP: the high-level policy says which subtask is due, that subtask's policy moves its arm
-until the subtask ends, and the high-level policy is asked again. A subtask ends
+HLP → LLP → termination → HLP: the high-level policy says which subtask is due, that subtask's
+policy moves its arm until the subtask ends, and the high-level policy is asked again. A subtask
+ends
 
-* `privileged`: when the env's measured success has held (a grasp's for `grasp_hold` steps), as in the released code;
-* `learned`: when the high-level policy itself names another subtask, `PATIENCE` observations in a row;
+* `privileged`: when the env's measured success has held (a grasp's for `grasp_hold` steps), as in
+  the released code;
+* `learned`: when the high-level policy itself names another subtask, `PATIENCE` observations in a
+  row;
 * in either case after `steps` control steps (paper: 200).
 
 After `decisions` decisions (paper: 50) both arms hold still.
@@ -12,8 +15,8 @@ After `decisions` decisions (paper: 50) both arms hold still.
 A chain is a YAML file, which `surgicai-vision evaluate chain.yaml` takes (docs/chain.md):
 
     hlp: outputs/train/suture-hlp-…   # a checkpoint, or `order`: the subtasks in their order
-    grasp: outputs/train/grasp-…      # a checkpoint of this subtask, LeRobot's too, or `expert`, `random`, `zero`
-    place: …                          # and so on for insert, handoff, pullout
+    grasp: outputs/train/grasp-…      # a checkpoint of this subtask, LeRobot's too, or `expert`,
+    `random`, `zero` place: …                          # and so on for insert, handoff, pullout
     termination: privileged
 """
 
@@ -36,7 +39,9 @@ from surgicai_vision.evaluation.policy_spec import Subject, checkpoint_subject, 
 ORDER = "order"
 GRASP = names.SUBTASKS.index("grasp")
 PATIENCE = 5
-"""Observations in a row that must name another subtask before a learned termination believes them (0.1 s)."""
+"""Observations in a row that must name another subtask before a learned termination believes them
+(0.1 s).
+"""
 TERMINATIONS = ("privileged", "learned")
 MAX_STEPS = 2000
 """Control steps of an episode: ten subtasks of full length."""
@@ -48,13 +53,15 @@ class Chain:
 
     Attributes:
         hlp: folder of the high-level policy's checkpoint, or "order".
-        grasp: folder of a checkpoint, or a baseline's name; likewise place, insert, handoff and pullout.
+        grasp: folder of a checkpoint, or a baseline's name; likewise place, insert, handoff and
+            pullout.
         termination: one of `TERMINATIONS`.
         steps: control steps a subtask may take.
         decisions: decisions an episode may take.
         max_steps: control steps an episode may take.
-        grasp_hold: control steps a grasp must hold before it ends as `privileged`, at most the env's own `DWELL`; a
-            policy that learned to search (`demos.searching`) lets go again sooner than that.
+        grasp_hold: control steps a grasp must hold before it ends as `privileged`, at most the
+            env's own `DWELL`; a policy that learned to search (`demos.searching`) lets go again
+            sooner than that.
     """
 
     hlp: str
@@ -77,7 +84,9 @@ class Chain:
         if not 1 <= self.grasp_hold <= DWELL:
             raise InputError(f"grasp_hold is {self.grasp_hold}; allowed: 1 to {DWELL}.")
         if self.hlp == ORDER and self.termination == "learned":
-            raise InputError("A learned termination needs a high-level policy; give hlp: a checkpoint folder.")
+            raise InputError(
+                "A learned termination needs a high-level policy; give hlp: a checkpoint folder."
+            )
 
     @property
     def low(self) -> tuple[str, ...]:
@@ -104,12 +113,16 @@ def subject(chain: Chain, weights: str | None = None, accept_licence: bool = Fal
         if policy not in BASELINES:
             configs[subtask] = _low_subject(policy, subtask, weights, accept_licence).config
             if configs[subtask].task != subtask:
-                raise InputError(f"{policy} was trained for '{configs[subtask].task}', not for '{subtask}'.")
+                raise InputError(
+                    f"{policy} was trained for '{configs[subtask].task}', not for '{subtask}'."
+                )
     about: dict[str, Any] = {"chain": to_mapping(chain)}
     if chain.hlp != ORDER:
         checkpoint = read_checkpoint(Path(chain.hlp))
         if checkpoint.policy != "hlp" or checkpoint.task.task != names.SUTURE:
-            raise InputError(f"{chain.hlp} is '{checkpoint.policy}' of '{checkpoint.task.task}'; hlp: takes an 'hlp'.")
+            raise InputError(
+                f"{chain.hlp} is '{checkpoint.policy}' of '{checkpoint.task.task}'; hlp: takes an 'hlp'."
+            )
         configs["hlp"] = checkpoint.task
     base = configs.values() or [TaskConfig()]
     made = [replace(config, task=names.SUTURE, max_steps=chain.max_steps) for config in base]
@@ -119,7 +132,9 @@ def subject(chain: Chain, weights: str | None = None, accept_licence: bool = Fal
         )
     about["views"] = list(_views(chain, weights, accept_licence))
     name = f"chain-{chain.termination}-{digest(chain)[:8]}"
-    return Subject(name, made[0], functools.partial(ChainAgent, name, chain, weights, accept_licence), about)
+    return Subject(
+        name, made[0], functools.partial(ChainAgent, name, chain, weights, accept_licence), about
+    )
 
 
 def _low_subject(policy: str, subtask: str, weights: str | None, accept_licence: bool) -> Subject:
@@ -162,11 +177,13 @@ class _Progress:
 class ChainAgent:
     """A high-level policy over low-level ones; see the module's docstring.
 
-    It asks the env for nothing but both arms' measured poses and, with a privileged termination, whether the present
-    subtask has ended; it tells it which subtask, and so which arm, is on.
+    It asks the env for nothing but both arms' measured poses and, with a privileged termination,
+    whether the present subtask has ended; it tells it which subtask, and so which arm, is on.
     """
 
-    def __init__(self, name: str, chain: Chain, weights: str | None = None, accept_licence: bool = False):
+    def __init__(
+        self, name: str, chain: Chain, weights: str | None = None, accept_licence: bool = False
+    ):
         self.name, self.chain = name, chain
         self.cameras = _views(chain, weights, accept_licence)
         self._low: list[Any] = [
@@ -175,12 +192,18 @@ class ChainAgent:
             else _low_subject(policy, subtask, weights, accept_licence).make_agent()
             for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True)
         ]
-        high = None if chain.hlp == ORDER else policy_agent(Path(chain.hlp), weights, accept_licence)
+        high = (
+            None if chain.hlp == ORDER else policy_agent(Path(chain.hlp), weights, accept_licence)
+        )
         self._high: Any = high
-        sizes = {agent.image_size for agent in (*self._low, self._high) if agent is not None and agent.cameras}
+        sizes = {
+            agent.image_size
+            for agent in (*self._low, self._high)
+            if agent is not None and agent.cameras
+        }
         if len(sizes) > 1:
             raise InputError(
-                f"The chain's policies see pictures of {sorted(sizes)} pixels; give policies of one size."
+                f"The chain's policies see images of {sorted(sizes)} pixels; give policies of one size."
             )
         self.image_size = sizes.pop() if sizes else 224
         self._slots: dict[int, _Progress] = {}
@@ -195,15 +218,23 @@ class ChainAgent:
         for agent in self._low:
             agent.begin(slot, env, seed)
 
-    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
-        """Return the actions (n, 7) of the subtasks that are on, decided anew where one has ended."""
+    def act(
+        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
+        """Return the actions (n, 7) of the subtasks that are on, decided anew where one has
+        ended.
+        """
         self._features.clear()
         states = [self._slots[slot] for slot in slots]
         with one_thread():
             self._decide(slots, states, envs, observations)
         actions = np.zeros((len(slots), len(names.ACTION_NAMES)), np.float32)
         for subtask, agent in enumerate(self._low):
-            rows = [row for row, state in enumerate(states) if state.subtask == subtask and self._may_act(state)]
+            rows = [
+                row
+                for row, state in enumerate(states)
+                if state.subtask == subtask and self._may_act(state)
+            ]
             if rows:
                 group = ([items[row] for row in rows] for items in (slots, envs, observations))
                 actions[rows] = agent.act(*group)
@@ -216,13 +247,21 @@ class ChainAgent:
         return state.decisions <= self.chain.decisions
 
     def _decide(
-        self, slots: Sequence[int], states: Sequence[_Progress], envs: Sequence[Any], observations: Sequence[Any]
+        self,
+        slots: Sequence[int],
+        states: Sequence[_Progress],
+        envs: Sequence[Any],
+        observations: Sequence[Any],
     ) -> None:
         """Ask the high-level policy wherever it is due, and begin what it says."""
         for state, env in zip(states, envs, strict=True):
             if self._has_grasped(state, env):
                 env.begin(GRASP + 1)
-        asked = [row for row, state in enumerate(states) if self._may_act(state) and self._is_asked(state, envs[row])]
+        asked = [
+            row
+            for row, state in enumerate(states)
+            if self._may_act(state) and self._is_asked(state, envs[row])
+        ]
         if not asked:
             return
         chosen = self._choose([envs[row] for row in asked], [observations[row] for row in asked])
@@ -242,14 +281,22 @@ class ChainAgent:
         return self.chain.termination == "learned" or env.phase != state.subtask
 
     def _has_grasped(self, state: _Progress, env: Any) -> bool:
-        """Say whether a grasp has held for as long as this chain asks, before the env itself goes on."""
+        """Say whether a grasp has held for as long as this chain asks, before the env itself goes
+        on.
+        """
         if self.chain.termination != "privileged" or not state.subtask == env.phase == GRASP:
             return False
         return bool(env.dwell >= self.chain.grasp_hold)
 
     def _believes(self, state: _Progress, env: Any, choice: int) -> bool:
-        """Say whether a choice is a decision: always but where a learned termination must wait for more."""
-        if state.subtask < 0 or state.steps >= self.chain.steps or self.chain.termination == "privileged":
+        """Say whether a choice is a decision: always but where a learned termination must wait for
+        more.
+        """
+        if (
+            state.subtask < 0
+            or state.steps >= self.chain.steps
+            or self.chain.termination == "privileged"
+        ):
             return True
         state.doubts = state.doubts + 1 if choice != state.subtask else 0
         return state.doubts >= PATIENCE

@@ -1,15 +1,16 @@
-"""LeRobot's policies in our evaluation: a checkpoint of `lerobot-train` becomes the subject of `evaluate`.
+"""LeRobot's policies in our evaluation: a checkpoint of `lerobot-train` becomes the subject of
+`evaluate`.
 
 Interface:
 
-* `find(folder) -> Path | None`: the folder with config.json and model.safetensors, looked for in a training's
-  output, in one of its checkpoints, or in `pretrained_model` itself.
+* `find(folder) -> Path | None`: the folder with config.json and model.safetensors, looked for in a
+  training's output, in one of its checkpoints, or in `pretrained_model` itself.
 * `subject(folder, task, weights) -> subjects.Subject`.
 
-The policy runs through LeRobot's own pipeline, as in `lerobot-eval`. So that a result depends neither on the
-batch nor on the processes, every slot has a policy of its own (sharing weights) with its own random numbers,
-drawn from the episode's seed; a policy that declares itself `memoryless` gets all slots in one batch. Importing
-LeRobot takes ten seconds and happens in the worker alone.
+The policy runs through LeRobot's own pipeline, as in `lerobot-eval`. So that a result depends
+neither on the batch nor on the processes, every slot has a policy of its own (sharing weights) with
+its own random numbers, drawn from the episode's seed; a policy that declares itself `memoryless`
+gets all slots in one batch. Importing LeRobot takes ten seconds and happens in the worker alone.
 """
 
 import contextlib
@@ -55,8 +56,8 @@ class Sight:
 
     Attributes:
         cameras: views.
-        image_size: height and width of their pictures [px].
-        encoder: encoder whose features it sees in place of pictures; None for pictures.
+        image_size: height and width of their images [px].
+        encoder: encoder whose features it sees in place of images; None for images.
         sha256: hash of that encoder's weights; empty where unknown.
     """
 
@@ -81,7 +82,10 @@ def subject(folder: Path, task: str | None = None, weights: str | None = None) -
     policy = _table(folder / CONFIG)
     training = _table(folder / TRAINING) if (folder / TRAINING).is_file() else {}
     config, sight = _circumstances(training, folder, task, policy)
-    encoder, views = sight.encoder or policy.get("encoder"), "+".join(sight.cameras) or "proprioception"
+    encoder, views = (
+        sight.encoder or policy.get("encoder"),
+        "+".join(sight.cameras) or "proprioception",
+    )
     name = "-".join(part for part in (policy["type"], encoder, views) if part)
     text = names.TASK_TEXTS[config.task]
     about = {
@@ -90,21 +94,34 @@ def subject(folder: Path, task: str | None = None, weights: str | None = None) -
         "views": list(sight.cameras),
         "encoder": encoder or "own",
     }
-    return Subject(name, config, functools.partial(LeRobotAgent, name, folder, sight, weights, text), about)
+    return Subject(
+        name, config, functools.partial(LeRobotAgent, name, folder, sight, weights, text), about
+    )
 
 
 def _circumstances(
     training: Mapping[str, Any], folder: Path, task: str | None, policy: Mapping[str, Any]
 ) -> tuple[TaskConfig, Sight]:
-    """Return the task the policy was trained for and what it sees, from its env, its dataset or `task`."""
+    """Return the task the policy was trained for and what it sees, from its env, its dataset or
+    `task`.
+    """
     env, root = training.get("env") or {}, (training.get("dataset") or {}).get("root")
     features: Mapping[str, Any] = {}
     if env.get("type") == ENV_TYPE:
-        fields = {field.name: env[field.name] for field in dataclasses.fields(TaskConfig) if field.name in env}
+        fields = {
+            field.name: env[field.name]
+            for field in dataclasses.fields(TaskConfig)
+            if field.name in env
+        }
         config = from_mapping(TaskConfig, fields, str(folder / TRAINING))
         if env.get("encoder"):
             views, sha256 = env["cameras"], env.get("encoder_sha256", "")
-            features = {"encoder": env["encoder"], "views": views, "weights_sha256": sha256, "size": env["image_size"]}
+            features = {
+                "encoder": env["encoder"],
+                "views": views,
+                "weights_sha256": sha256,
+                "size": env["image_size"],
+            }
     elif root and (Path(root) / names.META_FILE).is_file():
         meta = read_json(Path(root) / names.META_FILE)
         config = from_mapping(TaskConfig, meta["task_config"], str(Path(root) / names.META_FILE))
@@ -123,14 +140,21 @@ def _sight(folder: Path, inputs: Mapping[str, Any], features: Mapping[str, Any])
             raise InputError(
                 f"{folder} sees {names.ENVIRONMENT_STATE}, and neither its env nor its dataset says of which encoder."
             )
-        return Sight(tuple(features["views"]), features["size"], features["encoder"], features["weights_sha256"])
+        return Sight(
+            tuple(features["views"]),
+            features["size"],
+            features["encoder"],
+            features["weights_sha256"],
+        )
     shapes = {key: value["shape"] for key, value in inputs.items() if value["type"] == VISUAL}
     known = {names.image_key(view): view for view in names.CAMERAS}
     for key in shapes:
-        check_name(f"picture of {folder}", key, known)
+        check_name(f"image of {folder}", key, known)
     sizes = {tuple(shape[1:]) for shape in shapes.values()}
     if len(sizes) > 1 or any(height != width for height, width in sizes):
-        raise InputError(f"{folder} sees pictures of {sorted(sizes)}; our envs show square ones of one size.")
+        raise InputError(
+            f"{folder} sees images of {sorted(sizes)}; our envs show square ones of one size."
+        )
     return Sight(tuple(known[key] for key in shapes), next(iter(sizes))[0] if sizes else 224)
 
 
@@ -154,7 +178,9 @@ class LeRobotAgent:
         text: the task in words, as its dataset says it; empty for the env's own.
     """
 
-    def __init__(self, name: str, folder: Path, sight: Sight, weights: str | None = None, text: str = ""):
+    def __init__(
+        self, name: str, folder: Path, sight: Sight, weights: str | None = None, text: str = ""
+    ):
         self.name, self.cameras, self.image_size = name, sight.cameras, sight.image_size
         self._policy, self._before, self._after = _load(folder, weights)
         self._text = text
@@ -173,14 +199,19 @@ class LeRobotAgent:
             tensors = itertools.chain(policy.parameters(), policy.buffers())
             policy = copy.deepcopy(policy, {id(tensor): tensor for tensor in tensors})
         policy.reset()
-        states = {device: torch.Generator(device).manual_seed(seed).get_state() for device in self._devices}
+        states = {
+            device: torch.Generator(device).manual_seed(seed).get_state()
+            for device in self._devices
+        }
         self._slots[slot] = policy, states
 
     def restart(self, slot: int) -> None:
         """Forget what the slot's policy has planned: a chain begins the subtask anew."""
         self._slots[slot][0].reset()
 
-    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+    def act(
+        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
         """Return the policy's actions (n, 7)."""
         import torch
 
@@ -197,7 +228,9 @@ class LeRobotAgent:
                 self._slots[slot] = policy, {device: _random(device) for device in states}
             return np.concatenate(actions)
 
-    def _act(self, policy: Any, envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+    def _act(
+        self, policy: Any, envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
         """Ask one policy for the actions of a batch, through LeRobot's pipeline."""
         import torch
         from lerobot.envs.utils import preprocess_observation
@@ -205,11 +238,19 @@ class LeRobotAgent:
         # Asked of the env: in a chain another arm may have become active since it was observed.
         raw: dict[str, Any] = {"agent_pos": np.stack([env.agent_pos() for env in envs])}
         if self._encoder is None:
-            raw["pixels"] = {view: np.stack([o["pixels"][view] for o in observations]) for view in self.cameras}
+            raw["pixels"] = {
+                view: np.stack([o["pixels"][view] for o in observations]) for view in self.cameras
+            }
         else:
-            views = [self._encoder(np.stack([o["pixels"][view] for o in observations])) for view in self.cameras]
+            views = [
+                self._encoder(np.stack([o["pixels"][view] for o in observations]))
+                for view in self.cameras
+            ]
             raw["environment_state"] = np.concatenate(views, axis=1)
-        batch = {**preprocess_observation(raw), "task": [self._text or env.task_description for env in envs]}
+        batch = {
+            **preprocess_observation(raw),
+            "task": [self._text or env.task_description for env in envs],
+        }
         action = self._after(policy.select_action(self._before(batch)))
         return action.to("cpu", torch.float32).numpy()
 
@@ -232,7 +273,9 @@ def _set_random(device: str, state: Any) -> None:
 
 
 def _load(folder: Path, weights: str | None) -> tuple[Any, Any, Any]:
-    """Return policy, pre- and post-processor; plug-ins are found as LeRobot's own commands find them."""
+    """Return policy, pre- and post-processor; plug-ins are found as LeRobot's own commands find
+    them.
+    """
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
     from lerobot.utils.import_utils import register_third_party_plugins
@@ -248,14 +291,20 @@ def _load(folder: Path, weights: str | None) -> tuple[Any, Any, Any]:
         own = encoders.weights_of(str(getattr(config, "encoder", None)), weights)
         if own and hasattr(config, "encoder_weights"):
             config.encoder_weights = str(own)
-        with contextlib.redirect_stdout(sys.stderr):  # LeRobot prints; our standard output is the result
+        with contextlib.redirect_stdout(
+            sys.stderr
+        ):  # LeRobot prints; our standard output is the result
             policy = get_policy_class(config.type).from_pretrained(folder, config=config)
         overrides = {"device_processor": {"device": config.device}}
-        before, after = make_pre_post_processors(config, str(folder), preprocessor_overrides=overrides)
+        before, after = make_pre_post_processors(
+            config, str(folder), preprocessor_overrides=overrides
+        )
     except SurgicaiError:
         raise
     except Exception as error:
-        raise BadFile(f"LeRobot cannot load {folder} ({(str(error).splitlines() or [''])[0]}).") from error
+        raise BadFile(
+            f"LeRobot cannot load {folder} ({(str(error).splitlines() or [''])[0]})."
+        ) from error
     return policy.eval(), before, after
 
 

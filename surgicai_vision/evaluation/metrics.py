@@ -1,4 +1,5 @@
-"""Rows: what is kept of one episode, and the summary of many. `docs/evaluation.md` explains every column.
+"""Rows: what is kept of one episode, and the summary of many. `docs/evaluation.md` explains every
+column.
 
 All lengths, angles and forces are read from the measured physical state, never from a command.
 """
@@ -40,8 +41,10 @@ class EpisodeRow:
         error: what broke the episode off, or "".
         grasp: grasp level of the scene.
         failure: "" for a success, else one of `KINDS`.
-        stages: subtasks that succeeded in their order, of the whole procedure; 1 for a subtask's own success.
-        entry_mm: where the tip went through the entry, from the hole's centre [mm]; NaN where it did not.
+        stages: subtasks that succeeded in their order, of the whole procedure; 1 for a subtask's
+            own success.
+        entry_mm: where the tip went through the entry, from the hole's centre [mm]; NaN where it
+            did not.
         exit_mm: the same at the exit.
         slip_mm: the needle's largest shift in the active jaws since they took it [mm].
         slip_deg: its largest turn [deg].
@@ -75,7 +78,8 @@ def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, he
         error: what broke the episode off, or "".
         diverged: the physics broke it off: "physics"; any other error: "error".
         touched: whether the active jaws ever felt the needle; if not: "missed".
-        wrong_hole: the needle went through another opening than the stitch's, and stayed wrong: "wrong_hole".
+        wrong_hole: the needle went through another opening than the stitch's, and stayed wrong:
+            "wrong_hole".
         held: whether either arm held the needle at the end: "time" if one did, else "dropped".
     """
     if error:
@@ -90,8 +94,8 @@ def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, he
 def summary(rows: Sequence[EpisodeRow]) -> dict[str, Any]:
     """Return the counts of one policy on one task.
 
-    Trajectory length and steps are those of successful episodes; what was measured is averaged over all episodes that
-    have it ("n" of them).
+    Trajectory length and steps are those of successful episodes; what was measured is averaged over
+    all episodes that have it ("n" of them).
     """
     first, successes = rows[0], [row for row in rows if row.success]
     failures = [row.failure for row in rows if not row.success]
@@ -108,12 +112,18 @@ def summary(rows: Sequence[EpisodeRow]) -> dict[str, Any]:
         "errors": sum(1 for row in rows if row.error),
         "failures": {kind: failures.count(kind) for kind in KINDS if kind in failures},
         "first_seed": min(row.seed for row in rows),
-        **({"reached": _reached(rows), "survival": survival(rows)} if first.task == names.SUTURE else {}),
+        **(
+            {"reached": _reached(rows), "survival": survival(rows)}
+            if first.task == names.SUTURE
+            else {}
+        ),
     }
 
 
 def survival(rows: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
-    """Return for each subtask how many episodes finished it and all before it: k of n, with the exact interval."""
+    """Return for each subtask how many episodes finished it and all before it: k of n, with the
+    exact interval.
+    """
     stages = []
     for subtask, k in _reached(rows).items():
         low, high = clopper_pearson(k, len(rows))
@@ -123,7 +133,10 @@ def survival(rows: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
 
 def _reached(rows: Sequence[EpisodeRow]) -> dict[str, int]:
     """Return how many episodes finished each subtask and all before it."""
-    return {subtask: sum(row.stages > index for row in rows) for index, subtask in enumerate(names.SUBTASKS)}
+    return {
+        subtask: sum(row.stages > index for row in rows)
+        for index, subtask in enumerate(names.SUBTASKS)
+    }
 
 
 def _finite(rows: Sequence[EpisodeRow], column: str) -> list[float]:

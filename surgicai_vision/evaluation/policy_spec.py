@@ -1,4 +1,6 @@
-"""Subjects: who is evaluated in which task: a baseline, blind replay, the policy of a checkpoint folder."""
+"""Subjects: who is evaluated in which task: a baseline, blind replay, the policy of a checkpoint
+folder.
+"""
 
 import functools
 from collections.abc import Sequence
@@ -9,7 +11,13 @@ from typing import Any
 from surgicai_vision.core import names
 from surgicai_vision.core.config import Deviations, TaskConfig, from_mapping
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.evaluation.agents import BASELINES, NoisyAgent, PolicyAgent, ReplayAgent, mean_demonstration
+from surgicai_vision.evaluation.agents import (
+    BASELINES,
+    NoisyAgent,
+    PolicyAgent,
+    ReplayAgent,
+    mean_demonstration,
+)
 from surgicai_vision.evaluation.rollout import Agent, MakeAgent
 
 ROUNDS = 3
@@ -25,7 +33,8 @@ class Subject:
         config: the task.
         make_agent: makes the agent in a worker process.
         about: more to be kept beside the result.
-        rounds: how often as many starts again are evaluated (the released code evaluated one policy three times).
+        rounds: how often as many starts again are evaluated (the released code evaluated one policy
+            three times).
     """
 
     name: str
@@ -44,7 +53,9 @@ def policy_name(
     recipe: str = "paper",
 ) -> str:
     """Name a policy by its inputs, and by what is not as usual."""
-    name = f"{encoder}-{'+'.join(views)}" if encoder else "state" if privileged else "proprioception"
+    name = (
+        f"{encoder}-{'+'.join(views)}" if encoder else "state" if privileged else "proprioception"
+    )
     unusual = [part for part, usual in ((pool, "global"), (recipe, "paper")) if part != usual]
     return "-".join([*([] if policy == "bc" else [policy]), name.replace(":", "-"), *unusual])
 
@@ -69,7 +80,9 @@ def replay_subject(dataset: Any) -> Subject:
     return Subject(ReplayAgent.name, dataset.config, functools.partial(ReplayAgent, actions), about)
 
 
-def checkpoint_subject(folder: Path, weights: str | None = None, accept_licence: bool = False) -> Subject:
+def checkpoint_subject(
+    folder: Path, weights: str | None = None, accept_licence: bool = False
+) -> Subject:
     """Return the subject of a checkpoint folder; its weights are looked up at once.
 
     Raises:
@@ -113,7 +126,9 @@ def checkpoint_name(checkpoint: Any) -> str:
     privileged = bool(checkpoint.recipe.get("privileged"))
     pool = encoder.pool if encoder else "global"
     name = encoder.name if encoder else None
-    return policy_name(name, checkpoint.views, pool, privileged, checkpoint.policy, checkpoint.recipe_name)
+    return policy_name(
+        name, checkpoint.views, pool, privileged, checkpoint.policy, checkpoint.recipe_name
+    )
 
 
 def _deviations(checkpoint: Any) -> Deviations:

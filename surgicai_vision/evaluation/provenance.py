@@ -9,7 +9,16 @@ from typing import Any
 
 from surgicai_vision.core.errors import SurgicaiError
 
-PACKAGES = ("surgicai-vision", "mujoco", "gymnasium", "lerobot", "torch", "timm", "numpy", "pyarrow")
+PACKAGES = (
+    "surgicai-vision",
+    "mujoco",
+    "gymnasium",
+    "lerobot",
+    "torch",
+    "timm",
+    "numpy",
+    "pyarrow",
+)
 
 
 def provenance(render: bool = True) -> dict[str, Any]:

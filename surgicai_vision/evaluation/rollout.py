@@ -1,12 +1,12 @@
 """Evaluation: an agent × a task × start seeds → one row an episode.
 
-Episodes run in lock step in `batch` slots, so that an encoder sees many frames at once; a slot whose
-episode ends takes the next seed. Seeds are shared out over spawned processes. The result depends on
-neither: every episode has its own state and random numbers, and encoders and policies give a row the same
-answer in any batch.
+Episodes run in lock step in `batch` slots, so that an encoder sees many frames at once; a slot
+whose episode ends takes the next seed. Seeds are shared out over spawned processes. The result
+depends on neither: every episode has its own state and random numbers, and encoders and policies
+give a row the same answer in any batch.
 
-An episode ends at success, at the task's step limit, or at an error (diverged physics, a start that cannot
-be made, an action that is not finite). An error is a failure, counted in `errors` as well.
+An episode ends at success, at the task's step limit, or at an error (diverged physics, a start that
+cannot be made, an action that is not finite). An error is a failure, counted in `errors` as well.
 """
 
 import functools
@@ -38,7 +38,7 @@ class Agent(Protocol):
     Attributes:
         name: how the agent is called in rows and tables.
         cameras: views it needs, empty for none.
-        image_size: height and width of their pictures [px].
+        image_size: height and width of their images [px].
     """
 
     name: str
@@ -48,12 +48,16 @@ class Agent(Protocol):
     def begin(self, slot: int, env: Any, seed: int) -> None:
         """Forget the slot's last episode; `env` has just been reset with `seed`."""
 
-    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+    def act(
+        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
         """Return the actions (len(slots), 7) of the running slots."""
 
 
 MakeAgent = Callable[[], Agent]
-"""Makes the agent inside a worker process; must be picklable (a function or a functools.partial)."""
+"""Makes the agent inside a worker process; must be picklable (a function or a
+functools.partial).
+"""
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,9 @@ def evaluate(
         InputError: no seeds, repeated seeds, or numbers below 1.
     """
     if not seeds or len(set(seeds)) != len(seeds):
-        raise InputError(f"{len(seeds)} start seeds, {len(set(seeds))} of them different; give each once.")
+        raise InputError(
+            f"{len(seeds)} start seeds, {len(set(seeds))} of them different; give each once."
+        )
     if batch < 1 or (workers is not None and workers < 1):
         raise InputError(f"batch is {batch} and workers {workers}; both must be at least 1.")
     count = workers or min(len(os.sched_getaffinity(0)), -(-len(seeds) // 4))
@@ -130,7 +136,9 @@ def run_share(
     batch: int,
     report: Callable[[int], None],
 ) -> list[Episode]:
-    """Run the episodes of one process; `report` is told the steps done, a finished episode as all of its own."""
+    """Run the episodes of one process; `report` is told the steps done, a finished episode as all
+    of its own.
+    """
     agent = make_agent()
     slots = [_Slot(index, agent, task_config) for index in range(min(batch, len(seeds)))]
     waiting, finished = list(seeds)[::-1], []
@@ -140,7 +148,9 @@ def run_share(
         live = [slot for slot in running if not slot.ended]
         if live:
             actions = agent.act(
-                [slot.index for slot in live], [slot.env for slot in live], [slot.observation for slot in live]
+                [slot.index for slot in live],
+                [slot.env for slot in live],
+                [slot.observation for slot in live],
             )
             for slot, action in zip(live, actions, strict=True):
                 slot.step(action)
@@ -149,7 +159,10 @@ def run_share(
                 finished.append(slot.take())
                 if waiting:
                     slot.begin(waiting.pop())
-        report(len(finished) * task_config.max_steps + sum(slot.steps for slot in slots if slot.seed is not None))
+        report(
+            len(finished) * task_config.max_steps
+            + sum(slot.steps for slot in slots if slot.seed is not None)
+        )
     for slot in slots:
         slot.env.close()
     return finished
@@ -209,7 +222,9 @@ class _Slot:
             self.error, self.diverged = self.error or "the physics diverged", True
         self.steps += 1
         self.touched = self.touched or bool(self.info.get("contact"))
-        self.ended = bool(terminated or truncated or self.error or self.steps >= self.task_config.max_steps)
+        self.ended = bool(
+            terminated or truncated or self.error or self.steps >= self.task_config.max_steps
+        )
         if not self.error:
             self._keep()
 
@@ -251,7 +266,9 @@ class _Slot:
     def _film(self) -> Film:
         if not self.states:
             return Film(np.zeros(0, np.int64), np.zeros((0, 0)))
-        steps = np.unique(np.linspace(0, len(self.states) - 1, FILM_FRAMES).round().astype(np.int64))
+        steps = np.unique(
+            np.linspace(0, len(self.states) - 1, FILM_FRAMES).round().astype(np.int64)
+        )
         return Film(steps, np.stack([self.states[step] for step in steps]))
 
 
@@ -263,7 +280,9 @@ def _in_processes(jobs: list[Any], progress: Progress | None, total: int) -> lis
 
     context = multiprocessing.get_context("spawn")
     counts = context.Array("q", len(jobs))
-    with ProcessPoolExecutor(len(jobs), context, initializer=_start_worker, initargs=(counts,)) as pool:
+    with ProcessPoolExecutor(
+        len(jobs), context, initializer=_start_worker, initargs=(counts,)
+    ) as pool:
         futures = [pool.submit(_run_job, job, index) for index, job in enumerate(jobs)]
         try:
             while wait(futures, timeout=0.25).not_done:

@@ -14,7 +14,11 @@ from surgicai_vision.evaluation.storage import MARKER, write_evaluation
 
 
 def evaluate_once(
-    out: Path, make_subject: Callable[[], Subject], seeds: Sequence[int], stage: Stage, workers: int | None
+    out: Path,
+    make_subject: Callable[[], Subject],
+    seeds: Sequence[int],
+    stage: Stage,
+    workers: int | None,
 ) -> dict[str, Any]:
     """Evaluate into the folder `out` if it holds no evaluation yet; return the summary."""
     if (out / MARKER).exists():
@@ -44,7 +48,9 @@ def evaluate_into(
     from surgicai_vision.scene import build_scene
 
     seeds = range(seeds[0], seeds[0] + subject.rounds * len(seeds)) if subject.rounds > 1 else seeds
-    episodes = evaluate(subject.make_agent, subject.config, seeds, workers=workers, progress=progress)
+    episodes = evaluate(
+        subject.make_agent, subject.config, seeds, workers=workers, progress=progress
+    )
     wins = [episode.row.success for episode in episodes]
     size = len(wins) // subject.rounds
     cuts = range(0, len(wins), size)

@@ -1,4 +1,5 @@
-"""Statistics: intervals of success rates, tests of pairs of policies, the area under a curve of successes.
+"""Statistics: intervals of success rates, tests of pairs of policies, the area under a curve of
+successes.
 
 Interface:
     clopper_pearson(k, n)                exact interval of one success rate
@@ -9,7 +10,8 @@ Interface:
     area_interval(areas)                 its interval, from each episode's own area
     mean_and_std(values)                 sample mean and deviation
 
-SciPy is imported where it is used: it takes 0.3 s, and the command line's --help must not pay for it.
+SciPy is imported where it is used: it takes 0.3 s, and the command line's --help must not pay for
+it.
 """
 
 import math
@@ -26,7 +28,8 @@ Array = NDArray[np.float64]
 def clopper_pearson(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
     """Return the exact (Clopper-Pearson) interval of a success rate.
 
-    Clopper and Pearson, Biometrika 26 (1934): the bounds are quantiles of Beta(k, n-k+1) and Beta(k+1, n-k).
+    Clopper and Pearson, Biometrika 26 (1934): the bounds are quantiles of Beta(k, n-k+1) and
+    Beta(k+1, n-k).
 
     Args:
         successes: k, 0 ≤ k ≤ n.
@@ -40,7 +43,9 @@ def clopper_pearson(successes: int, trials: int, level: float = 0.95) -> tuple[f
         InputError: counts or level outside their range.
     """
     if trials < 1 or not 0 <= successes <= trials:
-        raise InputError(f"{successes} successes of {trials} trials; allowed: 0 ≤ successes ≤ trials, trials ≥ 1.")
+        raise InputError(
+            f"{successes} successes of {trials} trials; allowed: 0 ≤ successes ≤ trials, trials ≥ 1."
+        )
     return _beta_bounds(successes, trials, level)
 
 
@@ -50,38 +55,55 @@ def _beta_bounds(successes: float, trials: float, level: float) -> tuple[float, 
 
     tail = (1 - _checked(level)) / 2
     low = 0.0 if successes <= 0 else float(beta.ppf(tail, successes, trials - successes + 1))
-    high = 1.0 if successes >= trials else float(beta.ppf(1 - tail, successes + 1, trials - successes))
+    high = (
+        1.0 if successes >= trials else float(beta.ppf(1 - tail, successes + 1, trials - successes))
+    )
     return low, high
 
 
 def hierarchical_bootstrap(
-    groups: Sequence[Sequence[float]], generator: np.random.Generator, level: float = 0.95, resamples: int = 10_000
+    groups: Sequence[Sequence[float]],
+    generator: np.random.Generator,
+    level: float = 0.95,
+    resamples: int = 10_000,
 ) -> tuple[float, float]:
     """Return an interval of the mean over training seeds, and over episodes within each.
 
-    Seeds are drawn with replacement, then episodes within each drawn seed; the mean of the drawn seeds' means is
-    kept. The plain percentiles of those means cover far less than they claim with five seeds (77 % for a rate of
-    0.95 whose seeds scatter by 0.1), so only the bootstrap's standard error e is taken from them. Then
+    Seeds are drawn with replacement, then episodes within each drawn seed; the mean of the drawn
+    seeds' means is kept. The plain percentiles of those means cover far less than they claim with
+    five seeds (77 % for a rate of 0.95 whose seeds scatter by 0.1), so only the bootstrap's
+    standard error e is taken from them. Then
 
-    * successes (values 0 and 1): Korn and Graubard, Survey Methodology 24 (1998). The episodes are worth
-      n* = min(n, p(1-p)/e²) · (t(n-1)/t(m-1))² independent ones, t(d) being Student's quantile for d degrees of
-      freedom, n episodes and m seeds in all; Clopper and Pearson's bounds of n* trials follow;
-    * other values: mean ± t(m-1) e √(m/(m-1)), the factor since m drawn seeds scatter by (m-1)/m too little.
+    * successes (values 0 and 1): Korn and Graubard, Survey Methodology 24 (1998). The episodes are
+      worth n* = min(n, p(1-p)/e²) · (t(n-1)/t(m-1))² independent ones, t(d) being Student's
+      quantile for d degrees of freedom, n episodes and m seeds in all; Clopper and Pearson's bounds
+      of n* trials follow;
+    * other values: mean ± t(m-1) e √(m/(m-1)), the factor since m drawn seeds scatter by (m-1)/m
+      too little.
 
-    One seed says nothing about others: its interval is that of its own episodes. Coverage: `benchmarks/coverage.py`.
+    One seed says nothing about others: its interval is that of its own episodes. Coverage:
+    `benchmarks/coverage.py`.
 
     Args:
-        groups: for each training seed its episodes' values; seeds may differ in their number of episodes.
+        groups: for each training seed its episodes' values; seeds may differ in their number of
+            episodes.
         generator: draws the resamples.
         level: coverage, between 0 and 1.
         resamples: at least 100.
 
     Raises:
-        InputError: no seeds, a seed without episodes, a value that is not finite, level or resamples out of range.
+        InputError: no seeds, a seed without episodes, a value that is not finite, level or
+            resamples out of range.
     """
     seeds = [np.asarray(group, np.float64) for group in groups]
-    if not seeds or any(seed.size == 0 for seed in seeds) or not all(np.isfinite(seed).all() for seed in seeds):
-        raise InputError(f"{len(seeds)} training seeds; give at least one, each with episodes of finite values.")
+    if (
+        not seeds
+        or any(seed.size == 0 for seed in seeds)
+        or not all(np.isfinite(seed).all() for seed in seeds)
+    ):
+        raise InputError(
+            f"{len(seeds)} training seeds; give at least one, each with episodes of finite values."
+        )
     if resamples < 100:
         raise InputError(f"resamples is {resamples}; it must be at least 100.")
     rates, single = all(np.isin(seed, (0.0, 1.0)).all() for seed in seeds), len(seeds) == 1
@@ -89,10 +111,17 @@ def hierarchical_bootstrap(
         return _beta_bounds(float(seeds[0].sum()), seeds[0].size, level)
     # Of one seed the episodes are what is independent.
     units = [seeds[0][[episode]] for episode in range(seeds[0].size)] if single else seeds
-    mean, error = float(np.mean([unit.mean() for unit in units])), _bootstrap_error(units, generator, resamples)
+    mean, error = (
+        float(np.mean([unit.mean() for unit in units])),
+        _bootstrap_error(units, generator, resamples),
+    )
     if not rates:
         count = len(units)
-        half = _student(level, count - 1) * error * math.sqrt(count / (count - 1)) if count > 1 else math.inf
+        half = (
+            _student(level, count - 1) * error * math.sqrt(count / (count - 1))
+            if count > 1
+            else math.inf
+        )
         return mean - half, mean + half
     trials = sum(seed.size for seed in seeds)
     worth = min(trials, mean * (1 - mean) / error**2) if error > 0 else trials
@@ -121,8 +150,9 @@ def _student(level: float, freedom: int) -> float:
 def mcnemar(one: ArrayLike, other: ArrayLike) -> float:
     """Return the exact two-sided p-value of two policies' successes on the same starts.
 
-    McNemar, Psychometrika 12 (1947), exact: of the starts that only one of them solves, each has as many as a fair
-    coin would give; p is twice the smaller binomial tail, at most 1. Starts that both or neither solve say nothing.
+    McNemar, Psychometrika 12 (1947), exact: of the starts that only one of them solves, each has as
+    many as a fair coin would give; p is twice the smaller binomial tail, at most 1. Starts that
+    both or neither solve say nothing.
 
     Args:
         one: successes of the first policy, booleans (n,).
@@ -135,7 +165,9 @@ def mcnemar(one: ArrayLike, other: ArrayLike) -> float:
 
     a, b = np.asarray(one, bool), np.asarray(other, bool)
     if a.shape != b.shape or a.ndim != 1 or not a.size:
-        raise InputError(f"Successes of shapes {a.shape} and {b.shape}; give the same starts of both, at least one.")
+        raise InputError(
+            f"Successes of shapes {a.shape} and {b.shape}; give the same starts of both, at least one."
+        )
     first, second = int((a & ~b).sum()), int((b & ~a).sum())
     return min(1.0, 2.0 * float(binom.cdf(min(first, second), first + second, 0.5)))
 
@@ -143,8 +175,9 @@ def mcnemar(one: ArrayLike, other: ArrayLike) -> float:
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values adjusted for their number by Holm's step-down method, in the order given.
 
-    Holm, Scandinavian Journal of Statistics 6 (1979): the i-th smallest of m is multiplied by m - i + 1, is at least
-    as large as the one before, and at most 1. Rejecting those below α keeps the chance of any false one below α.
+    Holm, Scandinavian Journal of Statistics 6 (1979): the i-th smallest of m is multiplied by m - i
+    + 1, is at least as large as the one before, and at most 1. Rejecting those below α keeps the
+    chance of any false one below α.
 
     Raises:
         InputError: a p-value outside [0, 1].
@@ -154,12 +187,15 @@ def holm(p_values: Sequence[float]) -> list[float]:
         raise InputError(f"p-values {list(p_values)}; each must lie between 0 and 1.")
     order = np.argsort(values, kind="stable")
     adjusted = np.empty_like(values)
-    adjusted[order] = np.minimum(1.0, np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)))
+    adjusted[order] = np.minimum(
+        1.0, np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1))
+    )
     return [float(value) for value in adjusted]
 
 
 def area_under_curve(strength: ArrayLike, success: ArrayLike) -> float:
-    """Return the mean success over the range of strengths: the trapezoids' area over the range's width.
+    """Return the mean success over the range of strengths: the trapezoids' area over the range's
+    width.
 
     Args:
         strength: increasing, (k,), at least two.
@@ -177,10 +213,12 @@ def area_under_curve(strength: ArrayLike, success: ArrayLike) -> float:
 
 
 def area_interval(areas: Sequence[float], level: float = 0.95) -> tuple[float, float]:
-    """Return an interval of the mean of values in [0, 1]: each start's own area under its successes.
+    """Return an interval of the mean of values in [0, 1]: each start's own area under its
+    successes.
 
-    A value in [0, 1] varies at most as much as a success of the same mean, so that Clopper and Pearson's bounds of
-    their sum (which need not be whole) out of their number are at least as wide as they must be.
+    A value in [0, 1] varies at most as much as a success of the same mean, so that Clopper and
+    Pearson's bounds of their sum (which need not be whole) out of their number are at least as wide
+    as they must be.
 
     Raises:
         InputError: no values, or one outside [0, 1].
@@ -192,14 +230,19 @@ def area_interval(areas: Sequence[float], level: float = 0.95) -> tuple[float, f
 
 
 def mean_and_std(values: Sequence[float]) -> dict[str, float | None]:
-    """Return {"mean", "std"} of `values` (sample deviation, n - 1); None where it is not defined."""
+    """Return {"mean", "std"} of `values` (sample deviation, n - 1); None where it is not
+    defined.
+    """
     count = len(values)
     if count == 0:
         return {"mean": None, "std": None}
     mean = sum(values) / count
     if count == 1:
         return {"mean": mean, "std": None}
-    return {"mean": mean, "std": (sum((value - mean) ** 2 for value in values) / (count - 1)) ** 0.5}
+    return {
+        "mean": mean,
+        "std": (sum((value - mean) ** 2 for value in values) / (count - 1)) ** 0.5,
+    }
 
 
 def _checked(level: float) -> float:

@@ -19,15 +19,22 @@ from surgicai_vision.evaluation.rollout import Episode, Film
 MARKER = "evaluation.json"
 EPISODES = "episodes.parquet"
 FILMS = "films.safetensors"
+RUN_FILE = "run.json"
+GRID_FILE = "sweep.json"
+CELL_FILE = "cell.json"
+FAILED_FILE = "failed.json"
 
 
-def write_evaluation(folder: Path, episodes: Sequence[Episode], about: dict[str, Any]) -> dict[str, Any]:
+def write_evaluation(
+    folder: Path, episodes: Sequence[Episode], about: dict[str, Any]
+) -> dict[str, Any]:
     """Write an evaluation; an earlier one in the same folder is replaced.
 
     Args:
         folder: made where it is missing.
         episodes: what `evaluate` returned.
-        about: how it was made: "task_config", "checkpoint", "views" and whatever else is worth keeping.
+        about: how it was made: "task_config", "checkpoint", "views" and whatever else is worth
+            keeping.
 
     Returns:
         The summary.

@@ -1,11 +1,12 @@
-"""DAgger (Ross et al. 2011): a learner drives, the expert says at each of its states what it would have done.
+"""DAgger (Ross et al. 2011): a learner drives, the expert says at each of its states what it would
+have done.
 
     learner = learner_of(Path("outputs/train/grasp-…"), config)
-    record(config, episodes=350, source="search", learner=learner, out=Path("demos"))
+    record(config, episodes=350, demonstrator="search", learner=learner, out=Path("demos"))
 
-An episode is the learner's until a step drawn uniformly from its limit, then the expert's, who mends what it finds;
-kept is, as ever, what succeeds. Rendered together with the demonstrations the learner was trained on, they train the
-next one (`render-demos --demos A,B`).
+An episode is the learner's until a step drawn uniformly from its limit, then the expert's, who
+mends what it finds; kept is, as ever, what succeeds. Rendered together with the demonstrations the
+learner was trained on, they train the next one (`render-demos --demos A,B`).
 """
 
 import atexit
@@ -55,7 +56,9 @@ def learner_of(folder: Path, config: TaskConfig) -> Learner:
     """
     subject = checkpoint_subject(folder)
     if subject.config.task != config.task:
-        raise InputError(f"{folder} was trained for '{subject.config.task}'; '{config.task}' is to be recorded.")
+        raise InputError(
+            f"{folder} was trained for '{subject.config.task}'; '{config.task}' is to be recorded."
+        )
     return Learner(folder, str(subject.about["checkpoint"]["policy_sha256"]))
 
 

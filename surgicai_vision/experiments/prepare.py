@@ -21,21 +21,23 @@ def prepare_dataset(
     size: int,
     depth: bool,
     workers: int,
-    every: int = 1,
+    frame_stride: int = 1,
     engine: Engine = LOCAL,
-    source: str = "expert",
+    demonstrator: str = "expert",
     disturbance: Disturbance = CALM,
-    linger: int = 0,
+    post_success_steps: int = 0,
 ) -> Path:
-    """Record demonstrations into `folder`/demos and render them into `folder`/dataset; return the latter."""
+    """Record demonstrations into `folder`/demos and render them into `folder`/dataset; return the
+    latter.
+    """
     with stage(f"demos: {demonstrations} of {config.task}", "episodes") as progress:
         record(
             config, episodes=demonstrations, out=folder / "demos", workers=workers, engine=engine, progress=progress,
-            source=source, disturbance=disturbance, linger=linger,
+            demonstrator=demonstrator, disturbance=disturbance, post_success_steps=post_success_steps,
         )  # fmt: skip
     with stage(f"dataset: {', '.join(views)} at {size} px", "frames") as progress:
         render_demos(
-            folder / "demos", folder / "dataset", views=views, size=size, depth=depth, every=every,
+            folder / "demos", folder / "dataset", views=views, size=size, depth=depth, frame_stride=frame_stride,
             workers=workers, engine=engine, progress=progress,
         )  # fmt: skip
     return folder / "dataset"

@@ -1,81 +1,26 @@
-"""Quickstart: the whole flow once, small: demos → dataset → features → policies → evaluation → report.
+"""Quickstart: the whole flow once, small: demos → dataset → features → policies → evaluation →
+report.
 
-One folder holds everything: `demos/`, `dataset/`, `policies/<name>/`, `evaluations/<name>/`, `run.json` and
-`report.html`. A step that is there is not done again, so the same command continues a broken-off run.
+One folder holds everything: `demos/`, `dataset/`, `policies/<name>/`, `evaluations/<name>/`,
+`run.json` and `report.html`. A step that is there is not done again, so the same command continues
+a broken-off run.
 """
 
 import functools
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig, to_mapping
-from surgicai_vision.core.errors import InputError, OutputExists, check_name
+from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.progress import Stage, timed
 from surgicai_vision.evaluation.policy_spec import baseline_subject, checkpoint_subject
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.run import evaluate_once
-from surgicai_vision.experiments.run import Cell, train_cell
+from surgicai_vision.experiments.quickstart_config import Quickstart
+from surgicai_vision.experiments.run import train_cell
 from surgicai_vision.features import encoders
 from surgicai_vision.report import RUN_FILE, write_report
-
-
-@dataclass(frozen=True)
-class PolicyChoice:
-    """A policy's inputs: an encoder with its views, or neither for proprioception alone."""
-
-    encoder: str | None = None
-    view: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Quickstart:
-    """What a quickstart does; the defaults are configs/quickstart.yaml.
-
-    Attributes:
-        task: the task.
-        demonstrations: expert demonstrations to train on.
-        view: rendered views.
-        size: height and width of pictures [px].
-        depth: render depth beside RGB.
-        recipe: recipe of behaviour cloning.
-        policies: what is trained and evaluated.
-        episodes: held-out starts of each evaluation.
-        seed: training seed.
-    """
-
-    task: str = "grasp"
-    demonstrations: int = 25
-    view: tuple[str, ...] = ("front", "back")
-    size: int = 224
-    depth: bool = True
-    recipe: str = "paper"
-    policies: tuple[PolicyChoice, ...] = (
-        PolicyChoice("imagenet-lite", ("front",)),
-        PolicyChoice("imagenet-lite", ("back",)),
-        PolicyChoice("random", ("back",)),
-        PolicyChoice(),
-    )
-    episodes: int = 20
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for cell in self.cells:
-            if cell.encoder:
-                encoders.check_encoder_name(cell.encoder)
-            for view in cell.view:
-                check_name("rendered view", view, self.view)
-        for name in ("demonstrations", "size", "episodes"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1.")
-
-    @property
-    def cells(self) -> list[Cell]:
-        """The policies as cells."""
-        return [
-            Cell(self.task, choice.encoder, choice.view, self.seed, recipe=self.recipe) for choice in self.policies
-        ]
 
 
 def run_quickstart(plan: Quickstart, out: Path, stage: Stage, workers: int) -> dict[str, Any]:
@@ -116,10 +61,14 @@ def run_quickstart(plan: Quickstart, out: Path, stage: Stage, workers: int) -> d
             if not (policy / CARD).exists():
                 train_cell(cell, dataset, policy, measured)
             make = functools.partial(checkpoint_subject, policy)
-            results.append(evaluate_once(out / "evaluations" / cell.name, make, seeds, measured, workers))
+            results.append(
+                evaluate_once(out / "evaluations" / cell.name, make, seeds, measured, workers)
+            )
             _store_run(out, run)
         make = functools.partial(baseline_subject, "expert", config)
-        results.append(evaluate_once(out / "evaluations" / "expert", make, seeds, measured, workers))
+        results.append(
+            evaluate_once(out / "evaluations" / "expert", make, seeds, measured, workers)
+        )
     run["provenance"] = provenance()
     run["data"] = (
         f"{plan.demonstrations} demonstrations of the scripted expert, {dataset.length} frames; "
@@ -145,8 +94,15 @@ def _open_run(plan: Quickstart, out: Path) -> dict[str, Any]:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"--out {out} cannot be written: {error.strerror}; choose another folder.") from None
-    run = {"title": f"quickstart, {plan.task}", "command": command_line(), "plan": to_mapping(plan), "seconds": {}}
+        raise InputError(
+            f"--out {out} cannot be written: {error.strerror}; choose another folder."
+        ) from None
+    run = {
+        "title": f"quickstart, {plan.task}",
+        "command": command_line(),
+        "plan": to_mapping(plan),
+        "seconds": {},
+    }
     _store_run(out, run)
     return run
 

@@ -1,4 +1,5 @@
-"""Cells: one policy from features to counted successes. A quickstart is a list of cells, a sweep a grid.
+"""Cells: one policy from features to counted successes. A quickstart is a list of cells, a sweep a
+grid.
 
 Every step leaves a whole folder and skips the one that is there, so running again continues.
 """
@@ -16,7 +17,7 @@ from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.policy_spec import policy_name
 
 OWN = "own"
-"""Stands for an encoder: a network of the policy's own, trained with it on the pictures."""
+"""Stands for an encoder: a network of the policy's own, trained with it on the images."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,9 @@ class Cell:
 
     Attributes:
         task: one of `names.TASKS`.
-        encoder: encoder's name; `OWN` for a policy that trains a network of its own on the pictures; None for a policy
-            without pictures.
-        view: its views, in the order of the features; empty without pictures.
+        encoder: encoder's name; `OWN` for a policy that trains a network of its own on the images;
+            None for a policy without images.
+        view: its views, in the order of the features; empty without images.
         seed: training seed.
         policy: policy's name.
         recipe: its recipe: a name, or the path of a YAML file.
@@ -37,7 +38,8 @@ class Cell:
         deviations: switches of `config.Deviations` that are on; None takes the recipe's.
         change: keys of the recipe and their values, `config.read_changes`'s texts.
         demonstrations: train on the first so many demonstrations; None takes all.
-        chain: how subtasks end, where this is a high-level policy over a policy a subtask (`chain.TERMINATIONS`).
+        chain: how subtasks end, where this is a high-level policy over a policy a subtask
+            (`chain.TERMINATIONS`).
         swap: the subtask of such a chain that the expert does.
     """
 
@@ -59,27 +61,35 @@ class Cell:
     def __post_init__(self) -> None:
         check_name("task", self.task, names.TASKS)
         if self.chain and any(view in names.DEPTH_VIEWS for view in self.view):
-            raise InputError(f"A chain sees no depth views ({', '.join(self.view)}); give views in colour.")
+            raise InputError(
+                f"A chain sees no depth views ({', '.join(self.view)}); give views in colour."
+            )
         if self.swap:
             check_name("subtask", self.swap, names.SUBTASKS)
         for view in self.view:
             check_name("view", view, names.VIEWS)
         if (self.encoder is None) != (not self.view):
-            raise InputError(f"encoder '{self.encoder}' with views {list(self.view)}; give both or neither.")
+            raise InputError(
+                f"encoder '{self.encoder}' with views {list(self.view)}; give both or neither."
+            )
         for switch in self.deviations or ():
             check_name("deviation", switch, DEVIATIONS)
 
     @property
     def name(self) -> str:
         """How tables and folders call the policy."""
-        name = policy_name(self.encoder, self.view, self.pool, self.privileged, self.policy, self.recipe_label)
+        name = policy_name(
+            self.encoder, self.view, self.pool, self.privileged, self.policy, self.recipe_label
+        )
         chain = f"chain-{self.chain}-" if self.chain else ""
         return f"{chain}{name}" + (f"-swap-{self.swap}" if self.swap else "")
 
     @property
     def changes(self) -> dict[str, Any]:
         """Keys that replace the recipe's."""
-        changes: dict[str, Any] = read_changes(self.change) | ({"privileged": True} if self.privileged else {})
+        changes: dict[str, Any] = read_changes(self.change) | (
+            {"privileged": True} if self.privileged else {}
+        )
         if self.epochs is not None:
             changes["epochs"] = self.epochs
         if self.deviations is not None:
@@ -108,7 +118,8 @@ def train_cell(
     save_every: int = 0,
     log: Callable[[int, dict[str, float]], None] | None = None,
 ) -> None:
-    """Encode the cell's views (from the cache where they are at hand) and train its policy into `out`.
+    """Encode the cell's views (from the cache where they are at hand) and train its policy into
+    `out`.
 
     Args:
         cell: what to train.
@@ -129,10 +140,13 @@ def train_cell(
     from surgicai_vision.training.train import train
 
     recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
-    dataset = thinned(dataset, recipe.every)
+    dataset = thinned(dataset, recipe.frame_stride)
     begin = policies.load_policy(start) if start else None
     features, beside = _encode(cell, dataset, recipe, stage, weights, accept_licence)
-    parts: tuple[tuple[Any, Callable[..., Any]], ...] = ((cell.demonstrations, first_episodes), (subtask, subtask_of))
+    parts: tuple[tuple[Any, Callable[..., Any]], ...] = (
+        (cell.demonstrations, first_episodes),
+        (subtask, subtask_of),
+    )
     for which, take in parts:
         if which is not None:
             dataset = take(dataset, which)
@@ -146,7 +160,12 @@ def train_cell(
 
 
 def encode_cell(
-    cell: Cell, dataset: Any, stage: Stage, weights: str | None = None, *, accept_licence: bool = False
+    cell: Cell,
+    dataset: Any,
+    stage: Stage,
+    weights: str | None = None,
+    *,
+    accept_licence: bool = False,
 ) -> tuple[list[Any], dict[str, bytes]]:
     """Encode the cell's views, all frames that its recipe takes, or find them in the cache.
 
@@ -157,7 +176,9 @@ def encode_cell(
     from surgicai_vision.training import policies
 
     recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
-    return _encode(cell, thinned(dataset, recipe.every), recipe, stage, weights, accept_licence)
+    return _encode(
+        cell, thinned(dataset, recipe.frame_stride), recipe, stage, weights, accept_licence
+    )
 
 
 def _encode(
@@ -177,12 +198,19 @@ def _encode(
 
 
 def _encoder(
-    cell: Cell, deviations: Deviations, dataset: Any, stage: Stage, weights: str | None, accept_licence: bool
+    cell: Cell,
+    deviations: Deviations,
+    dataset: Any,
+    stage: Stage,
+    weights: str | None,
+    accept_licence: bool,
 ) -> tuple[Any, dict[str, bytes]]:
     """Load the cell's encoder; return it with what of it the checkpoint has to keep."""
     from surgicai_vision.features import encoders
 
-    load = functools.partial(encoders.load_encoder, str(cell.encoder), weights, cell.pool, accept_licence)
+    load = functools.partial(
+        encoders.load_encoder, str(cell.encoder), weights, cell.pool, accept_licence
+    )
     if deviations == Deviations():
         return load(), {}
     encoder = load(deviations)

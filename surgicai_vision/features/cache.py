@@ -2,20 +2,22 @@
 
 Interface:
 
-* `encode(dataset, view, encoder, cache_root, progress) -> Features`: encode one view of a dataset once.
+* `encode(dataset, view, encoder, cache_root, progress) -> Features`: encode one view of a dataset
+  once.
 * `Features`: the rows as a read-only float16 memory map, aligned with the dataset's frame index.
 * `default_cache_root()`, `list_cache(root)`, `prune_cache(root, keep_datasets)`.
 
-An entry is addressed by its content: the dataset's fingerprint, the view, and the encoder's fingerprint
-(weights, preprocessing, pool, compute type). So encoding twice does nothing, and a changed dataset or
-weights file never meets an old entry. Layout of `<cache root>/features/<key>/`:
+An entry is addressed by its content: the dataset's fingerprint, the view, and the encoder's
+fingerprint (weights, preprocessing, pool, compute type). So encoding twice does nothing, and a
+changed dataset or weights file never meets an old entry. Layout of `<cache root>/features/<key>/`:
 
     features.npy    (N, dim) float16, allocated whole at the start
     progress.json   rows already on disk; written after each chunk
     manifest.json   what was encoded; written last, its presence makes the entry complete
     lock            held while a process writes
 
-A process killed at any moment leaves `progress.json` behind its rows, and the next call goes on there.
+A process killed at any moment leaves `progress.json` behind its rows, and the next call goes on
+there.
 """
 
 import fcntl
@@ -35,7 +37,7 @@ from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, Unkn
 from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, read_json, write_json
 
 FORMAT = 1
-CHUNK = 256  # frames per progress step: 38 MB of pictures at 224 × 224
+CHUNK = 256  # frames per progress step: 38 MB of images at 224 × 224
 MANIFEST, PROGRESS, ROWS = "manifest.json", "progress.json", "features.npy"
 
 Progress = Callable[[int, int], None]
@@ -85,7 +87,7 @@ class Features:
 
     @property
     def view(self) -> str:
-        """The camera the pictures came from."""
+        """The camera the images came from."""
         return self.manifest["view"]
 
     @property
@@ -99,9 +101,13 @@ class Features:
         return self.rows.shape[1]
 
     def part(self, rows: Any, dataset: str) -> "Features":
-        """Return some rows, a slice or (n,) indices, as the features of that part, whose fingerprint is `dataset`."""
+        """Return some rows, a slice or (n,) indices, as the features of that part, whose
+        fingerprint is `dataset`.
+        """
         taken = self.rows[rows]
-        return replace(self, manifest={**self.manifest, "length": len(taken), "dataset": dataset}, rows=taken)
+        return replace(
+            self, manifest={**self.manifest, "length": len(taken), "dataset": dataset}, rows=taken
+        )
 
 
 default_cache_root = cache_root
@@ -170,10 +176,14 @@ def open_entry(folder: Path, length: int | None = None, encoded: int = 0) -> Fea
     try:
         rows = np.load(folder / ROWS, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError) as error:
-        raise BadFile(f"The cache entry {folder} is damaged ({error}); delete that folder.") from None
+        raise BadFile(
+            f"The cache entry {folder} is damaged ({error}); delete that folder."
+        ) from None
     wanted = (manifest["length"] if length is None else length, manifest["dim"])
     if rows.shape != wanted or rows.dtype != np.float16:
-        raise BadFile(f"The cache entry {folder} holds {rows.shape}, expected {wanted}; delete that folder.")
+        raise BadFile(
+            f"The cache entry {folder} holds {rows.shape}, expected {wanted}; delete that folder."
+        )
     return Features(folder, manifest, rows, encoded)
 
 
@@ -196,7 +206,9 @@ def _manifest(dataset: FrameSource, view: str, encoder: FrameEncoder) -> dict[st
     }
 
 
-def _fill(folder: Path, dataset: FrameSource, view: str, encoder: FrameEncoder, progress: Progress | None) -> int:
+def _fill(
+    folder: Path, dataset: FrameSource, view: str, encoder: FrameEncoder, progress: Progress | None
+) -> int:
     """Encode what is missing; return how many frames that was."""
     rows, start = _allocated(folder, (dataset.length, encoder.dim))
     if progress:
@@ -260,7 +272,9 @@ def _locked(folder: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """One entry of the cache as `list_cache` shows it: its folder, size [bytes] and manifest (None: unfinished)."""
+    """One entry of the cache as `list_cache` shows it: its folder, size [bytes] and manifest (None:
+    unfinished).
+    """
 
     folder: Path
     size: int
@@ -279,7 +293,8 @@ def list_cache(root: Path | None = None) -> list[CacheEntry]:
 
 
 def prune_cache(root: Path | None = None, keep_datasets: Collection[str] = ()) -> list[CacheEntry]:
-    """Delete unfinished entries and those of datasets not in `keep_datasets` (fingerprints); return them.
+    """Delete unfinished entries and those of datasets not in `keep_datasets` (fingerprints); return
+    them.
 
     An entry that a process is writing now is left alone.
     """

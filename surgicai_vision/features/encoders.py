@@ -1,8 +1,8 @@
 """Encoders by name, imported on first use.
 
 * `encoder_names()`, `check_encoder_name(name)`, `encoder_card(name)`, `find_weights(name, …)`.
-* `load_encoder(name, weights=None, pool="global", accept_licence=False) -> encoders.base.Encoder`: a
-  callable from (batch, height, width, 3) uint8 RGB to (batch, dimension) float32.
+* `load_encoder(name, weights=None, pool="global", accept_licence=False) -> encoders.base.Encoder`:
+  a callable from (batch, height, width, 3) uint8 RGB to (batch, dimension) float32.
 """
 
 import importlib
@@ -93,8 +93,8 @@ def load_encoder(
 
     Args:
         name: one of `encoder_names()`.
-        weights: a weights file, as `weights_of` takes it; without it the folder $SURGICAI_VISION_WEIGHTS, the
-            hub's cache and a download are tried, in this order.
+        weights: a weights file, as `weights_of` takes it; without it the folder
+            $SURGICAI_VISION_WEIGHTS, the hub's cache and a download are tried, in this order.
         pool: "global", "spatial" or "tokens".
         accept_licence: accept weights under a non-commercial licence.
         deviations: use it as the released code did.
@@ -115,7 +115,7 @@ def load_encoder(
     released = importlib.import_module("encoders.released")
     if statistics:
         released.restore(network, statistics)
-    # Normalised twice, pictures hardly vary; bfloat16 would round away most of what is left of them.
+    # Normalised twice, images hardly vary; bfloat16 would round away most of what is left of them.
     dtype = importlib.import_module("torch").float32 if deviations.preprocessing else None
     return base.Encoder(released.changed(plugin, card, deviations), network, pool, dtype=dtype)
 
@@ -125,19 +125,27 @@ def released_noise(name: str) -> float:
     return float(encoder_plugin(name).released.action_noise)
 
 
-def drifted_statistics(name: str, weights: Path | str | None, accept_licence: bool, batches: Iterable[Any]) -> bytes:
-    """Let a network that is not frozen see pictures; see `encoders.released.drifted`."""
+def drifted_statistics(
+    name: str, weights: Path | str | None, accept_licence: bool, batches: Iterable[Any]
+) -> bytes:
+    """Let a network that is not frozen see images; see `encoders.released.drifted`."""
     plugin = encoder_plugin(name)
     _, network = plugin.build(plugin.card, find_weights(name, weights, accept_licence))
     statistics: bytes = importlib.import_module("encoders.released").drifted(network, batches)
     return statistics
 
 
-def find_weights(name: str, weights: Path | str | None = None, accept_licence: bool = False) -> Path | None:
-    """Find an encoder's weights file without loading it (or torch); see `load_encoder` for the errors."""
+def find_weights(
+    name: str, weights: Path | str | None = None, accept_licence: bool = False
+) -> Path | None:
+    """Find an encoder's weights file without loading it (or torch); see `load_encoder` for the
+    errors.
+    """
     plugin = encoder_plugin(name)
     lookup = importlib.import_module("encoders.weights")
-    return lookup.find(plugin.card, weights_of(name, weights), accept_licence, OFFLINE_ENCODERS, plugin.known)
+    return lookup.find(
+        plugin.card, weights_of(name, weights), accept_licence, OFFLINE_ENCODERS, plugin.known
+    )
 
 
 def weights_of(name: str, given: Path | str | None) -> Path | None:
@@ -145,8 +153,8 @@ def weights_of(name: str, given: Path | str | None) -> Path | None:
 
     Args:
         name: an encoder.
-        given: FILE (for every encoder that has none of its own), NAME=FILE (for that encoder alone), or several of
-            them between commas.
+        given: FILE (for every encoder that has none of its own), NAME=FILE (for that encoder
+            alone), or several of them between commas.
 
     Raises:
         UnknownName: a NAME that no encoder has.
@@ -162,6 +170,8 @@ def weights_of(name: str, given: Path | str | None) -> Path | None:
         else:
             check_encoder_name(owner)
         if owner in files:
-            raise InputError(f"--weights names two files for {f'encoder {owner!r}' if owner else 'every encoder'}.")
+            raise InputError(
+                f"--weights names two files for {f'encoder {owner!r}' if owner else 'every encoder'}."
+            )
         files[owner] = Path(path)
     return files.get(name, files.get(""))

@@ -1,14 +1,16 @@
 """Probe before rollout: what of the needle's pose can be read linearly from an encoder's features.
 
-`probe(dataset, features, seed=…, progress=…) -> Probe`: ridge regression in closed form from the features to the
-position of the needle's tip and to its orientation, judged on episodes it was not fitted on.
+`probe(dataset, features, seed=…, progress=…) -> Probe`: ridge regression in closed form from the
+features to the position of the needle's tip and to its orientation, judged on episodes it was not
+fitted on.
 
-Every episode is held out once (`FOLDS` folds of whole episodes). Each penalty is chosen on the other episodes alone,
-by cross-validation over folds of whole episodes among them. At most `FRAMES` frames are used, evenly spread over every
-episode: neighbouring frames say nearly the same. An orientation is fitted as two columns of its matrix and put back
-among the rotations (Gram–Schmidt). An episode's error is the median over its frames; reported is the median over
-episodes, with a percentile bootstrap over episodes. `chance` is the error of the mean pose of the episodes fitted on:
-what needs no seeing.
+Every episode is held out once (`FOLDS` folds of whole episodes). Each penalty is chosen on the
+other episodes alone, by cross-validation over folds of whole episodes among them. At most `FRAMES`
+frames are used, evenly spread over every episode: neighbouring frames say nearly the same. An
+orientation is fitted as two columns of its matrix and put back among the rotations (Gram–Schmidt).
+An episode's error is the median over its frames; reported is the median over episodes, with a
+percentile bootstrap over episodes. `chance` is the error of the mean pose of the episodes fitted
+on: what needs no seeing.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,7 +52,9 @@ class ProbedData(Protocol):
 
 @dataclass(frozen=True)
 class Measure:
-    """One error: its median over episodes, the 95 % interval of that, and what the mean pose would err."""
+    """One error: its median over episodes, the 95 % interval of that, and what the mean pose would
+    err.
+    """
 
     median: float
     low: float
@@ -83,12 +87,18 @@ class Probe:
         row: dict[str, Any] = {"n": self.n, "frames": self.frames}
         for name, unit, measure in (("tip", "mm", self.tip), ("angle", "deg", self.angle)):
             row[f"{name}_{unit}"] = measure.median
-            row |= {f"{name}_{unit}_{key}": getattr(measure, key) for key in ("low", "high", "chance")}
+            row |= {
+                f"{name}_{unit}_{key}": getattr(measure, key) for key in ("low", "high", "chance")
+            }
         return row
 
 
 def probe(
-    dataset: ProbedData, features: Sequence[Features], *, seed: int = 0, progress: Progress | None = None
+    dataset: ProbedData,
+    features: Sequence[Features],
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
 ) -> Probe:
     """Probe the features of one or several views side by side.
 
@@ -100,14 +110,17 @@ def probe(
 
     Raises:
         UnknownName: a dataset without the needle's pose.
-        InputError: fewer than `FEWEST` episodes, a pose that is not finite, or features of another dataset.
+        InputError: fewer than `FEWEST` episodes, a pose that is not finite, or features of another
+            dataset.
     """
     pose = _pose(dataset)
     if not features:
         raise InputError("A probe needs the features of at least one view.")
     for entry in features:
         if entry.manifest["dataset"] != dataset.fingerprint or len(entry.rows) != dataset.length:
-            raise InputError(f"The features of view '{entry.view}' are of another dataset; encode this one.")
+            raise InputError(
+                f"The features of view '{entry.view}' are of another dataset; encode this one."
+            )
     index = np.asarray(dataset.episode_index)
     rows = spread(index, FRAMES)
     seen = np.concatenate([np.asarray(entry.rows[rows], np.float64) for entry in features], axis=1)
@@ -125,11 +138,20 @@ def probe(
     generator = np.random.default_rng((seed, 1))
     measures = [_measure(errors, index[rows], generator) for errors in (tip, angle)]
     (tip_measure, tips), (angle_measure, angles) = measures
-    return Probe(tip_measure, angle_measure, len(tips), len(rows), tuple(tips.tolist()), tuple(angles.tolist()))
+    return Probe(
+        tip_measure,
+        angle_measure,
+        len(tips),
+        len(rows),
+        tuple(tips.tolist()),
+        tuple(angles.tolist()),
+    )
 
 
 def spread(episode_index: np.ndarray, frames: int) -> NDArray[np.int64]:
-    """Return at most `frames` row numbers, equally many from every episode (all of a shorter one), evenly spread."""
+    """Return at most `frames` row numbers, equally many from every episode (all of a shorter one),
+    evenly spread.
+    """
     episodes = np.unique(episode_index)
     each = max(1, frames // len(episodes))
     chosen = []
@@ -150,12 +172,16 @@ def _pose(dataset: ProbedData) -> Array:
     if episodes < FEWEST:
         raise InputError(f"The dataset has {episodes} episodes; a probe needs at least {FEWEST}.")
     if not np.isfinite(pose).all():
-        raise InputError(f"Column '{names.NEEDLE_POSE}' of the dataset holds values that are not finite.")
+        raise InputError(
+            f"Column '{names.NEEDLE_POSE}' of the dataset holds values that are not finite."
+        )
     return pose
 
 
 def _targets(pose: Array) -> tuple[Array, Array]:
-    """Return the tip's position in the world (n, 3) [m] and two columns of the orientation (n, 6)."""
+    """Return the tip's position in the world (n, 3) [m] and two columns of the orientation (n,
+    6).
+    """
     matrices = np.stack([quaternion_to_matrix(quaternion) for quaternion in pose[:, 3:]])
     tip = pose[:, :3] + matrices @ point(TIP_ANGLE)
     return tip, matrices[:, :, :2].transpose(0, 2, 1).reshape(len(pose), 6)
@@ -183,7 +209,8 @@ def _folds(episode: np.ndarray, count: int, generator: np.random.Generator) -> n
 
 
 class _Reader:
-    """Ridge regression from one table of features, in its dual form: frames are fewer than features.
+    """Ridge regression from one table of features, in its dual form: frames are fewer than
+    features.
 
     Args:
         fitted: features of the rows fitted, (n, d).
@@ -198,7 +225,9 @@ class _Reader:
         gram = fitted @ fitted.T
         self._whole = _Ridge(gram, asked @ fitted.T)
         parts = [folds == fold for fold in np.unique(folds)]
-        self._parts = [(held, _Ridge(gram[np.ix_(~held, ~held)], gram[np.ix_(held, ~held)])) for held in parts]
+        self._parts = [
+            (held, _Ridge(gram[np.ix_(~held, ~held)], gram[np.ix_(held, ~held)])) for held in parts
+        ]
         self._asked = len(asked)
 
     def mean(self, target: Array) -> Array:
@@ -206,7 +235,9 @@ class _Reader:
         return np.broadcast_to(target.mean(0), (self._asked, target.shape[1]))
 
     def answer(self, target: Array) -> Array:
-        """Return the answers (m, k) for targets (n, k), with the penalty that is best across the folds."""
+        """Return the answers (m, k) for targets (n, k), with the penalty that is best across the
+        folds.
+        """
         errors = np.zeros(len(PENALTIES))
         for held, ridge in self._parts:
             for at, penalty in enumerate(PENALTIES):
@@ -228,18 +259,28 @@ class _Ridge:
         values, self._vectors = np.linalg.eigh(centred)
         self._values = np.maximum(values, 0.0)
         self._scale = max(self._values.sum(), np.finfo(float).tiny)
-        self._projected = (cross - cross.mean(1, keepdims=True) - row[None] + row.mean()) @ self._vectors
+        self._projected = (
+            cross - cross.mean(1, keepdims=True) - row[None] + row.mean()
+        ) @ self._vectors
 
     def answer(self, target: Array, penalty: float) -> Array:
-        """Return the answers (m, k) for targets (n, k); `penalty` is a share of the features' total variance."""
+        """Return the answers (m, k) for targets (n, k); `penalty` is a share of the features' total
+        variance.
+        """
         mean = target.mean(0)
         turned = self._vectors.T @ (target - mean) / (self._values + penalty * self._scale)[:, None]
         return self._projected @ turned + mean
 
 
-def _measure(errors: Array, episode: np.ndarray, generator: np.random.Generator) -> tuple[Measure, Array]:
-    """Return the measure of (2, n) errors, read and chance, and the median error of each episode."""
-    of_episode = np.array([np.median(errors[:, episode == one], axis=1) for one in np.unique(episode)])
+def _measure(
+    errors: Array, episode: np.ndarray, generator: np.random.Generator
+) -> tuple[Measure, Array]:
+    """Return the measure of (2, n) errors, read and chance, and the median error of each
+    episode.
+    """
+    of_episode = np.array(
+        [np.median(errors[:, episode == one], axis=1) for one in np.unique(episode)]
+    )
     draws = generator.integers(0, len(of_episode), (RESAMPLES, len(of_episode)))
     low, high = np.quantile(np.median(of_episode[draws, 0], axis=1), (0.025, 0.975))
     median, chance = np.median(of_episode, axis=0)

@@ -1,9 +1,9 @@
 """Report: stored results → one self-contained page and tables.
 
-A results folder holds evaluations (`results.find_evaluations`) anywhere below it and, where a run wrote it,
-`run.json`: its title, command, stages with their seconds, versions and machine. A sweep's cells without a result are
-in the report too, with the reason. Pictures are rendered anew from the states kept of each episode, so results stay
-small and the page can be rebuilt at any time.
+A results folder holds evaluations (`results.find_evaluations`) anywhere below it and, where a run
+wrote it, `run.json`: its title, command, stages with their seconds, versions and machine. A sweep's
+cells without a result are in the report too, with the reason. Images are rendered anew from the
+states kept of each episode, so results stay small and the page can be rebuilt at any time.
 
     reading → groups (over training seeds) → pairs, curves, films → page, tables
 """
@@ -13,15 +13,24 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core import files
+from surgicai_vision.evaluation.storage import GRID_FILE, RUN_FILE
 from surgicai_vision.report import figures, filmstrips, page
 from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.pairs import compare
 from surgicai_vision.report.provenance import commands, origin
-from surgicai_vision.report.reader import GRID_FILE, REFERENCES, RUN_FILE, Result, collect, read_results
+from surgicai_vision.report.reader import REFERENCES, Result, collect, read_results
 from surgicai_vision.report.tables import write_changed, write_tables
 
-__all__ = ["GRID_FILE", "REFERENCES", "RUN_FILE", "Result", "collect", "read_results", "write_report"]
+__all__ = [
+    "GRID_FILE",
+    "REFERENCES",
+    "RUN_FILE",
+    "Result",
+    "collect",
+    "read_results",
+    "write_report",
+]
 
 PAGE_FILE, FAILURES_FILE = "report.html", "failures.jpg"
 Progress = Callable[..., None]
@@ -57,8 +66,10 @@ def write_report(
     filled = {
         **page.numbers(collected, groups, pairs),
         **origin(collected, groups),
-        **figures.static_pictures(groups, reel),
-        "details": page.details(groups, reel, {str(r.folder): commands(r, collected.run) for r in collected.results}),
+        **figures.static_images(groups, reel),
+        "details": page.details(
+            groups, reel, {str(r.folder): commands(r, collected.run) for r in collected.results}
+        ),
         "footer": page.footer(collected),
         "title": title,
     }

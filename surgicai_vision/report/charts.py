@@ -1,7 +1,8 @@
-"""Charts: small SVG drawings with their intervals visible, in colours a colour-blind reader can tell apart.
+"""Charts: small SVG drawings with their intervals visible, in colours a colour-blind reader can
+tell apart.
 
-Series have Okabe and Ito's colours and a marker of their own, so that no chart rests on colour alone. Colours of text
-and axes come from the page's style sheet.
+Series have Okabe and Ito's colours and a marker of their own, so that no chart rests on colour
+alone. Colours of text and axes come from the page's style sheet.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,9 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#7a5195", "#666666")
-"""Okabe and Ito, "Color Universal Design" (2008), the yellow darkened; two more for the seventh and eighth series."""
+"""Okabe and Ito, "Color Universal Design" (2008), the yellow darkened; two more for the seventh and
+eighth series.
+"""
 
 KIND_COLOURS = {
     "success": "#0072b2",
@@ -58,21 +61,32 @@ def heat(rate: float) -> tuple[str, str]:
     at = min(max(rate, 0.0), 1.0) * (len(_HEAT) - 1)
     low = min(int(at), len(_HEAT) - 2)
     share = at - low
-    red, green, blue = (round((1 - share) * a + share * b) for a, b in zip(_HEAT[low], _HEAT[low + 1], strict=True))
-    return f"#{red:02x}{green:02x}{blue:02x}", "#ffffff" if _luminance(red, green, blue) < _MIDDLE else "#000000"
+    red, green, blue = (
+        round((1 - share) * a + share * b) for a, b in zip(_HEAT[low], _HEAT[low + 1], strict=True)
+    )
+    return f"#{red:02x}{green:02x}{blue:02x}", "#ffffff" if _luminance(
+        red, green, blue
+    ) < _MIDDLE else "#000000"
 
 
 def _luminance(*channels: int) -> float:
     """Return the relative luminance of an sRGB colour (WCAG 2)."""
     shares = [channel / 255 for channel in channels]
-    linear = [share / 12.92 if share <= 0.04045 else ((share + 0.055) / 1.055) ** 2.4 for share in shares]
+    linear = [
+        share / 12.92 if share <= 0.04045 else ((share + 0.055) / 1.055) ** 2.4 for share in shares
+    ]
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
 def interval(
-    rate: float, low: float, high: float, label: str, paper: tuple[float, float, float] | None = None
+    rate: float,
+    low: float,
+    high: float,
+    label: str,
+    paper: tuple[float, float, float] | None = None,
 ) -> Markup:
-    """Draw a rate with its interval on an axis from 0 to 1; below it the paper's rate and interval, where it has one.
+    """Draw a rate with its interval on an axis from 0 to 1; below it the paper's rate and interval,
+    where it has one.
 
     Args:
         rate: ours.
@@ -106,7 +120,9 @@ def outcomes(successes: int, failures: dict[str, int]) -> Markup:
         width = 160 * count / total
         colour = KIND_COLOURS.get(kind, KIND_COLOURS["error"])
         title = f"<title>{escape(kind.replace('_', ' '))}: {count} of {total}</title>"
-        parts.append(f'<rect x="{at:.2f}" y="1" width="{width:.2f}" height="12" fill="{colour}">{title}</rect>')
+        parts.append(
+            f'<rect x="{at:.2f}" y="1" width="{width:.2f}" height="12" fill="{colour}">{title}</rect>'
+        )
         at += width
     words = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in failures.items())
     label = escape(f"{successes} of {total} succeeded" + (f"; {words}" if words else ""))
@@ -141,11 +157,17 @@ def curves(
     span = (high - low) or 1.0
 
     def place(x: float, rate: float) -> tuple[float, float]:
-        return LEFT + (WIDTH - LEFT - RIGHT) * (scale(x) - low) / span, TOP + (HEIGHT - TOP - BOTTOM) * (1 - rate)
+        return LEFT + (WIDTH - LEFT - RIGHT) * (scale(x) - low) / span, TOP + (
+            HEIGHT - TOP - BOTTOM
+        ) * (1 - rate)
 
     parts = [_axes(xs, place, x_name, ticks or {})]
     for index, line in enumerate(series):
-        shift = 3.0 * (index - (len(series) - 1) / 2) / max(1, len(series) - 1) if len(series) > 1 else 0.0
+        shift = (
+            3.0 * (index - (len(series) - 1) / 2) / max(1, len(series) - 1)
+            if len(series) > 1
+            else 0.0
+        )
         parts.append(_line(line, index, shift if joined else 0.0, place, joined))
     body = "".join(parts)
     return Markup(
@@ -171,8 +193,12 @@ def _axes(xs: Sequence[float], place: object, x_name: str, ticks: Mapping[float,
     parts = []
     for rate in (0.0, 0.25, 0.5, 0.75, 1.0):
         y = place(xs[0], rate)[1]
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{100 * rate:.0f}</text>')
+        parts.append(
+            f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
+        )
+        parts.append(
+            f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{100 * rate:.0f}</text>'
+        )
     last = -1e9
     for x in xs:
         at = place(x, 0.0)[0]
@@ -180,14 +206,20 @@ def _axes(xs: Sequence[float], place: object, x_name: str, ticks: Mapping[float,
             continue
         last = at
         word = escape(ticks.get(x, f"{x:g}"))
-        parts.append(f'<text x="{at:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{word}</text>')
+        parts.append(
+            f'<text x="{at:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{word}</text>'
+        )
     middle = LEFT + (WIDTH - LEFT - RIGHT) / 2
-    parts.append(f'<text class="name" x="{middle:.1f}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_name)}</text>')
+    parts.append(
+        f'<text class="name" x="{middle:.1f}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_name)}</text>'
+    )
     return "".join(parts)
 
 
 def _line(line: Series, index: int, shift: float, place: object, with_path: bool) -> str:
-    """Draw one series; `shift` moves it sideways, so that intervals at one x stand beside each other."""
+    """Draw one series; `shift` moves it sideways, so that intervals at one x stand beside each
+    other.
+    """
     assert callable(place)
     colour, path, parts = COLOURS[index % len(COLOURS)], [], []
     for point in line.points:
@@ -198,7 +230,9 @@ def _line(line: Series, index: int, shift: float, place: object, with_path: bool
         bar = f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{top:.1f}" y2="{bottom:.1f}" stroke-width="1.6" opacity=".6"/>'
         title = escape(f"{line.name}: {point.text}")
         parts.append(f"<g><title>{title}</title>{bar}{_marker(index, x, y, colour)}</g>")
-    joined = f'<polyline points="{" ".join(path)}" fill="none" stroke-width="1.8"/>' if with_path else ""
+    joined = (
+        f'<polyline points="{" ".join(path)}" fill="none" stroke-width="1.8"/>' if with_path else ""
+    )
     return f'<g stroke="{colour}">{joined}{"".join(parts)}</g>'
 
 

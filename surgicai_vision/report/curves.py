@@ -29,12 +29,16 @@ class Chart:
 
 
 def data_curves(groups: Sequence[Group]) -> list[Chart]:
-    """Success against the number of demonstrations, one chart a task, where a policy has several numbers."""
+    """Success against the number of demonstrations, one chart a task, where a policy has several
+    numbers.
+    """
     found = []
     for task in names.TASKS:
         candidates = [item for item in groups if _evaluated(item, task) and item.condition.plain]
         candidates = [item for item in candidates if item.condition.demonstrations]
-        members = _by_condition(candidates, lambda item: replace(item.condition, demonstrations=None))
+        members = _by_condition(
+            candidates, lambda item: replace(item.condition, demonstrations=None)
+        )
         lines = _series(members, lambda item: float(item.condition.demonstrations or 0))
         if lines:
             found.append(_chart(task, lines, "demonstrations", logarithmic=True))
@@ -42,7 +46,9 @@ def data_curves(groups: Sequence[Group]) -> list[Chart]:
 
 
 def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
-    """Success against the strength of each shift, with the area under the curve; one chart a task and axis."""
+    """Success against the strength of each shift, with the area under the curve; one chart a task
+    and axis.
+    """
     found = []
     for task in names.TASKS:
         mine = [item for item in groups if _evaluated(item, task) and not item.condition.swap]
@@ -57,9 +63,13 @@ def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
 
 
 def _with_zero(groups: Sequence[Group], axis: str) -> list[Group]:
-    """Return the evaluations of one axis; an evaluation without a shift is strength 0 where none was made."""
+    """Return the evaluations of one axis; an evaluation without a shift is strength 0 where none
+    was made.
+    """
     of_axis = [item for item in groups if item.condition.axis == axis]
-    lacking = {_base(item) for item in of_axis} - {_base(item) for item in of_axis if item.condition.strength == 0}
+    lacking = {_base(item) for item in of_axis} - {
+        _base(item) for item in of_axis if item.condition.strength == 0
+    }
     return [*(item for item in groups if item.condition in lacking), *of_axis]
 
 
@@ -76,16 +86,23 @@ def _area(items: Sequence[Group]) -> str:
     strengths = [item.condition.strength for item in ordered]
     if len(set(strengths)) < 2:
         return text.ABSENT
-    wins = [{(r.seed, row["seed"]): float(row["success"]) for r in item.results for row in r.rows} for item in ordered]
+    wins = [
+        {(r.seed, row["seed"]): float(row["success"]) for r in item.results for row in r.rows}
+        for item in ordered
+    ]
     area = statistics.area_under_curve(strengths, [item.rate for item in ordered])
     if any(each.keys() != wins[0].keys() for each in wins):
         return f"{area:.2f}"
-    own = [statistics.area_under_curve(strengths, [each[start] for each in wins]) for start in wins[0]]
+    own = [
+        statistics.area_under_curve(strengths, [each[start] for each in wins]) for start in wins[0]
+    ]
     low, high = statistics.area_interval(own)
     return f"{area:.2f} ({low:.2f}–{high:.2f})"
 
 
-def _by_condition(groups: Sequence[Group], same: Callable[[Group], Condition]) -> dict[Condition, list[Group]]:
+def _by_condition(
+    groups: Sequence[Group], same: Callable[[Group], Condition]
+) -> dict[Condition, list[Group]]:
     """Gather the groups that are the `same` but for what the curve runs along."""
     found: dict[Condition, list[Group]] = {}
     for item in groups:
@@ -105,7 +122,12 @@ def _series(members: dict[Condition, list[Group]], x: Callable[[Group], float]) 
 
 def _point(x: float, item: Group) -> Point:
     count = f"{item.successes}/{item.episodes}"
-    return Point(x, item.rate, *item.interval, f"{count}, {text.percent(item.rate)} ({text.interval(item.interval)})")
+    return Point(
+        x,
+        item.rate,
+        *item.interval,
+        f"{count}, {text.percent(item.rate)} ({text.interval(item.interval)})",
+    )
 
 
 def _chart(
@@ -120,10 +142,18 @@ def _chart(
     rows = []
     for line in lines:
         known = {point.x: point.text for point in line.points}
-        rows.append((line.name, *(known.get(x, text.ABSENT) for x in xs), *((extra[1][line.name],) if extra else ())))
+        rows.append(
+            (
+                line.name,
+                *(known.get(x, text.ABSENT) for x in xs),
+                *((extra[1][line.name],) if extra else ()),
+            )
+        )
     drawn = lines[:MOST]
     more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
-    drawing = charts.curves(drawn, x_name, logarithmic=logarithmic, label=f"{title}: success [%] against {x_name}")
+    drawing = charts.curves(
+        drawn, x_name, logarithmic=logarithmic, label=f"{title}: success [%] against {x_name}"
+    )
     head = ("policy", *(f"{x:g}" for x in xs), *((extra[0],) if extra else ()))
     return Chart(title, drawing, charts.key([line.name for line in drawn]), head, tuple(rows), more)
 
@@ -137,7 +167,10 @@ def survival(groups: Sequence[Group]) -> Chart | None:
         stages = [int(row.get("stages") or 0) for row in item.rows]
         counts = [sum(stage > index for stage in stages) for index in range(len(names.SUBTASKS))]
         bounds = [statistics.clopper_pearson(count, item.episodes) for count in counts]
-        texts = [f"{count}/{item.episodes} ({text.interval(b)})" for count, b in zip(counts, bounds, strict=True)]
+        texts = [
+            f"{count}/{item.episodes} ({text.interval(b)})"
+            for count, b in zip(counts, bounds, strict=True)
+        ]
         points = [
             Point(index + 1, count / item.episodes, *b, words)
             for index, (count, b, words) in enumerate(zip(counts, bounds, texts, strict=True))
@@ -148,11 +181,15 @@ def survival(groups: Sequence[Group]) -> Chart | None:
         return None
     drawn = lines[:MOST]
     ticks = {float(index + 1): name for index, name in enumerate(names.SUBTASKS)}
-    drawing = charts.curves(drawn, "finished, and all before it", label="survival along the chain", ticks=ticks)
+    drawing = charts.curves(
+        drawn, "finished, and all before it", label="survival along the chain", ticks=ticks
+    )
     more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
     key = charts.key([line.name for line in drawn])
     return Chart("", drawing, key, ("policy", *names.SUBTASKS), tuple(rows), more)
 
 
 def _evaluated(item: Group, task: str, trained: bool = True) -> bool:
-    return bool(item.episodes and item.condition.task == task and (item.condition.trained or not trained))
+    return bool(
+        item.episodes and item.condition.task == task and (item.condition.trained or not trained)
+    )

@@ -1,4 +1,6 @@
-"""Episodes: what a click on a cell shows. Every episode's outcome, the commands, hashes and film strips."""
+"""Episodes: what a click on a cell shows. Every episode's outcome, the commands, hashes and film
+strips.
+"""
 
 import hashlib
 import json
@@ -13,7 +15,15 @@ from surgicai_vision.report.filmstrips import Reel, Strip
 from surgicai_vision.report.groups import MEASURES, Group
 from surgicai_vision.report.reader import Result
 
-LETTERS = {"": "s", "missed": "m", "dropped": "d", "wrong_hole": "w", "time": "t", "physics": "p", "error": "e"}
+LETTERS = {
+    "": "s",
+    "missed": "m",
+    "dropped": "d",
+    "wrong_hole": "w",
+    "time": "t",
+    "physics": "p",
+    "error": "e",
+}
 """Outcome of an episode → its letter in the page's data."""
 
 _DARK_TEXT = ("dropped", "time", "missed")
@@ -41,7 +51,8 @@ def film_id(identity: tuple[str, int]) -> str:
 def group_details(
     item: Group, reel: Reel, commands: dict[str, list[str]], on_page: set[tuple[str, int]]
 ) -> dict[str, Any]:
-    """Return one condition: its cells with their episodes, its films, what was measured, what is missing.
+    """Return one condition: its cells with their episodes, its films, what was measured, what is
+    missing.
 
     Args:
         item: the condition.
@@ -63,7 +74,9 @@ def group_details(
         "across": item.across_text() if item.across else "",
         "cells": [_cell(result, commands.get(str(result.folder), [])) for result in item.results],
         "measures": _measures(item) if item.episodes else [],
-        "missing": [{"seed": cell.seed, "state": cell.state, "reason": cell.reason} for cell in item.missing],
+        "missing": [
+            {"seed": cell.seed, "state": cell.state, "reason": cell.reason} for cell in item.missing
+        ],
         "films": films,
     }
 
@@ -78,7 +91,9 @@ def _cell(result: Result, commands: Sequence[str]) -> dict[str, Any]:
         "count": f"{k}/{len(rows)}",
         "interval": text.interval(clopper_pearson(k, len(rows))),
         "starts": _starts([row["seed"] for row in rows]),
-        "outcomes": "".join("s" if row["success"] else LETTERS.get(row["failure"], "?") for row in rows),
+        "outcomes": "".join(
+            "s" if row["success"] else LETTERS.get(row["failure"], "?") for row in rows
+        ),
         "steps": [row["steps"] for row in rows],
         "mm": [_rounded(row.get("d_trans_mm")) for row in rows],
         "deg": [_rounded(row.get("d_angle_deg")) for row in rows],
@@ -109,7 +124,10 @@ def _facts(result: Result) -> list[tuple[str, str]]:
 def _measures(item: Group) -> list[tuple[str, str]]:
     """Return what was measured: lengths and steps of successes, medians of the rest."""
     spread = [
-        ("trajectory length of successes [mm]", text.mean(item.on_successes("trajectory_length_mm"))),
+        (
+            "trajectory length of successes [mm]",
+            text.mean(item.on_successes("trajectory_length_mm")),
+        ),
         ("time steps of successes", text.mean(item.on_successes("steps"))),
     ]
     for column, what, unit, _ in MEASURES:

@@ -1,4 +1,6 @@
-"""Conditions: what was evaluated, but for the training seed, as cells, checkpoints and tables tell it."""
+"""Conditions: what was evaluated, but for the training seed, as cells, checkpoints and tables tell
+it.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -18,7 +20,8 @@ class Condition:
 
     Attributes:
         task: one of `names.TASKS`.
-        encoder: the encoder; without one "proprioception" or "state", or the name of the chain or reference.
+        encoder: the encoder; without one "proprioception" or "state", or the name of the chain or
+            reference.
         views: its views.
         chain: how subtasks end in a chain, or "".
         trained_by: the policy's kind.
@@ -30,7 +33,8 @@ class Condition:
         strength: how much.
         swap: subtask in which the expert acts (chain), or "".
         trained: whether a policy was trained.
-        place: where it stands, if another evaluation of the same condition and training seed stands elsewhere.
+        place: where it stands, if another evaluation of the same condition and training seed stands
+            elsewhere.
     """
 
     task: str
@@ -53,7 +57,12 @@ class Condition:
         """Everything but inputs and demonstrations that is not as usual: not bc, global, paper."""
         usual = ((self.trained_by, "bc"), (self.pool, "global"), (self.recipe, "paper"))
         chain = f"chain, {self.chain} end" if self.chain else ""
-        parts = [chain, *(part for part, common in usual if part != common), " + ".join(self.changes), self.place]
+        parts = [
+            chain,
+            *(part for part, common in usual if part != common),
+            " + ".join(self.changes),
+            self.place,
+        ]
         return " · ".join(part for part in parts if part)
 
     @property
@@ -87,7 +96,9 @@ def condition_of(cell: Mapping[str, Any]) -> Condition:
     epochs = [f"{cell['epochs']}epochs"] if cell.get("epochs") else []
     return Condition(
         task=str(cell["task"]),
-        encoder=str(cell.get("encoder") or ("state" if cell.get("privileged") else "proprioception")),
+        encoder=str(
+            cell.get("encoder") or ("state" if cell.get("privileged") else "proprioception")
+        ),
         views=tuple(cell.get("view") or ()),
         chain=str(cell.get("chain") or ""),
         trained_by=cell.get("policy", "bc"),
@@ -100,7 +111,9 @@ def condition_of(cell: Mapping[str, Any]) -> Condition:
 
 
 def condition_of_policy(summary: Mapping[str, Any], about: Mapping[str, Any]) -> Condition:
-    """Return the condition of an evaluation that belongs to no cell, from what is kept beside it."""
+    """Return the condition of an evaluation that belongs to no cell, from what is kept beside
+    it.
+    """
     checkpoint = about.get("checkpoint") or {}
     encoder = about.get("encoder") or summary["policy"]
     if checkpoint and not about.get("views"):
@@ -124,8 +137,19 @@ def _told(changes: Sequence[str]) -> tuple[str, ...]:
 
 
 def order(condition: Condition) -> tuple[Any, ...]:
-    """By task; in it trained policies first, by encoder, views and what else they are, then the references."""
-    views = [names.VIEWS.index(view) if view in names.VIEWS else len(names.VIEWS) for view in condition.views]
+    """By task; in it trained policies first, by encoder, views and what else they are, then the
+    references.
+    """
+    views = [
+        names.VIEWS.index(view) if view in names.VIEWS else len(names.VIEWS)
+        for view in condition.views
+    ]
     task = names.TASKS.index(condition.task) if condition.task in names.TASKS else len(names.TASKS)
-    more = (condition.variant, condition.demonstrations or 0, condition.axis, condition.strength, condition.swap)
+    more = (
+        condition.variant,
+        condition.demonstrations or 0,
+        condition.axis,
+        condition.strength,
+        condition.swap,
+    )
     return (task, not condition.trained, not views, condition.encoder, len(views), views, *more)

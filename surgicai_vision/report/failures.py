@@ -1,4 +1,4 @@
-"""Failures: one picture of how the best policies fail, for a paper or a README: a film strip each."""
+"""Failures: one image of how the best policies fail, for a paper or a README: a film strip each."""
 
 import base64
 import io
@@ -10,15 +10,17 @@ from surgicai_vision.report.filmstrips import Reel, Strip
 from surgicai_vision.report.groups import Group, best_trained, of_task
 
 MOST = 8
-"""Strips of the picture at most."""
+"""Strips of the image at most."""
 DOTS, QUALITY = 60, 80
 """Dots per inch, of 2.1 inches a frame, and JPEG quality: eight strips stay below 300 kB."""
 
 
 def failure_sheet(groups: Sequence[Group], reel: Reel) -> bytes | None:
-    """Return a JPEG with failures of the best trained policy of each task, or None where no strip shows one.
+    """Return a JPEG with failures of the best trained policy of each task, or None where no strip
+    shows one.
 
-    Each kind of failure stands once, as its policy's first view saw it; frames are evenly spaced over the episode.
+    Each kind of failure stands once, as its policy's first view saw it; frames are evenly spaced
+    over the episode.
     """
     strips = list(_failures(groups, reel))[:MOST]
     if not strips:
@@ -46,7 +48,7 @@ def _title(strip: Strip) -> str:
     return f"{strip.choice.row['task']} {strip.choice.row['seed']}\n{strip.outcome}"
 
 
-def _frames(strip: Strip, count: int) -> list[contact_sheet.Picture]:
+def _frames(strip: Strip, count: int) -> list[contact_sheet.Image]:
     """Return the strip's frames, the last again where it has fewer than `count`."""
     frames = [contact_sheet.decoded(base64.b64decode(frame)) for frame in strip.frames]
     return [*frames, *[frames[-1]] * (count - len(frames))]

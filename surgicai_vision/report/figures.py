@@ -1,4 +1,6 @@
-"""Show: the page's static pictures. What each view sees, a success and a failure, rollouts side by side."""
+"""Show: the page's static images. What each view sees, a success and a failure, rollouts side by
+side.
+"""
 
 import base64
 from collections.abc import Sequence
@@ -15,18 +17,25 @@ from surgicai_vision.report.filmstrips import Choice, Reel, sight
 from surgicai_vision.report.groups import Group, best_trained
 
 SIZE = 224
-"""Height and width of the large pictures [px]."""
+"""Height and width of the large images [px]."""
 
 
-def static_pictures(groups: Sequence[Group], reel: Reel) -> dict[str, Any]:
-    """Return views, a success, a failure and the side-by-side rollouts, or the reason why there are none."""
+def static_images(groups: Sequence[Group], reel: Reel) -> dict[str, Any]:
+    """Return views, a success, a failure and the side-by-side rollouts, or the reason why there are
+    none.
+    """
     colours = ["#" + bytes(colour).hex() for colour in contact_sheet.PALETTE]
-    parts = [{"name": name, "colour": colour} for name, colour in zip(names.PARTS, colours, strict=True)]
-    shown = {task: [_rollout(choice, reel) for choice in choices] for task, choices in reel.compared.items()}
+    parts = [
+        {"name": name, "colour": colour} for name, colour in zip(names.PARTS, colours, strict=True)
+    ]
+    shown = {
+        task: [_rollout(choice, reel) for choice in choices]
+        for task, choices in reel.compared.items()
+    }
     page: dict[str, Any] = {
-        "picture_size": SIZE,
+        "image_size": SIZE,
         "parts": parts,
-        "no_pictures": "",
+        "no_images": "",
         "compared": [
             {"task": task, "start": reel.compared[task][0].row["seed"], "rollouts": rollouts}
             for task, found in shown.items()
@@ -37,18 +46,25 @@ def static_pictures(groups: Sequence[Group], reel: Reel) -> dict[str, Any]:
     }
     try:
         if reel.problem:
-            raise SurgicaiError(reel.problem.removeprefix("No pictures: "))
+            raise SurgicaiError(reel.problem.removeprefix("No images: "))
         outcomes = ((True, "success"), (False, "failure"))
         page["strips"] = [_strip(choose(groups, success=won), word) for won, word in outcomes]
         page["views"] = _views(groups)
     except SurgicaiError as error:
-        reason = f"No pictures: {error}"
-        page.update(views=[], strips=[{"title": "", "frames": [], "text": reason}], no_pictures=reason, compared=[])
+        reason = f"No images: {error}"
+        page.update(
+            views=[],
+            strips=[{"title": "", "frames": [], "text": reason}],
+            no_images=reason,
+            compared=[],
+        )
     return page
 
 
 def choose(groups: Sequence[Group], success: bool) -> Choice | None:
-    """Choose the episode for a film: the best trained policy's first, else another's, references last."""
+    """Choose the episode for a film: the best trained policy's first, else another's, references
+    last.
+    """
     best = best_trained(groups)
     ordered = sorted(groups, key=lambda item: (item is not best, not item.condition.trained))
     for item in ordered:
@@ -62,13 +78,17 @@ def choose(groups: Sequence[Group], success: bool) -> Choice | None:
 def _strip(choice: Choice | None, kind: str) -> dict[str, Any]:
     """Render the large film strip of one episode."""
     if choice is None:
-        return {"title": f"No {kind}", "frames": [], "text": f"No episode of any policy was a {kind}."}
+        return {
+            "title": f"No {kind}",
+            "frames": [],
+            "text": f"No episode of any policy was a {kind}.",
+        }
     row, condition = choice.row, choice.group.condition
     view = next(iter(condition.views), "front")
     film = read_film(choice.result.folder, row["seed"])
-    with contact_sheet.stage(choice.result.config, SIZE) as picture:
+    with contact_sheet.stage(choice.result.config, SIZE) as image:
         frames = [
-            {"step": int(step), "data": _data(contact_sheet.jpeg(picture(state, *sight(view))))}
+            {"step": int(step), "data": _data(contact_sheet.jpeg(image(state, *sight(view))))}
             for step, state in zip(film.steps, film.states, strict=True)
         ]
     end = f"{row['d_trans_mm']:.1f} mm and {row['d_angle_deg']:.1f}° from the goal at the end"
@@ -101,18 +121,26 @@ def _views(groups: Sequence[Group]) -> list[dict[str, Any]]:
         return []
     film, start = read_film(chosen.result.folder, chosen.row["seed"]), chosen.row["seed"]
     views = []
-    with contact_sheet.stage(chosen.result.config, SIZE) as picture:
+    with contact_sheet.stage(chosen.result.config, SIZE) as image:
         for view in shown:
-            frames = {modality: picture(film.states[0], view, modality) for modality in names.MODALITIES}
-            needle = np.all(frames[names.SEGMENTATION] == contact_sheet.PALETTE[names.PARTS.index("needle")], axis=-1)
+            frames = {
+                modality: image(film.states[0], view, modality) for modality in names.MODALITIES
+            }
+            needle = np.all(
+                frames[names.SEGMENTATION] == contact_sheet.PALETTE[names.PARTS.index("needle")],
+                axis=-1,
+            )
             share = 100 * float(needle.mean())
             views.append(
                 {
                     "name": view,
-                    "text": f"start {start}; the needle covers {share:.2f} % of the picture. "
+                    "text": f"start {start}; the needle covers {share:.2f} % of the image. "
                     "Depth: near is red, far is blue.",
-                    "pictures": [
-                        {"name": name.upper() if name == names.RGB else name, "data": _picture_data(frame, name)}
+                    "images": [
+                        {
+                            "name": name.upper() if name == names.RGB else name,
+                            "data": _image_data(frame, name),
+                        }
                         for name, frame in frames.items()
                     ],
                 }
@@ -120,7 +148,7 @@ def _views(groups: Sequence[Group]) -> list[dict[str, Any]]:
     return views
 
 
-def _picture_data(frame: contact_sheet.Picture, modality: str) -> str:
+def _image_data(frame: contact_sheet.Image, modality: str) -> str:
     if modality == names.SEGMENTATION:
         return _data(contact_sheet.png(frame), "png")
     return _data(contact_sheet.jpeg(frame, 90))

@@ -1,8 +1,9 @@
 """Films: which episodes are shown, and their strips, within the page's budget.
 
-A strip is a few frames of one episode as small JPEGs, rendered anew from the states kept. Episodes are chosen in
-rounds, so that a page that may hold few strips still shows every policy: first each task's compared start, then a
-success and a failure of each condition, then a failure of another kind.
+A strip is a few frames of one episode as small JPEGs, rendered anew from the states kept. Episodes
+are chosen in rounds, so that a page that may hold few strips still shows every policy: first each
+task's compared start, then a success and a failure of each condition, then a failure of another
+kind.
 """
 
 import base64
@@ -23,7 +24,9 @@ from surgicai_vision.report.reader import Result
 FRAMES, SIZE, QUALITY = 8, 128, 72
 """Frames of a strip, their height and width [px] and their JPEG quality."""
 BUDGET = 4_000_000
-"""Characters of base64 that all strips together may take: with the rest the page stays below 8 MB."""
+"""Characters of base64 that all strips together may take: with the rest the page stays below 8
+MB.
+"""
 MOST_STRIPS = 160
 COMPARED = 5
 """Policies whose rollouts from one start stand beside each other."""
@@ -57,7 +60,9 @@ class Strip:
         """How the episode ended, in words."""
         row = self.choice.row
         end = f"after {row['steps']} steps"
-        return f"success {end}" if row["success"] else f"{str(row['failure']).replace('_', ' ')} {end}"
+        return (
+            f"success {end}" if row["success"] else f"{str(row['failure']).replace('_', ' ')} {end}"
+        )
 
 
 @dataclass
@@ -68,7 +73,7 @@ class Reel:
         strips: by the episode's identity.
         compared: task → the identities of one start's rollouts.
         wanted: how many episodes were asked for.
-        problem: why there are no pictures, or "".
+        problem: why there are no images, or "".
     """
 
     strips: dict[tuple[str, int], Strip] = field(default_factory=dict)
@@ -77,7 +82,9 @@ class Reel:
     problem: str = ""
 
 
-def make_reel(groups: Sequence[Group], most: int = MOST_STRIPS, progress: Callable[..., None] | None = None) -> Reel:
+def make_reel(
+    groups: Sequence[Group], most: int = MOST_STRIPS, progress: Callable[..., None] | None = None
+) -> Reel:
     """Choose and render.
 
     Args:
@@ -85,7 +92,9 @@ def make_reel(groups: Sequence[Group], most: int = MOST_STRIPS, progress: Callab
         most: strips at most; 0 renders nothing.
         progress: called as progress(strips done, strips).
     """
-    reel = Reel(compared={task: chosen for task in names.TASKS if (chosen := comparison(groups, task))})
+    reel = Reel(
+        compared={task: chosen for task in names.TASKS if (chosen := comparison(groups, task))}
+    )
     wanted = {choice.identity: choice for choice in _wanted(groups, reel.compared)}
     reel.wanted = len(wanted)
     chosen = list(wanted.values())[:most]
@@ -100,12 +109,14 @@ def make_reel(groups: Sequence[Group], most: int = MOST_STRIPS, progress: Callab
             if progress:
                 progress(done, len(chosen))
     except SurgicaiError as error:
-        reel.problem = f"No pictures: {error}"
+        reel.problem = f"No images: {error}"
     return reel
 
 
 def comparison(groups: Sequence[Group], task: str) -> list[Choice]:
-    """Choose the start on which the policies of a task disagree most, and up to `COMPARED` rollouts from it."""
+    """Choose the start on which the policies of a task disagree most, and up to `COMPARED` rollouts
+    from it.
+    """
     shown = [item for item in of_task(groups, task) if item.episodes]
     trained = [item for item in shown if item.condition.trained]
     if len(shown) < 2 or not trained:
@@ -120,7 +131,9 @@ def comparison(groups: Sequence[Group], task: str) -> list[Choice]:
         return len(starts[start]), min(sum(wins), len(wins) - sum(wins)), sum(wins)
 
     best = max(sorted(starts, reverse=True), key=disagreement)
-    ranked = sorted(starts[best], key=lambda choice: (not choice.group.condition.trained, -choice.group.rate))
+    ranked = sorted(
+        starts[best], key=lambda choice: (not choice.group.condition.trained, -choice.group.rate)
+    )
     won = [choice for choice in ranked if choice.row["success"]]
     lost = [choice for choice in ranked if not choice.row["success"]]
     half = COMPARED // 2
@@ -162,14 +175,14 @@ def _render(choices: Sequence[Choice]) -> Iterator[Strip]:
     for choice in choices:
         scenes.setdefault(repr(sorted(to_mapping(choice.result.config).items())), []).append(choice)
     for members in scenes.values():
-        with contact_sheet.stage(members[0].result.config, SIZE, "fast") as picture:
+        with contact_sheet.stage(members[0].result.config, SIZE, "fast") as image:
             for choice in members:
-                strip = _strip(choice, picture)
+                strip = _strip(choice, image)
                 if strip is not None:
                     yield strip
 
 
-def _strip(choice: Choice, picture: Any) -> Strip | None:
+def _strip(choice: Choice, image: Any) -> Strip | None:
     """Render one episode as the policy's first view saw it; None where no state of it was kept."""
     view = next(iter(choice.group.condition.views), "front")
     film = read_film(choice.result.folder, choice.row["seed"])
@@ -177,7 +190,8 @@ def _strip(choice: Choice, picture: Any) -> Strip | None:
         return None
     kept = np.unique(np.linspace(0, len(film.steps) - 1, FRAMES).round().astype(int))
     frames = [
-        base64.b64encode(contact_sheet.jpeg(picture(film.states[at], *sight(view)), QUALITY)).decode() for at in kept
+        base64.b64encode(contact_sheet.jpeg(image(film.states[at], *sight(view)), QUALITY)).decode()
+        for at in kept
     ]
     return Strip(choice, view, tuple(int(film.steps[at]) for at in kept), tuple(frames))
 

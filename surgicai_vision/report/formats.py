@@ -7,7 +7,17 @@ from surgicai_vision.report import paper, text
 from surgicai_vision.report.groups import Group
 from surgicai_vision.report.paper_comparison import beside_paper, our_text, paper_text
 
-HEAD = ("task", "policy", "views", "k/n", "success", "95 % interval", "across training seeds", "length [mm]", "steps")
+HEAD = (
+    "task",
+    "policy",
+    "views",
+    "k/n",
+    "success",
+    "95 % interval",
+    "across training seeds",
+    "length [mm]",
+    "steps",
+)
 CAPTION = (
     "Intervals: exact (Clopper-Pearson), 95 %, episodes of all training seeds together; across training seeds: mean, "
     "standard deviation and hierarchical bootstrap interval. Length and steps: mean and standard deviation over "
@@ -25,21 +35,32 @@ def markdown(groups: Sequence[Group], title: str) -> str:
     parts = [f"# {_escaped(title)}", ""]
     rows = beside_paper(groups)
     if rows:
-        parts += [f"Success beside the paper's ({paper.SOURCE}); ours: k/n and exact 95 % interval.", ""]
+        parts += [
+            f"Success beside the paper's ({paper.SOURCE}); ours: k/n and exact 95 % interval.",
+            "",
+        ]
         parts += _markdown(("task", "encoder", "front, paper", "front, ours", "back, paper", "back, ours"), [
             (task, encoder, *_paired(task, encoder, pairs)) for task, encoder, pairs in rows
         ])  # fmt: skip
-    parts += [f"Success from held-out starts. {CAPTION}", "", *_markdown(HEAD, [_record(item) for item in groups])]
+    parts += [
+        f"Success from held-out starts. {CAPTION}",
+        "",
+        *_markdown(HEAD, [_record(item) for item in groups]),
+    ]
     missing = [cell for item in groups for cell in item.missing]
     if missing:
-        lines = [(c.condition.task, c.condition.label, str(c.seed), c.state, c.reason) for c in missing]
+        lines = [
+            (c.condition.task, c.condition.label, str(c.seed), c.state, c.reason) for c in missing
+        ]
         parts += ["Cells without a result.", ""]
         parts += _markdown(("task", "policy", "training seed", "state", "reason"), lines)
     return "\n".join(parts).rstrip() + "\n"
 
 
 def latex(groups: Sequence[Group], title: str) -> str:
-    """Return the tables as LaTeX; the document needs the package booktabs and, for many rows, a smaller font."""
+    """Return the tables as LaTeX; the document needs the package booktabs and, for many rows, a
+    smaller font.
+    """
     parts = ["% needs \\usepackage{booktabs}"]
     rows = beside_paper(groups)
     if rows:
@@ -47,10 +68,14 @@ def latex(groups: Sequence[Group], title: str) -> str:
         spans = r"\multicolumn{2}{c}{front} & \multicolumn{2}{c}{back} \\"
         head = ["& & " + spans, r"\cmidrule(lr){3-4}\cmidrule(lr){5-6}"]
         head.append(_latex_row(("task", "encoder", "paper", "ours", "paper", "ours")))
-        caption = f"Success rates beside those of {paper.SOURCE}; ours: k/n and exact 95 % interval."
+        caption = (
+            f"Success rates beside those of {paper.SOURCE}; ours: k/n and exact 95 % interval."
+        )
         parts += _latex_table("llrrrr", head, body, caption, "tab:paper")
     body = [_record(item) for item in groups]
-    parts += _latex_table("lllrrrrrr", [_latex_row(HEAD)], body, f"{title}. {CAPTION}", "tab:success")
+    parts += _latex_table(
+        "lllrrrrrr", [_latex_row(HEAD)], body, f"{title}. {CAPTION}", "tab:success"
+    )
     return "\n".join(parts) + "\n"
 
 
@@ -65,7 +90,14 @@ def _record(item: Group) -> tuple[str, ...]:
         return (*start, item.missing[0].state, *[text.ABSENT] * 5)
     count = f"{item.successes}/{item.episodes}"
     spread = [text.mean(item.on_successes(column)) for column in ("trajectory_length_mm", "steps")]
-    return (*start, count, text.percent(item.rate), text.interval(item.interval), item.across_text(), *spread)
+    return (
+        *start,
+        count,
+        text.percent(item.rate),
+        text.interval(item.interval),
+        item.across_text(),
+        *spread,
+    )
 
 
 def _policy(item: Group) -> str:
@@ -75,7 +107,9 @@ def _policy(item: Group) -> str:
     return ", ".join(parts + ([f"expert in {condition.swap}"] if condition.swap else []))
 
 
-def _paired(task: str, encoder: str, pairs: Sequence[tuple[float | None, Group | None]]) -> Iterator[str]:
+def _paired(
+    task: str, encoder: str, pairs: Sequence[tuple[float | None, Group | None]]
+) -> Iterator[str]:
     for rate, item in pairs:
         yield paper_text(task, encoder, rate)
         yield our_text(item)

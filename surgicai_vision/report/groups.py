@@ -1,7 +1,8 @@
 """Groups: the cells that differ by nothing but their training seed, counted together.
 
-Episodes of one cell: k/n with the exact (Clopper–Pearson) interval. Over several training seeds: mean ± standard
-deviation of the cells' rates, and a hierarchical bootstrap interval (training seeds, then episodes).
+Episodes of one cell: k/n with the exact (Clopper–Pearson) interval. Over several training seeds:
+mean ± standard deviation of the cells' rates, and a hierarchical bootstrap interval (training
+seeds, then episodes).
 """
 
 from collections import Counter
@@ -27,7 +28,12 @@ MEASURES = (
     ("exit_mm", "exit error", "mm", "where the needle passed the exit, from the hole's centre"),
     ("slip_mm", "needle slip", "mm", "largest slip of the needle in the grip, where it was held"),
     ("slip_deg", "needle slip", "°", "largest turn of the needle in the grip, where it was held"),
-    ("tissue_force_n", "tissue force", "N", "largest contact force of needle or instrument on the tissue"),
+    (
+        "tissue_force_n",
+        "tissue force",
+        "N",
+        "largest contact force of needle or instrument on the tissue",
+    ),
 )
 """Columns of an episode's row that are no count: name, what, unit, explanation."""
 
@@ -123,13 +129,17 @@ class Group:
 
 
 def measured(row: Mapping[str, Any], column: str) -> float | None:
-    """Return a value of an episode; a needle that was never held has not slipped by 0 mm: it has no slip."""
+    """Return a value of an episode; a needle that was never held has not slipped by 0 mm: it has no
+    slip.
+    """
     absent = column.startswith("slip") and row["failure"] == "missed"
     return None if absent else row.get(column)
 
 
 def group(collected: Collected) -> list[Group]:
-    """Return one group for each condition, in the order of the results, those without any at their places."""
+    """Return one group for each condition, in the order of the results, those without any at their
+    places.
+    """
     conditions = {result.condition for result in collected.results}
     conditions |= {cell.condition for cell in collected.missing}
     alike = Counter(replace(condition, demonstrations=None) for condition in conditions)
@@ -145,8 +155,14 @@ def group(collected: Collected) -> list[Group]:
 
 
 def of_task(groups: Sequence[Group], task: str, *, plain: bool = True) -> list[Group]:
-    """Return the groups of a task; with `plain` only those without a shift and without a swapped expert."""
-    return [item for item in groups if item.condition.task == task and (item.condition.plain or not plain)]
+    """Return the groups of a task; with `plain` only those without a shift and without a swapped
+    expert.
+    """
+    return [
+        item
+        for item in groups
+        if item.condition.task == task and (item.condition.plain or not plain)
+    ]
 
 
 def best_trained(groups: Sequence[Group]) -> Group | None:
@@ -156,7 +172,9 @@ def best_trained(groups: Sequence[Group]) -> Group | None:
 
 
 def as_trained(groups: Sequence[Group]) -> list[Group]:
-    """Return the evaluations without a shift; where there are none, those at strength 0, else all."""
+    """Return the evaluations without a shift; where there are none, those at strength 0, else
+    all.
+    """
     evaluated = [item for item in groups if item.episodes]
     plain = [item for item in evaluated if item.condition.plain]
     return plain or [item for item in evaluated if not item.condition.strength] or evaluated

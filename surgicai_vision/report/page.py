@@ -26,13 +26,17 @@ def render(page: dict[str, Any]) -> str:
 
     loader = PackageLoader("surgicai_vision.report", "templates")
     environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     return environment.get_template("report.html.j2").render(page)
 
 
 def numbers(collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]) -> dict[str, Any]:
-    """Return everything but pictures and provenance."""
+    """Return everything but images and provenance."""
     index = {item.condition: at for at, item in enumerate(groups)}
     best = {task: best_trained(of_task(groups, task)) for task in names.TASKS}
     return {
@@ -43,13 +47,17 @@ def numbers(collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]
         "paper_episodes": paper.EPISODES,
         "ceilings": sections.ceilings(groups),
         "heats": sections.heat_maps(groups, index),
-        "rows": [sections.success_row(at, item, best.get(item.condition.task)) for at, item in enumerate(groups)],
+        "rows": [
+            sections.success_row(at, item, best.get(item.condition.task))
+            for at, item in enumerate(groups)
+        ],
         "across_seeds": any(item.across for item in groups),
         "shifted": len({item.condition.plain for item in groups}) > 1,
         "filters": sections.filters(groups),
         "caption": sections.caption(groups),
         "kinds": [
-            (kind.replace("_", " "), charts.KIND_COLOURS[kind]) for kind in ("success", *sections.kinds(groups))
+            (kind.replace("_", " "), charts.KIND_COLOURS[kind])
+            for kind in ("success", *sections.kinds(groups))
         ],
         "measures": sections.measures(groups),
         "data_curves": curves.data_curves(groups),
@@ -70,7 +78,10 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
     evaluated = as_trained(groups)
     tasks = list(dict.fromkeys(item.condition.task for item in evaluated))
     if not evaluated:
-        return {"headline": "No cell has a result yet", "lead": "What is missing, and why, stands below."}
+        return {
+            "headline": "No cell has a result yet",
+            "lead": "What is missing, and why, stands below.",
+        }
     if len(tasks) > 1:
         return _headline_of_many(evaluated, tasks)
     shown = best_trained(evaluated) or evaluated[0]
@@ -80,27 +91,48 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
     if shown.condition.trained and not shown.successes:
         sentence = f"No trained policy solves any of {shown.episodes} held-out starts of {task}"
     first = f"{text.percent(shown.rate)}, 95 % interval {text.interval(shown.interval)}."
-    lead = f"That is {first}" if shown.successes or not shown.condition.trained else f"The best: {first}"
-    others = [f"{item.label} {item.successes}/{item.episodes}" for item in evaluated if item is not shown]
-    return {"headline": sentence, "lead": lead + (f" Beside it: {'; '.join(others[:FEW])}." if others else "")}
+    lead = (
+        f"That is {first}"
+        if shown.successes or not shown.condition.trained
+        else f"The best: {first}"
+    )
+    others = [
+        f"{item.label} {item.successes}/{item.episodes}" for item in evaluated if item is not shown
+    ]
+    return {
+        "headline": sentence,
+        "lead": lead + (f" Beside it: {'; '.join(others[:FEW])}." if others else ""),
+    }
 
 
 def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str]:
-    """Return the best of each task; the best of many is a choice after the fact, and the page says so."""
+    """Return the best of each task; the best of many is a choice after the fact, and the page says
+    so.
+    """
     best = [found for task in tasks if (found := best_trained(of_task(evaluated, task)))]
     if not best:
-        return {"headline": f"References on {text.plural(len(tasks), 'task')}", "lead": "No trained policy was run."}
+        return {
+            "headline": f"References on {text.plural(len(tasks), 'task')}",
+            "lead": "No trained policy was run.",
+        }
     if not any(item.successes for item in best):
         episodes = sum(item.episodes for item in evaluated if item.condition.trained)
-        sentence = f"No trained policy solves any held-out start of {text.plural(len(best), 'task')}"
-        return {"headline": sentence, "lead": f"{episodes:,} episodes; the intervals of each policy stand below."}
+        sentence = (
+            f"No trained policy solves any held-out start of {text.plural(len(best), 'task')}"
+        )
+        return {
+            "headline": sentence,
+            "lead": f"{episodes:,} episodes; the intervals of each policy stand below.",
+        }
     low, high = min(item.rate for item in best), max(item.rate for item in best)
     span = text.percent(high) if low == high else f"{text.percent(low)} to {text.percent(high)}"
     parts = [
         f"{item.condition.task} {item.successes}/{item.episodes} ({text.interval(item.interval)}; {item.label})"
         for item in best
     ]
-    warning = "Each is the best of several and was chosen after the fact, so its interval flatters it."
+    warning = (
+        "Each is the best of several and was chosen after the fact, so its interval flatters it."
+    )
     return {
         "headline": f"The best trained policy of each of {len(best)} tasks solves {span} of its held-out starts",
         "lead": f"{'; '.join(parts)}. {warning}",
@@ -126,7 +158,9 @@ def details(groups: Sequence[Group], reel: Reel, commands: dict[str, list[str]])
     shown_on_page = {choice.identity for choices in reel.compared.values() for choice in choices}
     made = [group_details(item, reel, commands, shown_on_page) for item in groups]
     words = json.dumps(made, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-    return Markup(words.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))
+    return Markup(
+        words.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+    )
 
 
 def footer(collected: Collected) -> str:

@@ -1,8 +1,10 @@
-"""Pairs: do two conditions differ? Exact McNemar on the same starts, Holm's correction within a task.
+"""Pairs: do two conditions differ? Exact McNemar on the same starts, Holm's correction within a
+task.
 
-Compared are trained conditions of a task that differ in one thing (`FACTORS`); recipes as wholes, with the encoder,
-views and demonstrations of each; and each with pictures against proprioception alone. Episodes are paired by training
-seed and start. The test speaks of the policies that were trained, not of all that the same recipe might give.
+Compared are trained conditions of a task that differ in one thing (`FACTORS`); recipes as wholes,
+with the encoder, views and demonstrations of each; and each with images against proprioception
+alone. Episodes are paired by training seed and start. The test speaks of the policies that were
+trained, not of all that the same recipe might give.
 """
 
 import itertools
@@ -57,7 +59,9 @@ def compare(groups: Sequence[Group]) -> list[Pair]:
     """Return every pair of each task, the smallest p-value first."""
     pairs: list[Pair] = []
     for task in names.TASKS:
-        trained = [item for item in of_task(groups, task) if item.condition.trained and item.episodes]
+        trained = [
+            item for item in of_task(groups, task) if item.condition.trained and item.episodes
+        ]
         candidates = [_pair(*two) for two in itertools.combinations(trained, 2)]
         found = [pair for pair in candidates if pair is not None]
         adjusted = statistics.holm([pair.p for pair in found]) if found else []
@@ -70,13 +74,15 @@ def factor(first: Condition, second: Condition) -> str:
     if "state" in (first.encoder, second.encoder):
         return ""
     blind = not first.views or not second.views
-    fields = [name for name in FACTORS if not (blind and name == "pool")]  # no encoder, nothing taken from it
+    fields = [
+        name for name in FACTORS if not (blind and name == "pool")
+    ]  # no encoder, nothing taken from it
     differ = [name for name in fields if getattr(first, name) != getattr(second, name)]
     if "recipe" in differ and bool(first.views) == bool(second.views):
         whole = ("encoder", "views", "pool", "recipe", "changes", "demonstrations")
         differ = [name for name in differ if name == "recipe" or name not in whole]
     if blind:
-        differ = ["pictures" if name == "encoder" else name for name in differ if name != "views"]
+        differ = ["images" if name == "encoder" else name for name in differ if name != "views"]
     return FACTORS.get(differ[0], differ[0]) if len(differ) == 1 else ""
 
 
@@ -91,9 +97,21 @@ def _pair(first: Group, second: Group) -> Pair | None:
     a, b = [one[key] for key in common], [other[key] for key in common]
     first_only = sum(x and not y for x, y in zip(a, b, strict=True))
     second_only = sum(y and not x for x, y in zip(a, b, strict=True))
-    return Pair(first, second, differs, len(common), first_only, second_only, float(statistics.mcnemar(a, b)))
+    return Pair(
+        first,
+        second,
+        differs,
+        len(common),
+        first_only,
+        second_only,
+        float(statistics.mcnemar(a, b)),
+    )
 
 
 def _outcomes(item: Group) -> dict[tuple[int, int], bool]:
     """Map (training seed, start) to success."""
-    return {(result.seed, row["seed"]): bool(row["success"]) for result in item.results for row in result.rows}
+    return {
+        (result.seed, row["seed"]): bool(row["success"])
+        for result in item.results
+        for row in result.rows
+    }

@@ -1,9 +1,10 @@
 """The paper's numbers: SurgicAI (NeurIPS 2024 Datasets and Benchmarks).
 
-Success rates as printed. Table 2 is image-based imitation, each encoder with the front and with the back view; it
-leaves insert out. The text speaks of 20 episodes × 5 seeds; the released code runs 3 × 20 episodes of one trained
-policy, and every printed rate is a multiple of 1/60, so intervals are drawn for n = 60. The released evaluation adds
-noise to the actions, another amount for each encoder.
+Success rates as printed. Table 2 is image-based imitation, each encoder with the front and with the
+back view; it leaves insert out. The text speaks of 20 episodes × 5 seeds; the released code runs 3
+× 20 episodes of one trained policy, and every printed rate is a multiple of 1/60, so intervals are
+drawn for n = 60. The released evaluation adds noise to the actions, another amount for each
+encoder.
 """
 
 from surgicai_vision.core import names
@@ -26,7 +27,9 @@ STATE_BC = {"grasp": 0.96, "place": 1.00, "insert": 0.97, "handoff": 0.83, "pull
 """Table 1: behaviour cloning from the state, the ceiling."""
 
 CHAIN = (0.88, 0.72, 0.60, 0.52)
-"""Table 3: the hierarchical policy, chains that begin with approach (grasp), from the shortest to the whole."""
+"""Table 3: the hierarchical policy, chains that begin with approach (grasp), from the shortest to
+the whole.
+"""
 
 
 def rate(task: str, encoder: str, view: str) -> float | None:

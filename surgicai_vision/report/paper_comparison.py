@@ -12,12 +12,15 @@ _DEMONSTRATIONS = 50
 """Of each subtask, in the released code."""
 
 
-def beside_paper(groups: Sequence[Group]) -> list[tuple[str, str, list[tuple[float | None, Group | None]]]]:
-    """Return the paper's Table 2 and ours as rows (task, encoder, [(paper's rate, our condition) for each view]).
+def beside_paper(
+    groups: Sequence[Group],
+) -> list[tuple[str, str, list[tuple[float | None, Group | None]]]]:
+    """Return the paper's Table 2 and ours as rows (task, encoder, [(paper's rate, our condition)
+    for each view]).
 
-    The paper's encoders come first in each task, then ours that it has not. Rates are None where the paper has none.
-    Empty without a pretrained encoder of the paper's. Of several numbers of demonstrations the one nearest to the
-    paper's is taken.
+    The paper's encoders come first in each task, then ours that it has not. Rates are None where
+    the paper has none. Empty without a pretrained encoder of the paper's. Of several numbers of
+    demonstrations the one nearest to the paper's is taken.
     """
     known = [item for item in groups if _comparable(item.condition)]
     if not any(item.condition.encoder in _TELLING for item in known):
@@ -31,7 +34,10 @@ def beside_paper(groups: Sequence[Group]) -> list[tuple[str, str, list[tuple[flo
         for encoder in (*paper.ENCODERS, *others):
             in_paper = paper.has(task, encoder)
             pairs = [
-                (paper.rate(task, encoder, view) if in_paper else None, ours.get((task, encoder, view)))
+                (
+                    paper.rate(task, encoder, view) if in_paper else None,
+                    ours.get((task, encoder, view)),
+                )
                 for view in paper.VIEWS
             ]
             if any(rate is not None or item is not None for rate, item in pairs):
@@ -63,6 +69,8 @@ def paper_rate(condition: Condition) -> float | None:
 
 
 def _comparable(condition: Condition) -> bool:
-    """Whether it is what the paper's Table 2 holds: one view of the two, everything else as usual."""
+    """Whether it is what the paper's Table 2 holds: one view of the two, everything else as
+    usual.
+    """
     usual = condition.trained and condition.plain and not condition.variant
     return usual and len(condition.views) == 1 and condition.views[0] in paper.VIEWS

@@ -92,10 +92,15 @@ def _chart(pairs: Sequence[dict[str, Any]]) -> Chart | None:
     if len(pairs) < 2 or len({row["point"].x for row in pairs}) < 2:
         return None
     encoders = list(dict.fromkeys(row["encoder"] for row in pairs))[:MOST]
-    lines = [Series(name, tuple(row["point"] for row in pairs if row["encoder"] == name)) for name in encoders]
+    lines = [
+        Series(name, tuple(row["point"] for row in pairs if row["encoder"] == name))
+        for name in encoders
+    ]
     ticks = {point.x: f"{point.x:.1f}" for line in lines for point in line.points}
     name = "error of the needle's tip in the probe [mm]"
-    drawing = charts.curves(lines, name, label=f"success [%] against {name}", ticks=ticks, joined=False)
+    drawing = charts.curves(
+        lines, name, label=f"success [%] against {name}", ticks=ticks, joined=False
+    )
     return Chart("Success [%] against the probe", drawing, charts.key(encoders), (), ())
 
 

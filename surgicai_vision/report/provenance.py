@@ -37,14 +37,18 @@ def origin(collected: Collected, groups: Sequence[Group]) -> dict[str, Any]:
 
 
 def commands(result: Result, run: dict[str, Any]) -> list[str]:
-    """Return the commands that make a cell's number again: from the stored policy, and from nothing."""
+    """Return the commands that make a cell's number again: from the stored policy, and from
+    nothing.
+    """
     found = [evaluate_command(result), result.about.get("command") or run.get("command")]
     return list(dict.fromkeys(command for command in found if command))
 
 
 def stages(seconds: dict[str, float]) -> str:
     """Say where the time went; `seconds` maps a stage's name to its time [s]."""
-    ordered = sorted(seconds.items(), key=lambda item: FLOW.index(item[0]) if item[0] in FLOW else len(FLOW))
+    ordered = sorted(
+        seconds.items(), key=lambda item: FLOW.index(item[0]) if item[0] in FLOW else len(FLOW)
+    )
     parts = [f"{name} {value:.0f} s" for name, value in ordered]
     return f"{sum(seconds.values()):.0f} s: {', '.join(parts)}" if parts else ""
 
@@ -82,8 +86,14 @@ def _distinct(values: Any, joint: str = ", ") -> str:
 
 
 def _versions(made: dict[str, Any]) -> str:
-    return ", ".join(f"{name} {number}" for name, number in made.get("packages", {}).items() if number)
+    return ", ".join(
+        f"{name} {number}" for name, number in made.get("packages", {}).items() if number
+    )
 
 
 def _machine(made: dict[str, Any]) -> str:
-    return f"{made['processor']}, {made['cores']} cores, {made['system']}" if made.get("processor") else ""
+    return (
+        f"{made['processor']}, {made['cores']} cores, {made['system']}"
+        if made.get("processor")
+        else ""
+    )

@@ -1,7 +1,7 @@
 """Reading: a results folder → evaluations, and the cells that have none with the reason why.
 
-A cell is one training: task, inputs, policy, recipe, demonstrations, training seed. Its condition is all of that but
-the training seed, and the shift under which it was evaluated.
+A cell is one training: task, inputs, policy, recipe, demonstrations, training seed. Its condition
+is all of that but the training seed, and the shift under which it was evaluated.
 """
 
 import re
@@ -15,10 +15,22 @@ from typing import Any
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile
-from surgicai_vision.evaluation.storage import MARKER, find_evaluations, read_rows
-from surgicai_vision.report.experiment_key import Condition, condition_of, condition_of_policy, order
+from surgicai_vision.evaluation.storage import (
+    CELL_FILE,
+    FAILED_FILE,
+    GRID_FILE,
+    MARKER,
+    RUN_FILE,
+    find_evaluations,
+    read_rows,
+)
+from surgicai_vision.report.experiment_key import (
+    Condition,
+    condition_of,
+    condition_of_policy,
+    order,
+)
 
-RUN_FILE, GRID_FILE, CELL_FILE, FAILED_FILE = "run.json", "sweep.json", "cell.json", "failed.json"
 WORK = "work"
 """Folder of a sweep in which its jobs are at work."""
 REFERENCES = ("expert", "random", "zero", "replay")
@@ -40,7 +52,9 @@ class Result:
     rows: list[dict[str, Any]]
     cell: dict[str, Any] = field(default_factory=dict)
     place: str = ""
-    """Where it stands, if another evaluation of the same condition and training seed stands elsewhere."""
+    """Where it stands, if another evaluation of the same condition and training seed stands
+    elsewhere.
+    """
 
     @property
     def trained(self) -> bool:
@@ -65,9 +79,13 @@ class Result:
 
     @cached_property
     def condition(self) -> Condition:
-        """What it is an evaluation of: by its cell where it is one of a sweep, else by what is known of the policy."""
+        """What it is an evaluation of: by its cell where it is one of a sweep, else by what is
+        known of the policy.
+        """
         shift = self.about.get("shift") or {}
-        base = condition_of(self.cell) if self.cell else condition_of_policy(self.summary, self.about)
+        base = (
+            condition_of(self.cell) if self.cell else condition_of_policy(self.summary, self.about)
+        )
         return replace(
             base,
             place=self.place,
@@ -111,8 +129,9 @@ def collect(folder: Path, cells: Sequence[Mapping[str, Any]] = ()) -> Collected:
 
     Args:
         folder: results of quickstart, evaluate, robustness or sweep.
-        cells: the cells of a sweep, as mappings with "key", "state" ("to do" or "not run"), "reason" and the cell's
-            own fields; those that have no result and no record are reported as pending or not run.
+        cells: the cells of a sweep, as mappings with "key", "state" ("to do" or "not run"),
+            "reason" and the cell's own fields; those that have no result and no record are reported
+            as pending or not run.
 
     Raises:
         BadFile: neither an evaluation nor a cell that failed or was not run.
@@ -122,11 +141,15 @@ def collect(folder: Path, cells: Sequence[Mapping[str, Any]] = ()) -> Collected:
     results = read_results(folder, grid, empty=True)
     missing = _missing(folder, run, grid, cells, results)
     if not results and not missing:
-        raise BadFile(f"{folder} holds no evaluation; run `surgicai-vision evaluate POLICY --out {folder}` first.")
+        raise BadFile(
+            f"{folder} holds no evaluation; run `surgicai-vision evaluate POLICY --out {folder}` first."
+        )
     return Collected(folder, results, missing, run, grid, read_probes(folder))
 
 
-def read_results(folder: Path, grid: dict[str, Any] | None = None, empty: bool = False) -> list[Result]:
+def read_results(
+    folder: Path, grid: dict[str, Any] | None = None, empty: bool = False
+) -> list[Result]:
     """Read all evaluations below `folder`; trained policies first."""
     results = []
     shared = _shared(grid or {})
@@ -139,16 +162,27 @@ def read_results(folder: Path, grid: dict[str, Any] | None = None, empty: bool =
         mapping = {**shared, **_filled(cell)} if cell else {}
         results.append(Result(place, stored["summary"], stored["about"], read_rows(place), mapping))
     if not results and not empty:
-        raise BadFile(f"{folder} holds no evaluation; run `surgicai-vision evaluate POLICY --out {folder}` first.")
-    return sorted(_told_apart(_once(results), folder), key=lambda result: (*order(result.condition), result.seed))
+        raise BadFile(
+            f"{folder} holds no evaluation; run `surgicai-vision evaluate POLICY --out {folder}` first."
+        )
+    return sorted(
+        _told_apart(_once(results), folder),
+        key=lambda result: (*order(result.condition), result.seed),
+    )
 
 
 def _once(results: Sequence[Result]) -> list[Result]:
-    """Leave out a reference whose episodes are among those of another: several sweeps evaluate the same expert."""
+    """Leave out a reference whose episodes are among those of another: several sweeps evaluate the
+    same expert.
+    """
     kept: list[Result] = []
     references = [result for result in results if not result.trained]
     for result in sorted(references, key=lambda result: -len(result.rows)):
-        same = [other for other in kept if other.condition == result.condition and other.config == result.config]
+        same = [
+            other
+            for other in kept
+            if other.condition == result.condition and other.config == result.config
+        ]
         if not any(_outcomes(result) <= _outcomes(other) for other in same):
             kept.append(result)
     return [result for result in results if result.trained or result in kept]
@@ -159,7 +193,9 @@ def _outcomes(result: Result) -> set[tuple[Any, ...]]:
 
 
 def _told_apart(results: Sequence[Result], folder: Path) -> list[Result]:
-    """Name evaluations of the same condition and training seed by their folders: counted together they count twice."""
+    """Name evaluations of the same condition and training seed by their folders: counted together
+    they count twice.
+    """
     count = Counter((result.condition, result.seed) for result in results)
     return [
         replace(result, place=str(result.folder.relative_to(folder)))
@@ -184,9 +220,15 @@ def read_probes(folder: Path) -> list[dict[str, Any]]:
 
 
 def _missing(
-    folder: Path, run: dict[str, Any], grid: dict[str, Any], cells: Sequence[Mapping[str, Any]], results: list[Result]
+    folder: Path,
+    run: dict[str, Any],
+    grid: dict[str, Any],
+    cells: Sequence[Mapping[str, Any]],
+    results: list[Result],
 ) -> list[Missing]:
-    """Return the cells without a result: what failed, what the plan knows, what the run noted, each once."""
+    """Return the cells without a result: what failed, what the plan knows, what the run noted, each
+    once.
+    """
     shared = _shared(grid)
     done = {(result.condition, result.seed) for result in results}
     found: dict[tuple[Condition, int], Missing] = {}
@@ -219,7 +261,9 @@ def _missing(
 
 
 def _noted(line: str, shared: Mapping[str, Any]) -> Missing | None:
-    """Read a line that a run has noted of a cell: its policy's name is encoder and views, or stays whole."""
+    """Read a line that a run has noted of a cell: its policy's name is encoder and views, or stays
+    whole.
+    """
     match = PROBLEM.match(line)
     if not match:
         return None
@@ -227,7 +271,12 @@ def _noted(line: str, shared: Mapping[str, Any]) -> Missing | None:
     encoder, _, last = name.rpartition("-")
     views = tuple(last.split("+"))
     known = encoder and all(view in names.VIEWS for view in views)
-    cell = {"task": task, "encoder": encoder if known else name, "view": views if known else (), **shared}
+    cell = {
+        "task": task,
+        "encoder": encoder if known else name,
+        "view": views if known else (),
+        **shared,
+    }
     return Missing(condition_of(cell), int(seed), state, reason)
 
 
@@ -241,7 +290,9 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _shared(grid: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a cell has of its grid where it says nothing itself: of several demonstration counts the largest."""
+    """Return what a cell has of its grid where it says nothing itself: of several demonstration
+    counts the largest.
+    """
     counts = grid.get("demonstrations")
     counts = [counts] if isinstance(counts, int) else list(counts or ())
     return {"demonstrations": max(counts)} if counts else {}

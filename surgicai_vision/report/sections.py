@@ -25,19 +25,34 @@ def paper_rows(groups: Sequence[Group], index: dict[Condition, int]) -> list[dic
             evaluated = item is not None and item.episodes > 0
             drawing = Markup("")
             if item is not None and evaluated:
-                drawing = charts.interval(item.rate, *item.interval, our_text(item), _of_paper(rate))
-            count = f"{item.successes}/{item.episodes}" if item is not None and evaluated else our_text(item)
+                drawing = charts.interval(
+                    item.rate, *item.interval, our_text(item), _of_paper(rate)
+                )
+            count = (
+                f"{item.successes}/{item.episodes}"
+                if item is not None and evaluated
+                else our_text(item)
+            )
             cells.append(
                 {
                     "paper": paper_text(task, encoder, rate),
                     "ours": count,
-                    "interval": text.interval(item.interval) if item is not None and evaluated else "",
+                    "interval": text.interval(item.interval)
+                    if item is not None and evaluated
+                    else "",
                     "drawing": drawing,
                     "group": index[item.condition] if item is not None else None,
                     "state": "" if evaluated else "absent",
                 }
             )
-        rows.append({"task": task, "encoder": encoder, "cells": cells, "starts": not rows or rows[-1]["task"] != task})
+        rows.append(
+            {
+                "task": task,
+                "encoder": encoder,
+                "cells": cells,
+                "starts": not rows or rows[-1]["task"] != task,
+            }
+        )
     return rows
 
 
@@ -49,10 +64,16 @@ def _of_paper(rate: float | None) -> tuple[float, float, float] | None:
 
 
 def ceilings(groups: Sequence[Group]) -> str:
-    """Return what the paper's state-based policies and ours reach, the ceiling of those that see."""
+    """Return what the paper's state-based policies and ours reach, the ceiling of those that
+    see.
+    """
     parts = []
     for task, rate in paper.STATE_BC.items():
-        mine = [item for item in of_task(groups, task) if item.condition.encoder == "state" and item.episodes]
+        mine = [
+            item
+            for item in of_task(groups, task)
+            if item.condition.encoder == "state" and item.episodes
+        ]
         if of_task(groups, task):
             ours = f", ours {our_text(mine[-1])}" if mine else ""
             parts.append(f"{task} {text.percent(rate)}{ours}")
@@ -60,8 +81,12 @@ def ceilings(groups: Sequence[Group]) -> str:
 
 
 def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, Any]]:
-    """Return one heat map a view set: task × policy; of several numbers of demonstrations the largest counts."""
-    plain = [item for item in groups if item.condition.plain and item.condition.task != names.SUTURE]
+    """Return one heat map a view set: task × policy; of several numbers of demonstrations the
+    largest counts.
+    """
+    plain = [
+        item for item in groups if item.condition.plain and item.condition.task != names.SUTURE
+    ]
     maps = []
     for views in dict.fromkeys(item.condition.views for item in plain):
         mine = [item for item in plain if item.condition.views == views]
@@ -70,18 +95,32 @@ def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict
         rows = []
         for task in tasks:
             known = {item.condition.policy: item for item in of_task(mine, task)}
-            rows.append({"task": task, "cells": [_heat(known.get(column), index) for column in columns]})
-        maps.append({"view": " + ".join(views) or "no pictures", "columns": columns, "rows": rows})
+            rows.append(
+                {"task": task, "cells": [_heat(known.get(column), index) for column in columns]}
+            )
+        maps.append({"view": " + ".join(views) or "no images", "columns": columns, "rows": rows})
     return maps if sum(len(found["rows"]) for found in maps) > len(maps) else []
 
 
 def _heat(item: Group | None, index: dict[Condition, int]) -> dict[str, Any]:
     if item is None:
-        return {"text": "", "small": "", "title": "not in this sweep", "group": None, "state": "none"}
+        return {
+            "text": "",
+            "small": "",
+            "title": "not in this sweep",
+            "group": None,
+            "state": "none",
+        }
     title, group = item.label, index[item.condition]
     if not item.episodes:
         cell = item.missing[0]
-        return {"text": cell.state, "small": "", "title": f"{title}: {cell.reason}", "group": group, "state": "absent"}
+        return {
+            "text": cell.state,
+            "small": "",
+            "title": f"{title}: {cell.reason}",
+            "group": group,
+            "state": "absent",
+        }
     back, front = charts.heat(item.rate)
     return {
         "text": f"{100 * item.rate:.0f}",
@@ -111,11 +150,19 @@ def success_row(at: int, item: Group, best: Group | None) -> dict[str, Any]:
     }
     if not item.episodes:
         cell = item.missing[0]
-        return {**row, "kind": "absent", "state": cell.state, "reason": _short(cell.reason), "sort": {}}
+        return {
+            **row,
+            "kind": "absent",
+            "state": cell.state,
+            "reason": _short(cell.reason),
+            "sort": {},
+        }
     low, high = item.interval
     length, steps = item.on_successes("trajectory_length_mm"), item.on_successes("steps")
     label = f"{text.percent(item.rate)}, 95 % interval {text.interval((low, high))}"
-    failures = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in item.failures.items())
+    failures = ", ".join(
+        f"{count} {kind.replace('_', ' ')}" for kind, count in item.failures.items()
+    )
     return {
         **row,
         "kind": "best" if item is best and item.successes else row["kind"],
@@ -145,14 +192,19 @@ def _note(item: Group) -> str:
     states = [cell.state for cell in item.missing]
     if not item.episodes or not states:
         return ""
-    parts = [f"{text.plural(states.count(state), 'training seed')} {state}" for state in dict.fromkeys(states)]
+    parts = [
+        f"{text.plural(states.count(state), 'training seed')} {state}"
+        for state in dict.fromkeys(states)
+    ]
     return ", ".join(parts)
 
 
 def measures(groups: Sequence[Group]) -> dict[str, Any]:
     """Return the columns that some row measured, and their medians."""
     evaluated = [(at, item) for at, item in enumerate(groups) if item.episodes]
-    kept = [spec for spec in MEASURES if any(text.finite(item.values(spec[0])) for _, item in evaluated)]
+    kept = [
+        spec for spec in MEASURES if any(text.finite(item.values(spec[0])) for _, item in evaluated)
+    ]
     rows = []
     for at, item in evaluated:
         cells = []
@@ -194,7 +246,13 @@ def missing_rows(groups: Sequence[Group]) -> list[dict[str, Any]]:
             key = (item.condition.task, item.label, cell.state, " ".join(cell.reason.split()))
             rows.setdefault(key, []).append(cell.seed)
     return [
-        {"task": task, "policy": policy, "seeds": ", ".join(map(str, seeds)), "state": state, "reason": reason}
+        {
+            "task": task,
+            "policy": policy,
+            "seeds": ", ".join(map(str, seeds)),
+            "state": state,
+            "reason": reason,
+        }
         for (task, policy, state, reason), seeds in rows.items()
     ]
 
@@ -222,7 +280,9 @@ def caption(groups: Sequence[Group]) -> str:
     if not results:
         return ""
     config = results[0].config
-    first, last = (pick(row["seed"] for result in results for row in result.rows) for pick in (min, max))
+    first, last = (
+        pick(row["seed"] for result in results for row in result.rows) for pick in (min, max)
+    )
     meanings = {
         "missed": "never touched the needle",
         "dropped": "lost it",
@@ -235,7 +295,11 @@ def caption(groups: Sequence[Group]) -> str:
     return (
         f"Successes of n episodes with the exact (Clopper–Pearson) interval; the same starts, seeds {first}–{last}, "
         "for every policy. Trajectory length and time steps: mean ± standard deviation over successful episodes"
-        + (f", of at most {config.max_steps} steps. " if len({r.config.max_steps for r in results}) == 1 else ". ")
+        + (
+            f", of at most {config.max_steps} steps. "
+            if len({r.config.max_steps for r in results}) == 1
+            else ". "
+        )
         + (f"Failures: {failures}. " if failures else "")
         + f"Grasp by {config.scene.grasp}, {config.tolerance} tolerances."
     )

@@ -1,7 +1,7 @@
 """Tables: the page's numbers as Markdown, LaTeX (booktabs), CSV and Parquet.
 
-`table.*` have one row a condition; `cells.parquet` one a cell (a training seed), those without a result too;
-`pairs.csv` one a comparison.
+`table.*` have one row a condition; `cells.parquet` one a cell (a training seed), those without a
+result too; `pairs.csv` one a comparison.
 """
 
 import csv
@@ -67,11 +67,17 @@ def condition_record(item: Group) -> dict[str, Any]:
         "bootstrap_high": across.interval[1] if across else None,
         "paper_rate": reference,
     }
-    return {**row, **_measures(item.rows), "missing": "; ".join(f"{c.state}: {c.reason}" for c in item.missing)}
+    return {
+        **row,
+        **_measures(item.rows),
+        "missing": "; ".join(f"{c.state}: {c.reason}" for c in item.missing),
+    }
 
 
 def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, Any]]:
-    """Yield one flat row a cell: what it is, its counts and measures, how to make it again, or why there is none."""
+    """Yield one flat row a cell: what it is, its counts and measures, how to make it again, or why
+    there is none.
+    """
     for item in groups:
         for result in item.results:
             k, n = result.summary["successes"], len(result.rows)
@@ -98,12 +104,19 @@ def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, Any]]:
                 "evaluate": evaluate_command(result),
             }
         for cell in item.missing:
-            row = {**_identity(item.condition), "training_seed": cell.seed, "state": cell.state, "reason": cell.reason}
+            row = {
+                **_identity(item.condition),
+                "training_seed": cell.seed,
+                "state": cell.state,
+                "reason": cell.reason,
+            }
             yield {**row, "episodes": 0, "paper_rate": paper_rate(item.condition)}
 
 
 def evaluate_command(result: Result) -> str | None:
-    """Return the command that counts a cell's successes again from its stored policy, where one line does."""
+    """Return the command that counts a cell's successes again from its stored policy, where one
+    line does.
+    """
     about, seeds = result.about, [row["seed"] for row in result.rows]
     whole = seeds == list(range(seeds[0], seeds[0] + len(seeds)))
     if not whole or not result.condition.plain or about.get("chain") or about.get("rounds"):

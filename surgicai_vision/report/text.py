@@ -1,4 +1,6 @@
-"""Text: numbers as tables print them. Percentages are whole, intervals in brackets, absent is a dash."""
+"""Text: numbers as tables print them. Percentages are whole, intervals in brackets, absent is a
+dash.
+"""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +34,9 @@ def finite(values: Sequence[float | None]) -> list[float]:
 
 
 def quartiles(values: Sequence[float | None]) -> tuple[float, float, float] | None:
-    """Return lower quartile, median and upper quartile of the numbers among `values`; None without any."""
+    """Return lower quartile, median and upper quartile of the numbers among `values`; None without
+    any.
+    """
     known = finite(values)
     if not known:
         return None
@@ -41,21 +45,26 @@ def quartiles(values: Sequence[float | None]) -> tuple[float, float, float] | No
 
 
 def spread(values: Sequence[float | None]) -> str:
-    """Return the median and quartiles as "0.8 (0.5–1.2)", with two digits that count at the upper quartile.
+    """Return the median and quartiles as "0.8 (0.5–1.2)", with two digits that count at the upper
+    quartile.
 
     Of how many is said where some are missing.
     """
     found = quartiles(values)
     if found is None:
         return ABSENT
-    digits = next((digits for digits, least in enumerate((100, 1, 0.1, 0.01)) if found[2] >= least), 3)
+    digits = next(
+        (digits for digits, least in enumerate((100, 1, 0.1, 0.01)) if found[2] >= least), 3
+    )
     low, middle, high = (f"{value:.{digits}f}" for value in found)
     count = len(finite(values))
     return f"{middle} ({low}–{high})" + (f", n = {count}" if count < len(values) else "")
 
 
 def probability(p: float, sign: str = "") -> str:
-    """Return a p-value: "0.031", or "< 0.001" below that; `sign` stands before a number that is given."""
+    """Return a p-value: "0.031", or "< 0.001" below that; `sign` stands before a number that is
+    given.
+    """
     return "< 0.001" if p < 0.001 else f"{sign}{p:.3f}"
 
 

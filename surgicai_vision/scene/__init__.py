@@ -1,7 +1,7 @@
-"""Scene: two PSMs, a needle, its thread and a phantom as one MuJoCo model, and pictures of it.
+"""Scene: two PSMs, a needle, its thread and a phantom as one MuJoCo model, and images of it.
 
-`build_scene(SceneConfig()) -> Scene`; cameras in `scene.cameras`, pictures in `scene.rendering`, the arms'
-kinematics in `scene.kinematics`. See `scene.compose` for the interface.
+`build_scene(SceneConfig()) -> Scene`; cameras in `scene.cameras`, images in `scene.rendering`, the
+arms' kinematics in `scene.kinematics`. See `scene.compose` for the interface.
 """
 
 from surgicai_vision.scene.compose import ArmIds, Scene, build_scene, build_spec

@@ -1,12 +1,14 @@
 """Arm: one da Vinci PSM as a MuJoCo kinematic tree, built from the same DH table as `kinematics`.
 
-Bodies follow the modified DH frames; the last one, `tip`, is the wrist-yaw axis, with +z along the jaws, ±y the
-direction in which they open and x their hinge. The jaws' grasp point lies `GRASP_DEPTH` along z.
+Bodies follow the modified DH frames; the last one, `tip`, is the wrist-yaw axis, with +z along the
+jaws, ±y the direction in which they open and x their hinge. The jaws' grasp point lies
+`GRASP_DEPTH` along z.
 
-Actuators are position servos with the natural frequency `BANDWIDTH` on each joint's own inertia, gravity
-compensated: the joints follow a commanded pose as a dVRK's do, and give way to contact by a finite stiffness.
-The two fingers are coupled by an equality, so that one torque-limited motor closes both (about 2.5 N each).
-Numbers without another source were measured by `benchmarks/grip.py`.
+Actuators are position servos with the natural frequency `BANDWIDTH` on each joint's own inertia,
+gravity compensated: the joints follow a commanded pose as a dVRK's do, and give way to contact by a
+finite stiffness. The two fingers are coupled by an equality, so that one torque-limited motor
+closes both (about 2.5 N each). Numbers without another source were measured by
+`benchmarks/grip.py`.
 """
 
 import math
@@ -23,26 +25,34 @@ PAD_END = 0.0125
 PAD_WIDTH = 0.003
 PAD_THICKNESS = 0.0010
 PAD_OFFSET = BODY_RADIUS - 0.00005
-"""Inner faces of the closed jaws from their middle plane [m]: parallel when they hold the needle."""
+"""Inner faces of the closed jaws from their middle plane [m]: parallel when they hold the
+needle.
+"""
 JAW_LIMITS = (-0.06, 1.0)
 """Angle of each finger [rad]; below 0 only when the jaws close on nothing."""
 JAW_GAIN, JAW_TORQUE, JAW_ARMATURE = 1.0, 0.05, 1e-4
-"""[N·m/rad, N·m, kg·m²]: the coupled fingers' servo has 70 rad/s. With an armature of 1e-5 (220 rad/s) the closing
-jaws struck the needle at 12 rad/s, 0.25 mm of the pads' way in one physics step: with friction drawn 15 % lower it
-shot out of them in one grasp of three."""
+"""[N·m/rad, N·m, kg·m²]: the coupled fingers' servo has 70 rad/s. With an armature of 1e-5 (220
+rad/s) the closing jaws struck the needle at 12 rad/s, 0.25 mm of the pads' way in one physics step:
+with friction drawn 15 % lower it shot out of them in one grasp of three."""
 SHAFT_RADIUS, SHAFT_LENGTH = 0.004, 0.36
 WRIST_RADIUS = 0.003
 BANDWIDTH = 100.0
 """[rad/s]"""
 LIMIT_SOLREF, LIMIT_SOLIMP = [0.004, 1.0], [0.99, 0.999, 0.0001, 0.5, 2.0]
-"""Of joint limits and of the fingers' coupling: a servo told to go 0.5 rad past a limit rests within 0.1 mrad of it;
-with MuJoCo's default it stood 83 mrad beyond."""
+"""Of joint limits and of the fingers' coupling: a servo told to go 0.5 rad past a limit rests
+within 0.1 mrad of it; with MuJoCo's default it stood 83 mrad beyond."""
 ARMATURE = (0.02, 0.02, 0.5, 2e-4, 1e-4, 1e-4)
 MASSES = (0.01, 0.01, 0.05, 0.005, 0.005, 0.004)
 """Link masses [kg]; small beside the armature, which stands for the geared motors."""
 
 
-def add_arm(spec: mujoco.MjSpec, arm: str, base: mujoco.MjsBody, instrument: Instrument, bits: dict[str, int]) -> None:
+def add_arm(
+    spec: mujoco.MjSpec,
+    arm: str,
+    base: mujoco.MjsBody,
+    instrument: Instrument,
+    bits: dict[str, int],
+) -> None:
     """Add the arm `arm` to `spec` below its base body.
 
     Args:
@@ -57,10 +67,16 @@ def add_arm(spec: mujoco.MjSpec, arm: str, base: mujoco.MjsBody, instrument: Ins
         body = _add_link(body, arm, name, index, instrument)
         _add_servo(spec, f"{arm}_{name}", index)
         if index == 3:
-            _capsule(body, f"{arm}_shaft", [0, 0, -SHAFT_LENGTH, 0, 0, -SHAFT_RADIUS], SHAFT_RADIUS, bits)
+            _capsule(
+                body, f"{arm}_shaft", [0, 0, -SHAFT_LENGTH, 0, 0, -SHAFT_RADIUS], SHAFT_RADIUS, bits
+            )
         if index == 4:
-            _capsule(body, f"{arm}_wrist", [0, 0, 0, instrument.pitch_to_yaw, 0, 0], WRIST_RADIUS, bits)
-    tip = body.add_body(name=f"{arm}_tip", quat=_frame(instrument.dh[6].alpha, instrument.dh[6].offset))
+            _capsule(
+                body, f"{arm}_wrist", [0, 0, 0, instrument.pitch_to_yaw, 0, 0], WRIST_RADIUS, bits
+            )
+    tip = body.add_body(
+        name=f"{arm}_tip", quat=_frame(instrument.dh[6].alpha, instrument.dh[6].offset)
+    )
     tip.add_site(name=f"{arm}_tip", size=[0.0005] * 3, group=4)
     tip.add_site(name=f"{arm}_grasp", pos=[0, 0, GRASP_DEPTH], size=[0.0005] * 3, group=4)
     tip.add_body(name=f"{arm}_grasp", pos=[0, 0, GRASP_DEPTH])  # what cameras follow
@@ -71,11 +87,18 @@ def add_arm(spec: mujoco.MjSpec, arm: str, base: mujoco.MjsBody, instrument: Ins
 
 def _frame(alpha: float, offset: float) -> list[float]:
     """Return the quaternion (wxyz) of RotX(alpha)·RotZ(offset)."""
-    ca, sa, co, so = math.cos(alpha / 2), math.sin(alpha / 2), math.cos(offset / 2), math.sin(offset / 2)
+    ca, sa, co, so = (
+        math.cos(alpha / 2),
+        math.sin(alpha / 2),
+        math.cos(offset / 2),
+        math.sin(offset / 2),
+    )
     return [ca * co, sa * co, -sa * so, ca * so]
 
 
-def _add_link(parent: mujoco.MjsBody, arm: str, name: str, index: int, instrument: Instrument) -> mujoco.MjsBody:
+def _add_link(
+    parent: mujoco.MjsBody, arm: str, name: str, index: int, instrument: Instrument
+) -> mujoco.MjsBody:
     """Add the body and the joint of one row of the DH table."""
     row = instrument.dh[index]
     body = parent.add_body(
@@ -104,7 +127,9 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, index: int) -> None:
     actuator.set_to_position(kp=ARMATURE[index] * BANDWIDTH**2, kv=2 * ARMATURE[index] * BANDWIDTH)
 
 
-def _capsule(body: mujoco.MjsBody, name: str, fromto: list[float], radius: float, bits: dict[str, int]) -> None:
+def _capsule(
+    body: mujoco.MjsBody, name: str, fromto: list[float], radius: float, bits: dict[str, int]
+) -> None:
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -150,7 +175,9 @@ def _couple_fingers(spec: mujoco.MjSpec, arm: str) -> None:
     equality.data[:5] = [0, 1, 0, 0, 0]
     equality.solref = LIMIT_SOLREF
     equality.solimp = LIMIT_SOLIMP
-    actuator = spec.add_actuator(name=f"{arm}_jaw", target=f"{arm}_left_finger", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator = spec.add_actuator(
+        name=f"{arm}_jaw", target=f"{arm}_left_finger", trntype=mujoco.mjtTrn.mjTRN_JOINT
+    )
     actuator.set_to_position(kp=JAW_GAIN, kv=2 * math.sqrt(2 * JAW_GAIN * JAW_ARMATURE))
     actuator.forcelimited = True
     actuator.forcerange = [-JAW_TORQUE, JAW_TORQUE]
@@ -158,7 +185,15 @@ def _couple_fingers(spec: mujoco.MjSpec, arm: str) -> None:
 
 def add_weld(spec: mujoco.MjSpec, arm: str) -> None:
     """Add the weld between an arm's tip and the needle, inactive, for grasp level "attach"."""
-    weld = spec.add_equality(name=f"{arm}_attach", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
+    weld = spec.add_equality(
+        name=f"{arm}_attach", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY
+    )
     weld.name1, weld.name2, weld.active = f"{arm}_tip", "needle", False
-    weld.data[:11] = [0.0] * 6 + [1.0, 0.0, 0.0, 0.0, 0.01]  # anchor, pose in the jaws, torque scale [m]
+    weld.data[:11] = [0.0] * 6 + [
+        1.0,
+        0.0,
+        0.0,
+        0.0,
+        0.01,
+    ]  # anchor, pose in the jaws, torque scale [m]
     weld.solref, weld.solimp = [0.004, 1.0], [0.99, 0.999, 0.0001, 0.5, 2.0]

@@ -1,15 +1,18 @@
 """Cameras: where they stand, and the matrices that take a point of the world into a pixel.
 
-Pixels and camera frames follow OpenCV: x right, y down, z forward; the centre of the first pixel is (0, 0), so
-the principal point of a W × H picture is ((W - 1) / 2, (H - 1) / 2). A point p of the world has the pixel
-`K (R p + t)` divided by its third component, with `K = intrinsics(…)` and `[R t] = inverse(extrinsics(…))`.
+Pixels and camera frames follow OpenCV: x right, y down, z forward; the centre of the first pixel is
+(0, 0), so the principal point of a W × H image is ((W - 1) / 2, (H - 1) / 2). A point p of the
+world has the pixel `K (R p + t)` divided by its third component, with `K = intrinsics(…)` and `[R
+t] = inverse(extrinsics(…))`.
 
-Sources: "front" is the left endoscope of SurgicAI's scene, moved as `ENDOSCOPE` says; "front_right" the right one;
-"back" the camera opposite to them. The surgical robotics challenge also puts a camera on each insertion link; there it
-looks along the shaft and sees little else, so ours stand off it and aim at the jaws.
+Sources: "front" is the left endoscope of SurgicAI's scene, moved as `ENDOSCOPE` says; "front_right"
+the right one; "back" the camera opposite to them. The surgical robotics challenge also puts a
+camera on each insertion link; there it looks along the shaft and sees little else, so ours stand
+off it and aim at the jaws.
 
-"front_psm2" and its like follow an arm's jaws from where "front" or "back" stands: what one cuts out of a picture of
-higher resolution about the jaws, whose place the arm's joints tell, and scales to the size of the others.
+"front_psm2" and its like follow an arm's jaws from where "front" or "back" stands: what one cuts
+out of an image of higher resolution about the jaws, whose place the arm's joints tell, and scales
+to the size of the others.
 """
 
 import math
@@ -36,7 +39,7 @@ class CameraPose:
     Attributes:
         position: the optical centre [m].
         direction: of view; need not be a unit vector.
-        up: any vector in the upper half of the picture.
+        up: any vector in the upper half of the image.
         fovy: vertical field of view [rad].
     """
 
@@ -49,20 +52,24 @@ class CameraPose:
 ENDOSCOPE = (-0.008, 0.100, 0.160)
 ENDOSCOPE_DIRECTION = (0.040, -0.451, -0.892)
 ENDOSCOPE_FOVY = 0.9
-"""The endoscope's middle [m], its direction, and the vertical field of view [rad] of both its cameras.
+"""The endoscope's middle [m], its direction, and the vertical field of view [rad] of both its
+cameras.
 
-SurgicAI's stands at (0, 114.2, 148.8) mm, looks along (0, -0.642, -0.765) and sees 1.2 rad at 640 × 480. There, at
-224 × 224, the needle covers 31 pixels at the end of a handoff even with both arms taken away; and PSM2 holds it along
-the wound, which is the line of sight, so that placing ends with 5 to 15 pixels in view. 8 mm to PSM2's side, 14 mm
-forwards, 11 mm up and 0.9 rad bring it above 25 at the end of grasp, place, insert and handoff, with both arms still
-in view at the start (`tests/test_visibility.py`).
+SurgicAI's stands at (0, 114.2, 148.8) mm, looks along (0, -0.642, -0.765) and sees 1.2 rad at 640 ×
+480. There, at 224 × 224, the needle covers 31 pixels at the end of a handoff even with both arms
+     taken away; and PSM2 holds it along
+the wound, which is the line of sight, so that placing ends with 5 to 15 pixels in view. 8 mm to
+PSM2's side, 14 mm forwards, 11 mm up and 0.9 rad bring it above 25 at the end of grasp, place,
+insert and handoff, with both arms still in view at the start (`tests/test_visibility.py`).
 """
 BASELINE, TOE_IN = 0.004, 0.040
 """Between the endoscope's two cameras [m]; x of each one's direction, 2.3° (SurgicAI)."""
 
 
 def _endoscope(side: float) -> CameraPose:
-    """Return the left (side = 1) or the right (-1) camera: left is +x, for the endoscope looks along -y."""
+    """Return the left (side = 1) or the right (-1) camera: left is +x, for the endoscope looks
+    along -y.
+    """
     x, y, z = ENDOSCOPE
     across, forward, down = ENDOSCOPE_DIRECTION
     return CameraPose(
@@ -83,15 +90,23 @@ WORLD_CAMERAS = MappingProxyType(
 """Camera → pose in world; "back" stands where SurgicAI's does."""
 
 WRIST_ASIDE, WRIST_BACK = 0.030, 0.030
-"""From the wrist's pitch axis to the wrist camera: beside the shaft and up along it [m]. So the view meets the shaft
-at 33°: far enough to look past it at the jaws, and clear of the tissue in every grasp of the five subtasks."""
-WRIST_SIDE = MappingProxyType({PSM1: (-math.sqrt(0.5), -math.sqrt(0.5)), PSM2: (-math.sqrt(0.5), math.sqrt(0.5))})
-"""Arm → side of the shaft on which its camera stands, in x and y of the insertion link: above and outside, where of
-eight sides tried the jaws, the needle and the holes were seen best at the ends of all subtasks."""
+"""From the wrist's pitch axis to the wrist camera: beside the shaft and up along it [m]. So the
+view meets the shaft at 33°: far enough to look past it at the jaws, and clear of the tissue in
+every grasp of the five subtasks."""
+WRIST_SIDE = MappingProxyType(
+    {PSM1: (-math.sqrt(0.5), -math.sqrt(0.5)), PSM2: (-math.sqrt(0.5), math.sqrt(0.5))}
+)
+"""Arm → side of the shaft on which its camera stands, in x and y of the insertion link: above and
+outside, where of eight sides tried the jaws, the needle and the holes were seen best at the ends of
+all subtasks."""
 WRIST_TARGET = 0.017
-"""Point beyond the wrist's pitch axis at which the wrist camera aims [m]: 2 mm short of the jaws' grasp point."""
+"""Point beyond the wrist's pitch axis at which the wrist camera aims [m]: 2 mm short of the jaws'
+grasp point.
+"""
 WRIST_FOVY = 0.8
-"""Vertical field of view of the wrist cameras [rad]: about 47 mm of the scene at the jaws, more than two needles."""
+"""Vertical field of view of the wrist cameras [rad]: about 47 mm of the scene at the jaws, more
+than two needles.
+"""
 
 
 def wrist_camera(arm: str, instrument: str) -> CameraPose:
@@ -106,15 +121,20 @@ def wrist_camera(arm: str, instrument: str) -> CameraPose:
 
 
 FOLLOWING_SPAN = 0.050
-"""Height of what a following camera sees at the holes [m]: at 224 × 224 pixels 0.22 mm a pixel, where "front" and
-"back" have 0.43 and 0.47; two and a half needles, and the jaws at their middle."""
+"""Height of what a following camera sees at the holes [m]: at 224 × 224 pixels 0.22 mm a pixel,
+where "front" and "back" have 0.43 and 0.47; two and a half needles, and the jaws at their
+middle."""
 FOLLOWED = (0.0, 0.050, 0.075)
 """Point in world [m] at whose distance that holds: between the holes and the needle's home."""
 
 
 def following_fovy(camera: str) -> float:
-    """Return the vertical field of view [rad] of the cameras that stand where `camera` stands and follow the jaws."""
-    return 2.0 * math.atan(FOLLOWING_SPAN / 2.0 / math.dist(WORLD_CAMERAS[camera].position, FOLLOWED))
+    """Return the vertical field of view [rad] of the cameras that stand where `camera` stands and
+    follow the jaws.
+    """
+    return 2.0 * math.atan(
+        FOLLOWING_SPAN / 2.0 / math.dist(WORLD_CAMERAS[camera].position, FOLLOWED)
+    )
 
 
 def add_following_cameras(spec: mujoco.MjSpec) -> None:
@@ -136,7 +156,9 @@ def add_world_cameras(spec: mujoco.MjSpec) -> None:
         _add(spec.worldbody, name, pose)
 
 
-def add_wrist_camera(spec: mujoco.MjSpec, arm: str, instrument: str = "400006", body: str | None = None) -> None:
+def add_wrist_camera(
+    spec: mujoco.MjSpec, arm: str, instrument: str = "400006", body: str | None = None
+) -> None:
     """Add `wrist_{arm}` to the arm's insertion link, or to the named body with that link's axes."""
     carrier = body or f"{arm}_outer_insertion_link"
     found = spec.body(carrier)
@@ -154,7 +176,9 @@ def add_cameras(spec: mujoco.MjSpec, instrument: str = "400006") -> None:
 
 
 def look_at(direction: Vector, up: Vector) -> Array:
-    """Return the rotation (3, 3) of an OpenCV camera frame that looks along `direction` with `up` upwards."""
+    """Return the rotation (3, 3) of an OpenCV camera frame that looks along `direction` with `up`
+    upwards.
+    """
     forward: Array = np.array(direction, dtype=np.float64)
     forward /= np.linalg.norm(forward)
     right: Array = np.asarray(np.cross(forward, np.array(up, dtype=np.float64)), dtype=np.float64)
@@ -163,17 +187,20 @@ def look_at(direction: Vector, up: Vector) -> Array:
 
 
 def intrinsics(model: mujoco.MjModel, camera: str, height: int, width: int) -> Array:
-    """Return the camera matrix K (3, 3) [pixel] of a picture of `height` × `width`.
+    """Return the camera matrix K (3, 3) [pixel] of an image of `height` × `width`.
 
     Raises:
         UnknownName: no such camera in the model.
     """
     focal = height / 2 / math.tan(math.radians(float(model.cam_fovy[camera_id(model, camera)])) / 2)
-    return np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    return np.array(
+        [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
+    )
 
 
 def extrinsics(model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> Array:
-    """Return T_world_camera (4, 4) at the state of `data`, which must have been through `mj_forward`.
+    """Return T_world_camera (4, 4) at the state of `data`, which must have been through
+    `mj_forward`.
 
     Raises:
         UnknownName: no such camera in the model.
@@ -201,4 +228,6 @@ def _add(body: mujoco.MjsBody, name: str, pose: CameraPose) -> None:
     """Add one camera; MuJoCo's camera frame is OpenCV's turned half about x."""
     rotation = look_at(pose.direction, pose.up) * [1.0, -1.0, -1.0]
     quaternion = matrix_to_quaternion(rotation).tolist()
-    body.add_camera(name=name, pos=list(pose.position), quat=quaternion, fovy=math.degrees(pose.fovy))
+    body.add_camera(
+        name=name, pos=list(pose.position), quat=quaternion, fovy=math.degrees(pose.fovy)
+    )

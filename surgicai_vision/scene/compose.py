@@ -1,10 +1,12 @@
 """Compose: a `SceneConfig` becomes one MuJoCo model, through `mujoco.MjSpec`.
 
-Interface: `build_scene(config) -> Scene`, cached per process. `Scene` holds the model, the ids that later stages
-need, and the scene hash: sha256 over the compiled XML and the configuration, so any change of geometry changes it.
+Interface: `build_scene(config) -> Scene`, cached per process. `Scene` holds the model, the ids that
+later stages need, and the scene hash: sha256 over the compiled XML and the configuration, so any
+change of geometry changes it.
 
 World: metres, z up, gravity 9.81 m/s². Solver settings are those under which a friction grasp holds
-(`benchmarks/grip.py` shows what each of them is worth): Newton, elliptic cones, impratio 100, Euler, 2 ms.
+(`benchmarks/grip.py` shows what each of them is worth): Newton, elliptic cones, impratio 100,
+Euler, 2 ms.
 """
 
 import functools
@@ -25,11 +27,13 @@ from surgicai_vision.scene.visual import materials
 
 TIMESTEP = 0.002
 USER_DATA = 176
-"""Numbers the envs keep inside MuJoCo's state (goal, progress), so that one vector is the whole state."""
+"""Numbers the envs keep inside MuJoCo's state (goal, progress), so that one vector is the whole
+state.
+"""
 
 SURFACES, GRIP, FIRM, ARMS, THREAD = 1, 2, 4, 8, 16
-"""Collision bits: needle on tissue, needle in jaws, instruments on firm tissue, instrument on instrument,
-thread on tissue and instruments."""
+"""Collision bits: needle on tissue, needle in jaws, instruments on firm tissue, instrument on
+instrument, thread on tissue and instruments."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,9 @@ class Scene:
 
 @functools.lru_cache(maxsize=8)
 def build_scene(config: SceneConfig = SceneConfig()) -> Scene:
-    """Return the compiled scene of `config`; the same object for the same configuration in one process."""
+    """Return the compiled scene of `config`; the same object for the same configuration in one
+    process.
+    """
     spec = build_spec(config)
     model = spec.compile()
     free = int(model.joint("needle").qposadr[0])
@@ -118,7 +124,9 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     phantom.add_table(spec, soft)
     phantom.add_phantom(spec, config.layout, needle=soft, arm={"contype": 0, "conaffinity": FIRM})
     body = needle.add_needle(spec, {"contype": SURFACES | GRIP, "conaffinity": 0})
-    thread.add_thread(spec, body, needle.point(0.0).tolist(), config.thread, {"contype": THREAD, "conaffinity": 0})
+    thread.add_thread(
+        spec, body, needle.point(0.0).tolist(), config.thread, {"contype": THREAD, "conaffinity": 0}
+    )
     for name in names.ARMS:
         _add_arm(spec, config, name)
     if config.grasp == "attach":
@@ -134,8 +142,12 @@ def _add_arm(spec: mujoco.MjSpec, config: SceneConfig, name: str) -> None:
     """Add one arm at its base pose, with its wrist camera."""
     pose = kinematics.base_in_world(name)
     quat = rotations.matrix_to_quaternion(pose[:3, :3])
-    base = spec.worldbody.add_body(name=f"{name}_base", pos=pose[:3, 3].tolist(), quat=quat.tolist())
-    touching = {names.PSM1: (FIRM | ARMS, GRIP | THREAD), names.PSM2: (FIRM, GRIP | THREAD | ARMS)}[name]
+    base = spec.worldbody.add_body(
+        name=f"{name}_base", pos=pose[:3, 3].tolist(), quat=quat.tolist()
+    )
+    touching = {names.PSM1: (FIRM | ARMS, GRIP | THREAD), names.PSM2: (FIRM, GRIP | THREAD | ARMS)}[
+        name
+    ]
     bits = {"contype": touching[0], "conaffinity": touching[1]}
     arm.add_arm(spec, name, base, kinematics.INSTRUMENTS[config.instrument], bits)
     add_wrist_camera(spec, name, config.instrument)
@@ -144,11 +156,12 @@ def _add_arm(spec: mujoco.MjSpec, config: SceneConfig, name: str) -> None:
 def _set_options(spec: mujoco.MjSpec, thread: int) -> None:
     """Set the solver, the visual ranges and the size of the user data.
 
-    Joint damping is explicit. MuJoCo's Euler would take it implicitly after the contact solver: the accelerations
-    that start the next solution are then not those of the last, the solver takes 2.4 iterations in place of 1.3, and
-    once in some thousand steps it ends far off and kicks the held needle (`benchmarks/grip.py`: 4.6° in the worst of
-    40 trials, 0.9° without). A thread is one island with all it touches: solving without islands and with a sparse
-    Jacobian then takes 15 % less of a step.
+    Joint damping is explicit. MuJoCo's Euler would take it implicitly after the contact solver: the
+    accelerations that start the next solution are then not those of the last, the solver takes 2.4
+    iterations in place of 1.3, and once in some thousand steps it ends far off and kicks the held
+    needle (`benchmarks/grip.py`: 4.6° in the worst of 40 trials, 0.9° without). A thread is one
+    island with all it touches: solving without islands and with a sparse Jacobian then takes 15 %
+    less of a step.
     """
     option = spec.option
     option.timestep = TIMESTEP

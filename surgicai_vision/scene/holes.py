@@ -1,11 +1,13 @@
-"""Holes: where the stitch goes in and out of each phantom layout, and the test that a needle passed.
+"""Holes: where the stitch goes in and out of each phantom layout, and the test that a needle
+passed.
 
-A hole's frame has +z along the outward normal of its flank and +y along the wound (world y); x runs up the
-flank at the entry and down it at the exit. World frame, metres.
+A hole's frame has +z along the outward normal of its flank and +y along the wound (world y); x runs
+up the flank at the entry and down it at the exit. World frame, metres.
 
-Sources: layout `simple` holds the entry and exit poses of SurgicAI's phantom (opening about 3.8 mm square).
-`3dmed` and `3dmed_straight` keep the gaps and tilts of the new surgical robotics challenge; their places along
-the wound are ours. The insertion path through `simple` is derived in `envs.geometry`.
+Sources: layout `simple` holds the entry and exit poses of SurgicAI's phantom (opening about 3.8 mm
+square). `3dmed` and `3dmed_straight` keep the gaps and tilts of the new surgical robotics
+challenge; their places along the wound are ours. The insertion path through `simple` is derived in
+`envs.geometry`.
 """
 
 import functools
@@ -17,7 +19,9 @@ import numpy as np
 OPENING = 0.0038
 """Side of the square opening [m]."""
 SURFACE = 0.07126
-"""Height of the phantom's flat tissue in world [m]: the needle's home height less half its thickness."""
+"""Height of the phantom's flat tissue in world [m]: the needle's home height less half its
+thickness.
+"""
 
 
 @dataclass(frozen=True)
@@ -63,17 +67,22 @@ def _simple() -> tuple[HolePair, ...]:
     entries = ((-3.740, 44.189), (-4.316, 20.691), (-3.337, -2.032), (-4.394, -27.678))
     tilt = 0.8053
     return tuple(
-        HolePair(Hole((x / 1e3, y / 1e3, 0.075004), -tilt), Hole((0.004078, y / 1e3, 0.074860), tilt))
+        HolePair(
+            Hole((x / 1e3, y / 1e3, 0.075004), -tilt), Hole((0.004078, y / 1e3, 0.074860), tilt)
+        )
         for x, y in entries
     )
 
 
-def _symmetric(gaps: tuple[float, ...], tilt: float, bow: tuple[float, ...]) -> tuple[HolePair, ...]:
+def _symmetric(
+    gaps: tuple[float, ...], tilt: float, bow: tuple[float, ...]
+) -> tuple[HolePair, ...]:
     """Return pairs about x = bow[i] with the given gaps [mm]; y as in `simple`."""
     rows = (44.189, 20.691, -2.032, -27.678)
     return tuple(
         HolePair(
-            Hole(((x - gap / 2) / 1e3, y / 1e3, 0.0750), -tilt), Hole(((x + gap / 2) / 1e3, y / 1e3, 0.0750), tilt)
+            Hole(((x - gap / 2) / 1e3, y / 1e3, 0.0750), -tilt),
+            Hole(((x + gap / 2) / 1e3, y / 1e3, 0.0750), tilt),
         )
         for gap, x, y in zip(gaps, bow, rows, strict=True)
     )
@@ -100,7 +109,11 @@ def crossing(polyline: np.ndarray, hole: Hole, inward: bool) -> np.ndarray | Non
     """
     local = (polyline - np.asarray(hole.centre)) @ hole.rotation
     before, after = local[:-1], local[1:]
-    passes = (before[:, 2] > 0) & (after[:, 2] <= 0) if inward else (before[:, 2] <= 0) & (after[:, 2] > 0)
+    passes = (
+        (before[:, 2] > 0) & (after[:, 2] <= 0)
+        if inward
+        else (before[:, 2] <= 0) & (after[:, 2] > 0)
+    )
     if not passes.any():
         return None
     start, end = before[passes], after[passes]

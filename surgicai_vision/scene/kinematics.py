@@ -1,8 +1,9 @@
-"""Kinematics of the da Vinci patient-side manipulator (PSM): joints ⇄ pose of the tool tip in the arm's base.
+"""Kinematics of the da Vinci patient-side manipulator (PSM): joints ⇄ pose of the tool tip in the
+arm's base.
 
-`Instrument.dh` is the modified DH table that the surgical robotics challenge publishes. The base origin is the
-remote centre of motion: the shaft passes through it, so both directions are closed forms. Multiplied out, with
-L = L_tool - L_rcc and s, c for sine and cosine:
+`Instrument.dh` is the modified DH table that the surgical robotics challenge publishes. The base
+origin is the remote centre of motion: the shaft passes through it, so both directions are closed
+forms. Multiplied out, with L = L_tool - L_rcc and s, c for sine and cosine:
 
     shaft  z3 = (s1 c2, -s2, -c1 c2),  x3 = (-s1 s2, -c2, c1 s2),  y3 = (-c1, 0, -s1)
     wrist  w  = (q3 + L) z3                       where the pitch axis meets the shaft
@@ -11,8 +12,8 @@ L = L_tool - L_rcc and s, c for sine and cosine:
     tip    p  = w + L_p2y u                       on the yaw axis
     columns of R: x = -c5 (c4 x3 + s4 y3) + s5 z3,  y = c6 e - s6 u,  z = c6 u + s6 e
 
-`…_flat` functions work on plain floats for the control step: a pose is a tuple of twelve floats, the position
-and then the rotation row by row.
+`…_flat` functions work on plain floats for the control step: a pose is a tuple of twelve floats,
+the position and then the rotation row by row.
 """
 
 import functools
@@ -30,11 +31,20 @@ from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.scene.rotations import rpy_to_matrix
 
 Joints = tuple[float, float, float, float, float, float]
-"""outer_yaw, outer_pitch [rad], outer_insertion [m], outer_roll, outer_wrist_pitch, outer_wrist_yaw [rad]."""
+"""outer_yaw, outer_pitch [rad], outer_insertion [m], outer_roll, outer_wrist_pitch, outer_wrist_yaw
+[rad].
+"""
 Pose = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """Position [m], then the rotation matrix row by row."""
 
-DVRK_JOINTS = ("outer_yaw", "outer_pitch", "outer_insertion", "outer_roll", "outer_wrist_pitch", "outer_wrist_yaw")
+DVRK_JOINTS = (
+    "outer_yaw",
+    "outer_pitch",
+    "outer_insertion",
+    "outer_roll",
+    "outer_wrist_pitch",
+    "outer_wrist_yaw",
+)
 """The dVRK's names; a joint in the model is f"{arm}_{name}"."""
 INSERTION = DVRK_JOINTS.index("outer_insertion")
 
@@ -43,7 +53,9 @@ TOLERANCE = 1e-9
 
 
 class Row(NamedTuple):
-    """One row: RotX(alpha) TransX(a) RotZ(q + offset) TransZ(d) [rad, m]; where `prismatic`, q adds to d."""
+    """One row: RotX(alpha) TransX(a) RotZ(q + offset) TransZ(d) [rad, m]; where `prismatic`, q adds
+    to d.
+    """
 
     alpha: float
     a: float
@@ -75,29 +87,42 @@ class Instrument:
     @functools.cached_property
     def bounds(self) -> tuple[float, ...]:
         """Return the lower and upper limit of each joint, `TOLERANCE` wider, in one row."""
-        return tuple(edge for low, high in self.limits for edge in (low - TOLERANCE, high + TOLERANCE))
+        return tuple(
+            edge for low, high in self.limits for edge in (low - TOLERANCE, high + TOLERANCE)
+        )
 
     @property
     def dh(self) -> tuple[Row, ...]:
         """Return the table: six joints and the fixed tip."""
         right = pi / 2
         first, second = Row(right, 0.0, 0.0, right), Row(-right, 0.0, 0.0, -right)
-        insertion, roll = Row(right, 0.0, -self.rcc, 0.0, prismatic=True), Row(0.0, 0.0, self.tool, 0.0)
+        insertion, roll = (
+            Row(right, 0.0, -self.rcc, 0.0, prismatic=True),
+            Row(0.0, 0.0, self.tool, 0.0),
+        )
         wrist_yaw, tip = Row(-right, self.pitch_to_yaw, 0.0, -right), Row(-right, 0.0, 0.0, right)
         return first, second, insertion, roll, second, wrist_yaw, tip
 
 
 def _limits(*degrees: float) -> tuple[tuple[float, float], ...]:
-    """Return symmetric limits of the five turning joints, with 0..0.24 m of insertion between them."""
+    """Return symmetric limits of the five turning joints, with 0..0.24 m of insertion between
+    them.
+    """
     turning = [(-radians(angle), radians(angle)) for angle in degrees]
     return (*turning[:INSERTION], (0.0, 0.24), *turning[INSERTION:])
 
 
 INSTRUMENTS = MappingProxyType(
     {
-        "400006": Instrument("400006", 0.4389, 0.416, _limits(92.0, 60.0, 175.0, 90.0, 85.0), (0.0, 1.57)),
+        "400006": Instrument(
+            "400006", 0.4389, 0.416, _limits(92.0, 60.0, 175.0, 90.0, 85.0), (0.0, 1.57)
+        ),
         "420006": Instrument(
-            "420006", 0.4318, 0.4826, _limits(91.0, 53.0, 175.0, 80.0, 80.0), (radians(-20.0), radians(80.0))
+            "420006",
+            0.4318,
+            0.4826,
+            _limits(91.0, 53.0, 175.0, 80.0, 80.0),
+            (radians(-20.0), radians(80.0)),
         ),
     }
 )
@@ -114,7 +139,9 @@ BASES = MappingProxyType(
 
 PSM1_START = (0.04629208, 0.00752399, -0.08173992, -3.598019, -0.05762508, 1.2738742, 0.8)
 PSM2_START = (-0.03721037, 0.01213105, -0.08036895, -2.7039163, 0.07693613, 2.0361109, 0.8)
-"""Tip at the start of an episode in the arm's own base: x y z [m], roll pitch yaw, jaw [rad] (released code)."""
+"""Tip at the start of an episode in the arm's own base: x y z [m], roll pitch yaw, jaw [rad]
+(released code).
+"""
 STARTS = MappingProxyType({PSM1: PSM1_START, PSM2: PSM2_START})
 
 
@@ -142,12 +169,15 @@ def forward(q6: ArrayLike, instrument: str = DEFAULT) -> NDArray[np.float64]:
     return _matrix(pose[:3], np.array(pose[3:]).reshape(3, 3))
 
 
-def inverse(T_base_tip: ArrayLike, instrument: str = DEFAULT, near: ArrayLike | None = None) -> NDArray[np.float64]:
+def inverse(
+    T_base_tip: ArrayLike, instrument: str = DEFAULT, near: ArrayLike | None = None
+) -> NDArray[np.float64]:
     """Return the joints (6,) [rad, m] that put the tip at `T_base_tip` (4, 4).
 
     Args:
-        near: joints (6,) the arm comes from. The roll is then unwrapped towards them: a pose that is only
-            reached by turning the roll back through its whole range is refused. Without it, any solution will do.
+        near: joints (6,) the arm comes from. The roll is then unwrapped towards them: a pose that
+            is only reached by turning the roll back through its whole range is refused. Without it,
+            any solution will do.
 
     Raises:
         UnreachablePose: outside a joint limit; names joint, value and limit.
@@ -186,10 +216,13 @@ def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = No
     """Return the joints of a tip pose given as twelve floats; see `inverse`."""
     px, py, pz, ax, yx, bx, ay, yy, by, az, yz, bz = pose
     length = INSTRUMENTS[instrument]
-    # The pitch axis e stands on the plane of the shaft and the yaw axis a, which holds the base origin and the tip.
+    # The pitch axis e stands on the plane of the shaft and the yaw axis a, which holds the base
+    # origin and the tip.
     ex, ey, ez = py * az - pz * ay, pz * ax - px * az, px * ay - py * ax
     norm = sqrt(ex * ex + ey * ey + ez * ez)
-    if norm < 1e-12:  # the yaw axis passes through the remote centre: every wrist yaw serves, take none
+    if (
+        norm < 1e-12
+    ):  # the yaw axis passes through the remote centre: every wrist yaw serves, take none
         ex, ey, ez, norm = yx, yy, yz, 1.0
     ex, ey, ez = ex / norm, ey / norm, ez / norm
     ux, uy, uz = ay * ez - az * ey, az * ex - ax * ez, ax * ey - ay * ex
@@ -202,11 +235,18 @@ def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = No
     depth = sqrt(wx * wx + wy * wy + wz * wz)
     offset = length.rcc - length.tool
     geometry = (ux, uy, uz, ex, ey, ez, ax, ay, az)
-    if depth < 1e-12:  # the wrist lies in the remote centre: any shaft will do, take the pitch link's own
+    if (
+        depth < 1e-12
+    ):  # the wrist lies in the remote centre: any shaft will do, take the pitch link's own
         return _checked((*_shaft(ux, uy, uz, offset, geometry, near), q6), length)
     joints = (*_shaft(wx / depth, wy / depth, wz / depth, depth + offset, geometry, near), q6)
-    if depth <= 2.0 * offset:  # the wrist may be behind the remote centre: 400006 inserted by less than 23 mm
-        behind = (*_shaft(-wx / depth, -wy / depth, -wz / depth, offset - depth, geometry, near), q6)
+    if (
+        depth <= 2.0 * offset
+    ):  # the wrist may be behind the remote centre: 400006 inserted by less than 23 mm
+        behind = (
+            *_shaft(-wx / depth, -wy / depth, -wz / depth, offset - depth, geometry, near),
+            q6,
+        )
         return _checked(_better(joints, behind, length, near), length)
     return _checked(joints, length)
 
@@ -222,11 +262,19 @@ def _shaft(
     q4 = atan2(s1 * zy * ex - c2 * ey - c1 * zy * ez, c1 * ex + s1 * ez)
     if near is not None:
         q4 += 2.0 * pi * round((near[3] - q4) / (2.0 * pi))
-    return atan2(s1, c1), atan2(-zy, c2), q3, q4, atan2(ax * zx + ay * zy + az * zz, ux * zx + uy * zy + uz * zz)
+    return (
+        atan2(s1, c1),
+        atan2(-zy, c2),
+        q3,
+        q4,
+        atan2(ax * zx + ay * zy + az * zz, ux * zx + uy * zy + uz * zz),
+    )
 
 
 def _better(first: Joints, second: Joints, instrument: Instrument, near: Joints | None) -> Joints:
-    """Return the solution within limits; of two such, or of none, the one nearer to `near` (or to zero)."""
+    """Return the solution within limits; of two such, or of none, the one nearer to `near` (or to
+    zero).
+    """
     within = [joints for joints in (first, second) if _violation(joints, instrument) < 0]
     return min(within or (first, second), key=lambda joints: math.dist(joints, near or (0.0,) * 6))
 
@@ -235,7 +283,14 @@ def _violation(joints: Joints, instrument: Instrument) -> int:
     """Return the index of the first joint outside its limits, -1 for none."""
     a, b, c, d, e, f = joints
     a0, a1, b0, b1, c0, c1, d0, d1, e0, e1, f0, f1 = instrument.bounds
-    if a0 <= a <= a1 and b0 <= b <= b1 and c0 <= c <= c1 and d0 <= d <= d1 and e0 <= e <= e1 and f0 <= f <= f1:
+    if (
+        a0 <= a <= a1
+        and b0 <= b <= b1
+        and c0 <= c <= c1
+        and d0 <= d <= d1
+        and e0 <= e <= e1
+        and f0 <= f <= f1
+    ):
         return -1
     return next(
         index

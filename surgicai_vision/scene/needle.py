@@ -1,11 +1,12 @@
 """Needle: a rigid arc of capsules, one free body whose origin is the centre of the arc.
 
-Needle frame (facts of SurgicAI's released code): the point at angle θ [rad] is p(θ) = (-R cos θ, R sin θ, 0);
-0 is the base, where the thread is tied, `TIP_ANGLE` the tip; +z is the normal of the needle's plane.
+Needle frame (facts of SurgicAI's released code): the point at angle θ [rad] is p(θ) = (-R cos θ, R
+sin θ, 0); 0 is the base, where the thread is tied, `TIP_ANGLE` the tip; +z is the normal of the
+needle's plane.
 
-Sources: radius 10.18 mm and the 0°–120° arc from SurgicAI's scene; the diameter of 0.9 mm is between that of
-the new surgical robotics challenge (0.98 × 0.86 mm) and SurgicAI's (0.725 mm), and both taper towards the tip.
-Contact numbers were measured by `benchmarks/grip.py`.
+Sources: radius 10.18 mm and the 0°–120° arc from SurgicAI's scene; the diameter of 0.9 mm is
+between that of the new surgical robotics challenge (0.98 × 0.86 mm) and SurgicAI's (0.725 mm), and
+both taper towards the tip. Contact numbers were measured by `benchmarks/grip.py`.
 """
 
 import itertools
@@ -25,10 +26,10 @@ SEGMENTS = 16
 MASS = 0.0002
 """[kg]; a steel needle of this size."""
 DRAG = 2e-7
-"""Drag of the free needle [N·s/m and N·m·s/rad]. It slows a fall by 0.1 % a second, and it takes the energy that the
-explicit integrator would otherwise feed into a fast spin: without it one random episode in seventy diverged. Damping
-is explicit (`compose`), so it must stay below 2 I / dt: about the needle's chord, its least inertia, I is
-4.7e-10 kg m², the limit 4.7e-7."""
+"""Drag of the free needle [N·s/m and N·m·s/rad]. It slows a fall by 0.1 % a second, and it takes
+the energy that the explicit integrator would otherwise feed into a fast spin: without it one random
+episode in seventy diverged. Damping is explicit (`compose`), so it must stay below 2 I / dt: about
+the needle's chord, its least inertia, I is 4.7e-10 kg m², the limit 4.7e-7."""
 HOME = np.array([-0.02079, 0.05620, 0.07171])
 """Needle frame at the centre of the start distribution, lying flat [m, world]."""
 
@@ -38,13 +39,15 @@ CONTACT = {
     "solref": [0.004, 1.0],
     "solimp": [0.99, 0.999, 0.0001, 0.5, 2.0],
 }
-"""Stiff contact with strong torsional friction, for the serrated jaws of a needle driver: what lets two flat pads
-hold a round needle. With the default 0.005 m the grip crept 0.7° in ten seconds, 2.2° at most; with 0.01 m 0.4° and
-1.2°."""
+"""Stiff contact with strong torsional friction, for the serrated jaws of a needle driver: what lets
+two flat pads hold a round needle. With the default 0.005 m the grip crept 0.7° in ten seconds, 2.2°
+at most; with 0.01 m 0.4° and 1.2°."""
 
 
 def point(angle: float, radius: float = RADIUS) -> np.ndarray:
-    """Return the point at `angle` [rad] of an arc of `radius` [m] in the needle frame, shape (3,) [m]."""
+    """Return the point at `angle` [rad] of an arc of `radius` [m] in the needle frame, shape (3,)
+    [m].
+    """
     return np.array([-radius * math.cos(angle), radius * math.sin(angle), 0.0])
 
 
@@ -54,18 +57,24 @@ def tangent(angle: float) -> np.ndarray:
 
 
 def radial(angle: float) -> np.ndarray:
-    """Return the unit vector from the centre to the arc at `angle` [rad] in the needle frame, shape (3,)."""
+    """Return the unit vector from the centre to the arc at `angle` [rad] in the needle frame, shape
+    (3,).
+    """
     return np.array([-math.cos(angle), math.sin(angle), 0.0])
 
 
 def polyline(points: int = 61, radius: float = RADIUS) -> np.ndarray:
     """Return points along the needle from base to tip in its frame, shape (points, 3) [m]."""
     angles = np.linspace(0.0, TIP_ANGLE, points)
-    return np.stack([-radius * np.cos(angles), radius * np.sin(angles), np.zeros_like(angles)], axis=1)
+    return np.stack(
+        [-radius * np.cos(angles), radius * np.sin(angles), np.zeros_like(angles)], axis=1
+    )
 
 
 def thickness(angle: float) -> float:
-    """Return half of the needle's thickness at `angle` [rad]: it tapers over the last quarter [m]."""
+    """Return half of the needle's thickness at `angle` [rad]: it tapers over the last quarter
+    [m].
+    """
     share = max(0.0, (angle / TIP_ANGLE - 0.75) / 0.25)
     return BODY_RADIUS + share * (TIP_RADIUS - BODY_RADIUS)
 

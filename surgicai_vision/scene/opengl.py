@@ -1,7 +1,9 @@
-"""OpenGL without a display: one context for the whole process, made on first use and freed at its end.
+"""OpenGL without a display: one context for the whole process, made on first use and freed at its
+end.
 
-Software rendering runs in the calling thread ($LP_NUM_THREADS is put to 0): one process per core is faster than one
-threaded process, and a forked child, which lacks its parent's threads, would wait for them for ever.
+Software rendering runs in the calling thread ($LP_NUM_THREADS is put to 0): one process per core is
+faster than one threaded process, and a forked child, which lacks its parent's threads, would wait
+for them for ever.
 """
 
 import atexit
@@ -38,7 +40,7 @@ def make_current() -> None:
 
 
 def renderer_string() -> str:
-    """Return what draws the pictures, as OpenGL names it: "llvmpipe (LLVM 15.0.6, 256 bits)"."""
+    """Return what draws the images, as OpenGL names it: "llvmpipe (LLVM 15.0.6, 256 bits)"."""
     make_current()
     from OpenGL import GL  # only now: the backend's module has told PyOpenGL its platform
 

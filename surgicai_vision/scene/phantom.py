@@ -1,12 +1,12 @@
 """Phantom: a tissue pad with a ridge along y; the four hole pairs open on the ridge's two flanks.
 
-Only the walls are solid: each flank is a plate of `WALL` thickness with square openings, so the needle runs
-free inside the ridge, as in SurgicAI's phantom, whose holes hang on springs. The openings are wide for the same
-reason as there: the needle's arc meets them 21° off their axis.
+Only the walls are solid: each flank is a plate of `WALL` thickness with square openings, so the
+needle runs free inside the ridge, as in SurgicAI's phantom, whose holes hang on springs. The
+openings are wide for the same reason as there: the needle's arc meets them 21° off their axis.
 
-Tissue yields to steel: the jaws may dent the pad by `DENT` before they meet its firm layer, while the needle,
-a hundred times lighter, lies on its surface. Without it no jaw whose pads reach past the grasp point could
-take a needle that lies flat.
+Tissue yields to steel: the jaws may dent the pad by `DENT` before they meet its firm layer, while
+the needle, a hundred times lighter, lies on its surface. Without it no jaw whose pads reach past
+the grasp point could take a needle that lies flat.
 """
 
 import itertools
@@ -28,8 +28,8 @@ DENT = 0.0025
 CREST = 0.0012
 """Radius of the ridge's rounded top [m]."""
 BEYOND = 0.006
-"""How far the ridge goes on beyond the first and the last hole pair [m]: short, because the tools come along the
-wound and their wrists stand there."""
+"""How far the ridge goes on beyond the first and the last hole pair [m]: short, because the tools
+come along the wound and their wrists stand there."""
 
 TRAY_RIM, TRAY_HEIGHT = 0.007, 0.012
 """How far the tray on which the phantom lies reaches beyond it, and its height [m]."""
@@ -41,7 +41,9 @@ TABLE = SURFACE - SIZE[2] - CLEARANCE
 CONTACT = {"condim": 3, "friction": [0.4, 0.002, 0.0001], "solref": [0.004, 1.0]}
 
 
-def add_phantom(spec: mujoco.MjSpec, layout: str, needle: dict[str, int], arm: dict[str, int]) -> None:
+def add_phantom(
+    spec: mujoco.MjSpec, layout: str, needle: dict[str, int], arm: dict[str, int]
+) -> None:
     """Add the phantom to `spec` as one fixed body.
 
     Args:
@@ -66,14 +68,19 @@ def add_phantom(spec: mujoco.MjSpec, layout: str, needle: dict[str, int], arm: d
         )
     pairs = PAIRS[layout]
     edges = piece_edges(pairs)
-    for index, (pair, start, end) in enumerate(zip(pairs, edges[:-1], edges[1:], strict=True), start=1):
+    for index, (pair, start, end) in enumerate(
+        zip(pairs, edges[:-1], edges[1:], strict=True), start=1
+    ):
         for side, hole in (("entry", pair.entry), ("exit", pair.exit)):
-            _add_flank(body, f"phantom_{side}{index}", hole, start, end, flank_height(pair, hole), both)
+            _add_flank(
+                body, f"phantom_{side}{index}", hole, start, end, flank_height(pair, hole), both
+            )
         _add_crest(body, f"phantom_crest{index}", pair, start, end, both)
 
 
 def add_table(spec: mujoco.MjSpec, bits: dict[str, int]) -> None:
-    """Add the tray and the table below it, on which a needle comes to rest that falls from the phantom.
+    """Add the tray and the table below it, on which a needle comes to rest that falls from the
+    phantom.
 
     They are solid for the needle and the thread alone: no instrument is meant to come so low.
 
@@ -85,7 +92,9 @@ def add_table(spec: mujoco.MjSpec, bits: dict[str, int]) -> None:
     place = {"pos": [*ORIGIN, TABLE + half[2]], "size": half, "material": "tray", "group": 0}
     spec.worldbody.add_geom(name="tray", type=mujoco.mjtGeom.mjGEOM_BOX, **place, **CONTACT, **bits)
     flat = {"pos": [*ORIGIN, TABLE], "size": [0.0, 0.0, 1.0], "group": 4}
-    spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, **flat, **CONTACT, **bits)
+    spec.worldbody.add_geom(
+        name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, **flat, **CONTACT, **bits
+    )
 
 
 def piece_edges(pairs: tuple[HolePair, ...]) -> list[float]:
@@ -101,7 +110,13 @@ def flank_height(pair: HolePair, hole: Hole) -> float:
 
 
 def _add_flank(
-    body: mujoco.MjsBody, name: str, hole: Hole, start: float, end: float, rise: float, bits: dict[str, int]
+    body: mujoco.MjsBody,
+    name: str,
+    hole: Hole,
+    start: float,
+    end: float,
+    rise: float,
+    bits: dict[str, int],
 ) -> None:
     """Add the four boxes that frame one opening, from the crest down to the pad."""
     opening = OPENING / 2

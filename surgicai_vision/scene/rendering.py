@@ -1,11 +1,13 @@
-"""Rendering: a state becomes pictures, in software, without a display.
+"""Rendering: a state becomes images, in software, without a display.
 
-One OpenGL context serves the whole process and lives until it ends; every (model, size, quality) has one set of
-GPU objects inside it, shared by its `FrameRenderer`s and freed with the last of them. Several contexts in one
-process corrupt each other's segmentation when an older one is collected late, and cost 50 ms each.
+One OpenGL context serves the whole process and lives until it ends; every (model, size, quality)
+has one set of GPU objects inside it, shared by its `FrameRenderer`s and freed with the last of
+them. Several contexts in one process corrupt each other's segmentation when an older one is
+collected late, and cost 50 ms each.
 
-On llvmpipe the time of a frame goes into shadows, multisampling and the triangles of capsules, in this order:
-quality "fast" has none of the first two and few of the third; "high" is for pictures that people look at.
+On llvmpipe the time of a frame goes into shadows, multisampling and the triangles of capsules, in
+this order: quality "fast" has none of the first two and few of the third; "high" is for images that
+people look at.
 """
 
 import contextlib
@@ -30,7 +32,9 @@ __all__ = ["QUALITIES", "FrameRenderer", "parts_of_geoms", "renderer_string"]
 
 @dataclass(frozen=True)
 class Quality:
-    """What a picture costs: multisampling, shadow map [pixel], triangles round and along a capsule, quads a face."""
+    """What an image costs: multisampling, shadow map [pixel], triangles round and along a capsule,
+    quads a face.
+    """
 
     samples: int
     shadow: int
@@ -41,17 +45,17 @@ class Quality:
 
 QUALITIES = MappingProxyType({"fast": Quality(0, 0, 12, 6, 1), "high": Quality(8, 4096, 32, 16, 4)})
 MAX_SIDE = 4096
-"""Largest height and width of a picture [pixel]."""
+"""Largest height and width of an image [pixel]."""
 
 
 class FrameRenderer:
-    """Pictures of one model at one size. Close it, or use it as a context manager.
+    """Images of one model at one size. Close it, or use it as a context manager.
 
     Use a renderer in the thread and the process that made it.
     """
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int, quality: str = "fast"):
-        """Prepare pictures of `height` × `width` [pixel] in quality "fast" or "high".
+        """Prepare images of `height` × `width` [pixel] in quality "fast" or "high".
 
         Raises:
             UnknownName: another quality.
@@ -60,27 +64,34 @@ class FrameRenderer:
         check_name("quality", quality, QUALITIES)
         for side in (height, width):
             if not 1 <= side <= MAX_SIDE:
-                raise InputError(f"A picture of {height} × {width} pixels; each side must be 1 to {MAX_SIDE}.")
+                raise InputError(
+                    f"An image of {height} × {width} pixels; each side must be 1 to {MAX_SIDE}."
+                )
         self.model, self.height, self.width, self.quality = model, int(height), int(width), quality
         self._cameras: dict[str, mujoco.MjvCamera] = {}
         self._target: _Target | None = _acquire(model, self.height, self.width, quality)
 
     def render(self, data: mujoco.MjData, camera: str, modality: str = RGB) -> NDArray[Any]:
-        """Return one picture of the state `data`, an array of its own.
+        """Return one image of the state `data`, an array of its own.
 
         Args:
             data: a state that has been through `mj_forward`.
             camera: name of a camera of the model.
-            modality: "rgb" → (H, W, 3) uint8; "depth" → (H, W, 1) float32 [m] along the camera's axis, the far plane
-                where nothing stands; "segmentation" → (H, W, 1) uint8, an index of `names.PARTS`.
+            modality: "rgb" → (H, W, 3) uint8; "depth" → (H, W, 1) float32 [m] along the camera's
+                axis, the far plane where nothing stands; "segmentation" → (H, W, 1) uint8, an index
+                of `names.PARTS`.
 
         Raises:
             UnknownName: another camera or modality; the message lists what exists.
         """
         return self.render_all(data, camera, (modality,))[modality]
 
-    def render_all(self, data: mujoco.MjData, camera: str, modalities: Iterable[str]) -> dict[str, NDArray[Any]]:
-        """Return several modalities of one view as `render` does; depth and segmentation share one pass."""
+    def render_all(
+        self, data: mujoco.MjData, camera: str, modalities: Iterable[str]
+    ) -> dict[str, NDArray[Any]]:
+        """Return several modalities of one view as `render` does; depth and segmentation share one
+        pass.
+        """
         wanted = tuple(modalities)
         for modality in wanted:
             check_name("modality", modality, MODALITIES)
@@ -134,25 +145,27 @@ class _Target:
         self.parts = parts_of_geoms(model)
         self.codes = np.zeros(0, dtype=np.uint8)
 
-    def draw(self, data: mujoco.MjData, view: mujoco.MjvCamera, wanted: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    def draw(
+        self, data: mujoco.MjData, view: mujoco.MjvCamera, wanted: tuple[str, ...]
+    ) -> dict[str, NDArray[Any]]:
         """Return the wanted modalities from at most two passes."""
         opengl.make_current()
         # Another target may have drawn since; without this its buffer would be drawn over and read.
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self.model, data, self.option, None, view, everything, self.scene)
-        pictures: dict[str, NDArray[Any]] = {}
+        images: dict[str, NDArray[Any]] = {}
         if RGB in wanted:
             mujoco.mjr_render(self.area, self.scene, self.context)
             mujoco.mjr_readPixels(self.colours, None, self.area, self.context)
-            pictures[RGB] = self.colours[::-1].copy()  # OpenGL's first row is the lowest
+            images[RGB] = self.colours[::-1].copy()  # OpenGL's first row is the lowest
         if DEPTH in wanted or SEGMENTATION in wanted:
             self._draw_ids()
             if DEPTH in wanted:
-                pictures[DEPTH] = self._depth()
+                images[DEPTH] = self._depth()
             if SEGMENTATION in wanted:
-                pictures[SEGMENTATION] = self._segmentation()
-        return pictures
+                images[SEGMENTATION] = self._segmentation()
+        return images
 
     def _draw_ids(self) -> None:
         """Draw each geom in the colour of its number; such a pass has the exact depth as well."""
@@ -165,7 +178,9 @@ class _Target:
         mujoco.mjr_readPixels(self.colours, self.depths, self.area, self.context)
 
     def _depth(self) -> NDArray[np.float32]:
-        """Return metres from the depth buffer, which is 1 at the near plane and 0 at the far plane."""
+        """Return metres from the depth buffer, which is 1 at the near plane and 0 at the far
+        plane.
+        """
         extent = self.model.stat.extent
         near, far = self.model.vis.map.znear * extent, self.model.vis.map.zfar * extent
         stored = self.depths[::-1, :, None].astype(np.float64)
@@ -173,8 +188,12 @@ class _Target:
         return metres.astype(np.float32)
 
     def _segmentation(self) -> NDArray[np.uint8]:
-        """Return parts from colours: a geom's number in the scene plus 1, in base 256, red first."""
-        if len(self.codes) != self.scene.ngeom + 1:  # the same geoms are visible in every frame of a model
+        """Return parts from colours: a geom's number in the scene plus 1, in base 256, red
+        first.
+        """
+        if (
+            len(self.codes) != self.scene.ngeom + 1
+        ):  # the same geoms are visible in every frame of a model
             self.codes = np.zeros(self.scene.ngeom + 1, dtype=np.uint8)
             for geom in self.scene.geoms[: self.scene.ngeom]:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.segid >= 0:
@@ -186,7 +205,9 @@ class _Target:
 
 
 def parts_of_geoms(model: mujoco.MjModel) -> NDArray[np.uint8]:
-    """Return each geom's index in `names.PARTS` (ngeom,), by the name of the first named part among its bodies."""
+    """Return each geom's index in `names.PARTS` (ngeom,), by the name of the first named part among
+    its bodies.
+    """
     found = np.zeros(model.ngeom, dtype=np.uint8)
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])
@@ -239,7 +260,9 @@ if hasattr(os, "register_at_fork"):
 
 
 @contextlib.contextmanager
-def _visual_settings(model: mujoco.MjModel, quality: Quality, height: int, width: int) -> Iterator[None]:
+def _visual_settings(
+    model: mujoco.MjModel, quality: Quality, height: int, width: int
+) -> Iterator[None]:
     """Lend the model the settings that OpenGL objects are made from; they are read only then."""
     look, screen = model.vis.quality, model.vis.global_
     settings = (

@@ -1,9 +1,9 @@
 """Rotations: matrices, roll-pitch-yaw, rotation vectors, quaternions, and the angle between two.
 
-Conventions: `R = Rz(yaw) Ry(pitch) Rx(roll)` (fixed axes, facts of SurgicAI); quaternions are (w, x, y, z), as
-in MuJoCo, with w >= 0. Each function has one implementation in plain floats (`…_flat`: a matrix is a tuple of
-nine floats, row by row), because a control step that calls numpy on 3 × 3 arrays is several times slower; the
-numpy functions wrap it.
+Conventions: `R = Rz(yaw) Ry(pitch) Rx(roll)` (fixed axes, facts of SurgicAI); quaternions are (w,
+x, y, z), as in MuJoCo, with w >= 0. Each function has one implementation in plain floats (`…_flat`:
+a matrix is a tuple of nine floats, row by row), because a control step that calls numpy on 3 × 3
+arrays is several times slower; the numpy functions wrap it.
 """
 
 from collections.abc import Sequence
@@ -35,9 +35,11 @@ def rpy_to_matrix_flat(roll: float, pitch: float, yaw: float) -> Flat9:
 
 
 def matrix_to_rpy_flat(m: Sequence[float]) -> Vector:
-    """Return (roll, pitch, yaw) [rad]: roll in (-2π, 0] as in the released code, pitch in [-π/2, π/2], yaw in (-π, π].
+    """Return (roll, pitch, yaw) [rad]: roll in (-2π, 0] as in the released code, pitch in [-π/2,
+    π/2], yaw in (-π, π].
 
-    The tools point down in their base frames, at a roll of about ±π; the range (-2π, 0] puts the cut elsewhere.
+    The tools point down in their base frames, at a roll of about ±π; the range (-2π, 0] puts the
+    cut elsewhere.
     """
     r00, r10, r20, r21, r22 = m[0], m[3], m[6], m[7], m[8]
     cos_pitch = sqrt(r00 * r00 + r10 * r10)
@@ -60,11 +62,23 @@ def rotvec_to_matrix_flat(x: float, y: float, z: float) -> Flat9:
         c = cos(angle)
         a, b = sin(angle) / angle, (1.0 - c) / square
     ax, ay, az, bxy, bxz, byz = a * x, a * y, a * z, b * x * y, b * x * z, b * y * z
-    return (c + b * x * x, bxy - az, bxz + ay, bxy + az, c + b * y * y, byz - ax, bxz - ay, byz + ax, c + b * z * z)
+    return (
+        c + b * x * x,
+        bxy - az,
+        bxz + ay,
+        bxy + az,
+        c + b * y * y,
+        byz - ax,
+        bxz - ay,
+        byz + ax,
+        c + b * z * z,
+    )
 
 
 def matrix_to_rotvec_flat(m: Sequence[float]) -> Vector:
-    """Return the rotation vector [rad], of length at most π; exact to rounding at 0 and at π as well."""
+    """Return the rotation vector [rad], of length at most π; exact to rounding at 0 and at π as
+    well.
+    """
     w, x, y, z = matrix_to_quaternion_flat(m)
     half_sine = sqrt(x * x + y * y + z * z)
     scale = 2.0 if half_sine < 1e-12 else 2.0 * atan2(half_sine, w) / half_sine
@@ -72,7 +86,9 @@ def matrix_to_rotvec_flat(m: Sequence[float]) -> Vector:
 
 
 def matrix_to_quaternion_flat(m: Sequence[float]) -> Quaternion:
-    """Return the unit quaternion (w, x, y, z) with w >= 0, by Shepperd's choice of the largest component."""
+    """Return the unit quaternion (w, x, y, z) with w >= 0, by Shepperd's choice of the largest
+    component.
+    """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = m
     trace = r00 + r11 + r22
     if trace >= r00 and trace >= r11 and trace >= r22:
@@ -116,7 +132,8 @@ def geodesic_angle_flat(a: Sequence[float], b: Sequence[float]) -> float:
     a0, a1, a2, a3, a4, a5, a6, a7, a8 = a
     b0, b1, b2, b3, b4, b5, b6, b7, b8 = b
     trace = a0 * b0 + a1 * b1 + a2 * b2 + a3 * b3 + a4 * b4 + a5 * b5 + a6 * b6 + a7 * b7 + a8 * b8
-    # The skew part of a bᵀ is the sine; with both, the angle is exact near 0 and π, where an arc cosine is not.
+    # The skew part of a bᵀ is the sine; with both, the angle is exact near 0 and π, where an arc
+    # cosine is not.
     x = a6 * b3 + a7 * b4 + a8 * b5 - a3 * b6 - a4 * b7 - a5 * b8
     y = a0 * b6 + a1 * b7 + a2 * b8 - a6 * b0 - a7 * b1 - a8 * b2
     z = a3 * b0 + a4 * b1 + a5 * b2 - a0 * b3 - a1 * b4 - a2 * b5
@@ -140,7 +157,9 @@ def rotvec_to_matrix(rotvec: ArrayLike) -> Matrix:
 
 
 def matrix_to_rotvec(matrix: ArrayLike) -> Matrix:
-    """Return the rotation vector (3,) [rad] of a (3, 3) rotation: the logarithm, of length at most π."""
+    """Return the rotation vector (3,) [rad] of a (3, 3) rotation: the logarithm, of length at most
+    π.
+    """
     return np.array(matrix_to_rotvec_flat(flatten(matrix)))
 
 

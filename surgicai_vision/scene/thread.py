@@ -1,8 +1,8 @@
 """Thread: a chain of capsules on ball joints, tied to the needle's base.
 
-Sources: 95 mm long and 0.372 mm thick in SurgicAI's scene (40 capsules). Fewer segments keep the length. Contact
-is frictionless, by priority over what it touches, and the joints carry an armature: with friction the solver ran
-eight times slower.
+Sources: 95 mm long and 0.372 mm thick in SurgicAI's scene (40 capsules). Fewer segments keep the
+length. Contact is frictionless, by priority over what it touches, and the joints carry an armature:
+with friction the solver ran eight times slower.
 """
 
 import mujoco
@@ -14,7 +14,11 @@ STIFFNESS, DAMPING, ARMATURE = 2e-6, 2e-7, 1e-8
 
 
 def add_thread(
-    spec: mujoco.MjSpec, needle: mujoco.MjsBody, base: list[float], segments: int, bits: dict[str, int]
+    spec: mujoco.MjSpec,
+    needle: mujoco.MjsBody,
+    base: list[float],
+    segments: int,
+    bits: dict[str, int],
 ) -> None:
     """Tie a thread of `segments` capsules to `needle`.
 

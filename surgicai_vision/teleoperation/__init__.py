@@ -1,23 +1,29 @@
-"""Teleoperation: a person drives the active arm and keeps what succeeded, as demonstrations like any others.
+"""Teleoperation: a person drives the active arm and keeps what succeeded, as demonstrations like
+any others.
 
-    keys, sticks ──poll──► Input ──Steering──► action (7,) ──Session.tick──► env ──► Recordings: a file an episode
-       window | web page ◄──────────── pictures and status ◄────────┘
+    keys, sticks ──poll──► Input ──Steering──► action (7,) ──Session.tick──► env ──► Recordings: a
+    file an episode
+       window | web page ◄──────────── images and status ◄────────┘
 
 The parts, each usable and tested alone:
 
-* `commands`: what a hand can say (`Input`: three motions, three turns, the jaw, fine or not, events) and the protocol
-  `Device`. `steering`: the env's action of it, in the axes of a camera or of the tool.
-* `keyboard`, `gamepad`: presses and releases, axes and buttons → `Input`. The key table that `--help`, the page and
-  the documentation show is in `keyboard`. Keys are named as browsers name them (`KeyboardEvent.code`): by their place
-  on the keyboard, whatever is printed on them.
-* `session`: the state machine waiting → driving → judged → kept or discarded. Stepped by `tick`, one control step of
-  20 ms each; no clock, no thread, no randomness but the episode's seed: the same inputs give the same files.
-* `recordings`: the folder. An episode is written whole as soon as it is kept, so a process killed at any moment costs
-  the attempt in flight; the same command continues the numbers and the seeds.
-* `pacing`: ticks at 50 Hz of the wall clock. When drawing is too slow, pictures are dropped, never ticks.
-* `window`, `web`: the two places where a person sees and acts. Both are a `Device` and a `Screen` (`driving`).
+* `commands`: what a hand can say (`Input`: three motions, three turns, the jaw, fine or not,
+  events) and the protocol `Device`. `steering`: the env's action of it, in the axes of a camera or
+  of the tool.
+* `keyboard`, `gamepad`: presses and releases, axes and buttons → `Input`. The key table that
+  `--help`, the page and the documentation show is in `keyboard`. Keys are named as browsers name
+  them (`KeyboardEvent.code`): by their place on the keyboard, whatever is printed on them.
+* `session`: the state machine waiting → driving → judged → kept or discarded. Stepped by `tick`,
+  one control step of 20 ms each; no clock, no thread, no randomness but the episode's seed: the
+  same inputs give the same files.
+* `recordings`: the folder. An episode is written whole as soon as it is kept, so a process killed
+  at any moment costs the attempt in flight; the same command continues the numbers and the seeds.
+* `pacing`: ticks at 50 Hz of the wall clock. When drawing is too slow, images are dropped, never
+  ticks.
+* `window`, `web`: the two places where a person sees and acts. Both are a `Device` and a `Screen`
+  (`driving`).
 
-The web view exists for machines without a display: it listens on loopback alone, its address holds a random token,
-and a gamepad on the viewer's own machine works through the browser. Pictures are polled one by one, not streamed, so
-a slow line shows fewer of them and none late.
+The web view exists for machines without a display: it listens on loopback alone, its address holds
+a random token, and a gamepad on the viewer's own machine works through the browser. Images are
+polled one by one, not streamed, so a slow line shows fewer of them and none late.
 """

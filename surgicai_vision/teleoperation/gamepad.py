@@ -1,6 +1,7 @@
 """Gamepad: axes and buttons in the order of the W3C's standard gamepad become an `Input`.
 
-The same order serves a browser's Gamepad API as it is, and GLFW's gamepads after `window` put them in it.
+The same order serves a browser's Gamepad API as it is, and GLFW's gamepads after `window` put them
+in it.
 """
 
 from collections.abc import Sequence
@@ -9,7 +10,9 @@ from types import MappingProxyType
 from surgicai_vision.teleoperation.inputs import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
 
 AXES, BUTTONS = 4, 16
-"""Left stick x y, right stick x y, each in [-1, 1], y downwards; and the buttons of the standard."""
+"""Left stick x y, right stick x y, each in [-1, 1], y downwards; and the buttons of the
+standard.
+"""
 DEAD = 0.12
 """Deflection below which a stick is at rest; worn sticks stay up to a tenth off."""
 PRESSED = 0.5

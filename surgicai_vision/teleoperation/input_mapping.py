@@ -1,4 +1,6 @@
-"""Steering: the action that an input means, in the axes of a camera or of the tool, for the arm that is active."""
+"""Steering: the action that an input means, in the axes of a camera or of the tool, for the arm
+that is active.
+"""
 
 from typing import Any
 
@@ -14,8 +16,8 @@ FRAMES = ("camera", "tool")
 FINE = 0.2
 """Speed with the fine modifier, as a share of the usual."""
 CLOSE_ABOVE, OPENED = 0.05, 0.4
-"""The toggle closes a jaw that is open by more than the first, else opens it to the second [rad]: room for the needle
-(0.7 mm) and little else between the pads."""
+"""The toggle closes a jaw that is open by more than the first, else opens it to the second [rad]:
+room for the needle (0.7 mm) and little else between the pads."""
 
 
 class Steering:
@@ -52,7 +54,9 @@ class Steering:
         speed = self.speed * (FINE if given.fine else 1.0)
         rotation = self.axes(view)
         motions = [speed * rotation @ _limited(vector) for vector in (given.move, given.turn)]
-        action: NDArray[np.float32] = np.array([*np.concatenate(motions), self._jaw(given, speed)], dtype=np.float32)
+        action: NDArray[np.float32] = np.array(
+            [*np.concatenate(motions), self._jaw(given, speed)], dtype=np.float32
+        )
         return np.clip(action, -1.0, 1.0)
 
     def axes(self, view: str) -> NDArray[np.float64]:
@@ -66,7 +70,9 @@ class Steering:
         return base.T @ camera
 
     def _jaw(self, given: Input, speed: float) -> float:
-        """Return the jaw's part of the action [steps]: what is held, else what a toggle still owes."""
+        """Return the jaw's part of the action [steps]: what is held, else what a toggle still
+        owes.
+        """
         if JAW in given.events:
             now = float(self.env.simulation.commands[self._arm].jaw)
             self._jaw_due = ((0.0 if now > CLOSE_ABOVE else OPENED) - now) / self._jaw_step

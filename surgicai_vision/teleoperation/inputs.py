@@ -1,8 +1,9 @@
 """Commands: what a hand can say, and the protocol of whatever says it.
 
-Axes are those of a picture, as OpenCV has them: x right, y down, z away from the viewer, into the picture. A turn is
-about these axes by the right-hand rule: about x it tilts what points away upwards, about y it swings it to the right,
-about z it rolls clockwise. In the tool's frame the viewer looks out of the instrument: z points out between the jaws.
+Axes are those of an image, as OpenCV has them: x right, y down, z away from the viewer, into the
+image. A turn is about these axes by the right-hand rule: about x it tilts what points away upwards,
+about y it swings it to the right, about z it rolls clockwise. In the tool's frame the viewer looks
+out of the instrument: z points out between the jaws.
 """
 
 from collections.abc import Iterable
@@ -14,7 +15,9 @@ Vector = tuple[float, float, float]
 KEEP, DISCARD, STOP, START = "keep", "discard", "stop", "start"
 JAW, VIEW = "jaw", "view"
 EVENTS = (KEEP, DISCARD, STOP, START, JAW, VIEW)
-"""What happens once a press: → ← Esc of `lerobot-record`, begin, open or close the jaw, lead with the next view."""
+"""What happens once a press: → ← Esc of `lerobot-record`, begin, open or close the jaw, lead with
+the next view.
+"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,11 @@ class Device(Protocol):
 def merged(inputs: Iterable[Input]) -> Input:
     """Return several hands as one: motions add up to at most 1, events follow one another."""
     parts = tuple(inputs)
-    rows = zip(*((*part.move, *part.turn, part.jaw) for part in parts), strict=True) if parts else [(0.0,)] * 7
+    rows = (
+        zip(*((*part.move, *part.turn, part.jaw) for part in parts), strict=True)
+        if parts
+        else [(0.0,)] * 7
+    )
     x, y, z, tilt, swing, roll, jaw = (min(max(sum(row), -1.0), 1.0) for row in rows)
     events = tuple(event for part in parts for event in part.events)
     fine = any(part.fine for part in parts)

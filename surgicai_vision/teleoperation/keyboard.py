@@ -1,7 +1,7 @@
 """Keyboard: keys held and pressed become an `Input`.
 
-Keys are named by their place, as in a browser's `KeyboardEvent.code`: "KeyW" is the key left of E, whatever is printed
-on it.
+Keys are named by their place, as in a browser's `KeyboardEvent.code`: "KeyW" is the key left of E,
+whatever is printed on it.
 """
 
 from collections.abc import Iterable
@@ -20,18 +20,22 @@ class Row(NamedTuple):
 
 
 TABLE = (
-    Row(("KeyW", "KeyS"), "left stick", "move up, down in the picture"),
-    Row(("KeyA", "KeyD"), "left stick", "move left, right in the picture"),
-    Row(("KeyE", "KeyQ"), "triggers RT, LT", "move into the picture, out of it"),
+    Row(("KeyW", "KeyS"), "left stick", "move up, down in the image"),
+    Row(("KeyA", "KeyD"), "left stick", "move left, right in the image"),
+    Row(("KeyE", "KeyQ"), "triggers RT, LT", "move into the image, out of it"),
     Row(("KeyI", "KeyK"), "right stick", "tilt up, down"),
     Row(("KeyJ", "KeyL"), "right stick", "swing left, right"),
     Row(("KeyU", "KeyO"), "bumpers LB, RB", "roll anticlockwise, clockwise"),
     Row(("Space",), "A", "close or open the jaw"),
     Row(("KeyX", "KeyZ"), "D-pad up, down", "open, close the jaw a little"),
     Row(("ShiftLeft", "ShiftRight"), "X, held", "slow and fine, a fifth of the speed"),
-    Row(("KeyV",), "Y", "lead with the next view: its picture is large, its axes count"),
+    Row(("KeyV",), "Y", "lead with the next view: its image is large, its axes count"),
     Row(("Enter",), "Start", "begin without moving"),
-    Row(("ArrowRight",), "D-pad right", "keep a success and go on; else give up this start and go on"),
+    Row(
+        ("ArrowRight",),
+        "D-pad right",
+        "keep a success and go on; else give up this start and go on",
+    ),
     Row(("ArrowLeft",), "D-pad left", "discard and do the same start again"),
     Row(("Escape",), "Back", "stop; a success that waits is kept"),
 )
@@ -47,12 +51,25 @@ MOTIONS = MappingProxyType(
 """Key → its place in (move, turn, jaw) and its sign."""
 FINE_KEYS = ("ShiftLeft", "ShiftRight")
 PRESSES = MappingProxyType(
-    {"ArrowRight": KEEP, "ArrowLeft": DISCARD, "Escape": STOP, "Enter": START, "Space": JAW, "KeyV": VIEW}
+    {
+        "ArrowRight": KEEP,
+        "ArrowLeft": DISCARD,
+        "Escape": STOP,
+        "Enter": START,
+        "Space": JAW,
+        "KeyV": VIEW,
+    }
 )
 CODES = frozenset((*MOTIONS, *FINE_KEYS, *PRESSES))
 """Every key that means something."""
 _NAMES = MappingProxyType(
-    {"ArrowRight": "→", "ArrowLeft": "←", "Escape": "Esc", "ShiftLeft": "Shift", "ShiftRight": "Shift"}
+    {
+        "ArrowRight": "→",
+        "ArrowLeft": "←",
+        "Escape": "Esc",
+        "ShiftLeft": "Shift",
+        "ShiftRight": "Shift",
+    }
 )
 
 
@@ -65,7 +82,9 @@ class Keyboard:
         self._events: list[str] = []
 
     def press(self, code: str) -> None:
-        """Note that a key went down; one that is down already (autorepeat) or means nothing changes nothing."""
+        """Note that a key went down; one that is down already (autorepeat) or means nothing changes
+        nothing.
+        """
         if code not in CODES or code in self._held:
             return
         self._held[code] = self._tapped[code] = None
@@ -77,7 +96,9 @@ class Keyboard:
         self._held.pop(code, None)
 
     def hold(self, codes: Iterable[str]) -> None:
-        """Note that these keys are down and no others, without a press: what they do once is not done."""
+        """Note that these keys are down and no others, without a press: what they do once is not
+        done.
+        """
         down = {code: None for code in codes if code in CODES}
         self._tapped |= {code: None for code in down if code in MOTIONS}
         self._held = down
@@ -97,7 +118,9 @@ class Keyboard:
         events = tuple(self._events)
         self._tapped, self._events = {}, []
         fine = any(code in down for code in FINE_KEYS)
-        return Input((seven[0], seven[1], seven[2]), (seven[3], seven[4], seven[5]), seven[6], fine, events)
+        return Input(
+            (seven[0], seven[1], seven[2]), (seven[3], seven[4], seven[5]), seven[6], fine, events
+        )
 
 
 def key_name(code: str) -> str:
@@ -117,4 +140,6 @@ def key_table() -> str:
         *((" ".join(key_names(row)), row.gamepad, row.meaning) for row in TABLE),
     ]
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
-    return "\n".join(f"  {key:<{widths[0]}}  {pad:<{widths[1]}}  {meaning}" for key, pad, meaning in rows)
+    return "\n".join(
+        f"  {key:<{widths[0]}}  {pad:<{widths[1]}}  {meaning}" for key, pad, meaning in rows
+    )

@@ -11,7 +11,7 @@ from surgicai_vision.teleoperation.inputs import Device
 from surgicai_vision.teleoperation.pacer import Pacer
 from surgicai_vision.teleoperation.session import Session, Status
 
-Pictures = Mapping[str, NDArray[Any]]
+Images = Mapping[str, NDArray[Any]]
 """View → (size, size, 3) uint8."""
 
 
@@ -23,10 +23,10 @@ class Screen(Protocol):
         """Say whether the person shut it."""
 
     def wants(self) -> bool:
-        """Say whether a new picture would be seen."""
+        """Say whether a new image would be seen."""
 
-    def show(self, pictures: Pictures, status: Status) -> None:
-        """Show what the views see now; the pictures are the screen's to keep."""
+    def show(self, images: Images, status: Status) -> None:
+        """Show what the views see now; the images are the screen's to keep."""
 
 
 class Views:
@@ -35,14 +35,14 @@ class Views:
     Args:
         env: the env.
         cameras: its views, in the order they are shown.
-        size: side of a picture [pixel].
+        size: side of an image [pixel].
     """
 
     def __init__(self, env: Any, cameras: tuple[str, ...], size: int):
         self._env, self._cameras, self._size = env, cameras, size
         self._renderer, self._draws = FrameRenderer(env.model, size, size), env.simulation.draws
 
-    def look(self) -> Pictures:
+    def look(self) -> Images:
         """Return what every view sees now."""
         if self._env.simulation.draws is not self._draws:  # the needle may have another shape now
             self.close()
@@ -50,7 +50,10 @@ class Views:
                 FrameRenderer(self._env.model, self._size, self._size),
                 self._env.simulation.draws,
             )
-        return {camera: self._renderer.render(self._env.data, camera, names.RGB) for camera in self._cameras}
+        return {
+            camera: self._renderer.render(self._env.data, camera, names.RGB)
+            for camera in self._cameras
+        }
 
     def close(self) -> None:
         """Free the renderer."""
@@ -70,12 +73,12 @@ def drive(
     Args:
         session: what to run.
         device: where inputs come from.
-        screen: where pictures go.
+        screen: where images go.
         views: what draws them.
         pacer: keeps the time.
         heard: called with the status after every tick that changed its message.
     """
-    message, moment, pictures = "", None, views.look()
+    message, moment, images = "", None, views.look()
     while not session.over and not screen.closed:
         session.tick(device.poll())
         status = session.status()
@@ -84,8 +87,8 @@ def drive(
             heard(status)
         if screen.wants() and pacer.may_draw():
             now = (status.kept, status.discarded, status.skipped, status.steps)
-            if now != moment:  # else nothing has moved since the last picture
-                moment, pictures = now, views.look()
-            screen.show(pictures, status)
+            if now != moment:  # else nothing has moved since the last image
+                moment, images = now, views.look()
+            screen.show(images, status)
         pacer.wait()
-    screen.show(pictures, session.status())
+    screen.show(images, session.status())

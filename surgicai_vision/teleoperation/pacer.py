@@ -1,4 +1,6 @@
-"""Pacing: ticks at a fixed rate of the wall clock; where drawing takes too long, pictures are dropped, never ticks."""
+"""Pacing: ticks at a fixed rate of the wall clock; where drawing takes too long, images are
+dropped, never ticks.
+"""
 
 import time
 from collections.abc import Callable
@@ -6,9 +8,11 @@ from collections.abc import Callable
 from surgicai_vision.core import names
 
 BEHIND = 5
-"""Ticks that may be caught up; what is lost beyond them is given up, for a hand cannot steer a burst."""
+"""Ticks that may be caught up; what is lost beyond them is given up, for a hand cannot steer a
+burst.
+"""
 BLIND = 10
-"""Ticks after which a picture is due even when late: five a second."""
+"""Ticks after which an image is due even when late: five a second."""
 
 
 class Pacer:
@@ -31,7 +35,9 @@ class Pacer:
         self._blind = 0
 
     def may_draw(self) -> bool:
-        """Say whether a picture fits in before the next tick is due, or has been missing for too long."""
+        """Say whether an image fits in before the next tick is due, or has been missing for too
+        long.
+        """
         self._blind += 1
         if self._clock() >= self._due and self._blind < BLIND:
             return False

@@ -1,8 +1,9 @@
 """Recordings: the folder that teleoperation fills, an episode at a time.
 
-A folder of demonstrations like any other (`demos.store`), complete after every episode. `demos.json` also says which
-seeds were kept and which were given up; an episode whose entry a kill prevented is found by its file. The folder is
-locked while a session runs, so that two cannot write the same numbers.
+A folder of demonstrations like any other (`demos.store`), complete after every episode.
+`demos.json` also says which seeds were kept and which were given up; an episode whose entry a kill
+prevented is found by its file. The folder is locked while a session runs, so that two cannot write
+the same numbers.
 """
 
 import fcntl
@@ -15,9 +16,17 @@ from typing import Any
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, OutputExists, SurgicaiError
 from surgicai_vision.core.files import TEMPORARY, check_output, code_version
-from surgicai_vision.demos.store import MARKER, Demo, list_demos, read_demo, read_marker, write_demo, write_marker
+from surgicai_vision.demos.store import (
+    MARKER,
+    Demo,
+    list_demos,
+    read_demo,
+    read_marker,
+    write_demo,
+    write_marker,
+)
 
-SOURCE = "teleoperate"
+DEMONSTRATOR = "teleoperate"
 
 
 class Recordings:
@@ -30,7 +39,13 @@ class Recordings:
         skipped: seeds given up, {"seed", "reason"}.
     """
 
-    def __init__(self, folder: Path, request: Mapping[str, Any], seeds: list[int], skipped: list[dict[str, Any]]):
+    def __init__(
+        self,
+        folder: Path,
+        request: Mapping[str, Any],
+        seeds: list[int],
+        skipped: list[dict[str, Any]],
+    ):
         self.folder, self._request = folder, request
         self.seeds, self.skipped = seeds, skipped
 
@@ -53,8 +68,15 @@ class Recordings:
         self._note()
 
     def _note(self) -> None:
-        details = {"request": self._request, "seeds": self.seeds, "skipped": self.skipped, "episodes": len(self.seeds)}
-        write_marker(self.folder, self._request["task"]["task"], SOURCE, code=code_version(), **details)
+        details = {
+            "request": self._request,
+            "seeds": self.seeds,
+            "skipped": self.skipped,
+            "episodes": len(self.seeds),
+        }
+        write_marker(
+            self.folder, self._request["task"]["task"], DEMONSTRATOR, code=code_version(), **details
+        )
 
 
 @contextmanager
@@ -93,12 +115,19 @@ def _lock(descriptor: int, folder: Path) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise SurgicaiError(f"--out {folder}: another session is recording there; give another folder.") from None
+        raise SurgicaiError(
+            f"--out {folder}: another session is recording there; give another folder."
+        ) from None
 
 
 def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -> Recordings:
     """Return what lies in a folder; an empty one begins at `seed`."""
-    request = {"task": to_mapping(config), "source": SOURCE, "scene": scene_hash, "seed": seed or 0}
+    request = {
+        "task": to_mapping(config),
+        "demonstrator": DEMONSTRATOR,
+        "scene": scene_hash,
+        "seed": seed or 0,
+    }
     if not (folder / MARKER).exists() and not any(folder.glob("episode_*")):
         return Recordings(folder, request, [], [])
     marker = read_marker(folder)
@@ -113,7 +142,9 @@ def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -
     paths = list_demos(folder) if any(folder.glob("episode_*")) else []
     seeds, skipped = marker.get("seeds"), marker.get("skipped")
     if not (isinstance(seeds, list) and isinstance(skipped, list)):
-        raise BadFile(f"{folder / MARKER} does not say which seeds were kept and given up; give another folder.")
+        raise BadFile(
+            f"{folder / MARKER} does not say which seeds were kept and given up; give another folder."
+        )
     if len(seeds) != len(paths):  # killed between an episode and its entry
         seeds = [read_demo(path).seed for path in paths]
     return Recordings(folder, request, seeds, skipped)

@@ -3,10 +3,11 @@
     waiting ──moves, Enter──► driving ──ended──► judged ──→──► kept, next start
        └──────────◄── ← (same start) ◄──┴────◄─────┘
 
-→ keeps an episode that succeeded and goes on to the next start. Where there is no success yet it gives the start up:
-in `waiting` at once, in `driving` after the episode was judged a failure. ← discards and goes back to the same start.
-Esc stops; a success that waits for its answer is kept. An episode begins when nothing was held and something moves,
-so a key still held from the last one does not start the next.
+→ keeps an episode that succeeded and goes on to the next start. Where there is no success yet it
+gives the start up: in `waiting` at once, in `driving` after the episode was judged a failure. ←
+discards and goes back to the same start. Esc stops; a success that waits for its answer is kept. An
+episode begins when nothing was held and something moves, so a key still held from the last one does
+not start the next.
 
 Nothing here knows the time: the same inputs give the same files.
 """
@@ -21,7 +22,7 @@ from surgicai_vision.core.files import code_version
 from surgicai_vision.demos.store import Demo
 from surgicai_vision.teleoperation.input_mapping import Steering
 from surgicai_vision.teleoperation.inputs import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
-from surgicai_vision.teleoperation.recordings import SOURCE, Recordings
+from surgicai_vision.teleoperation.recordings import DEMONSTRATOR, Recordings
 
 WAITING, DRIVING, JUDGED, STOPPED = "waiting", "driving", "judged", "stopped"
 
@@ -119,11 +120,13 @@ class Attempt:
 
     def demo(self) -> Demo:
         """Return the episode as a demonstration."""
-        action, phase, reward, success, contact = (list(column) for column in zip(*self._rows, strict=True))
+        action, phase, reward, success, contact = (
+            list(column) for column in zip(*self._rows, strict=True)
+        )
         return Demo(
             config=self._env.config,
             seed=self.seed,
-            source=SOURCE,
+            demonstrator=DEMONSTRATOR,
             scene_hash=self._env.scene.hash,
             code_version=code_version(),
             state=np.stack(self._states).astype(np.float64),
@@ -147,7 +150,12 @@ class Session:
     """
 
     def __init__(
-        self, env: Any, steering: Steering, recordings: Recordings, views: tuple[str, ...], rules: Rules = Rules()
+        self,
+        env: Any,
+        steering: Steering,
+        recordings: Recordings,
+        views: tuple[str, ...],
+        rules: Rules = Rules(),
     ):
         self.env, self._steering, self._recordings, self.rules = env, steering, recordings, rules
         self._views, self._lead, self._fine = views, 0, False

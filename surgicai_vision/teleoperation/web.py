@@ -1,15 +1,16 @@
-"""Web: the page that shows the pictures and takes keys, touches and gamepads of the browser that looks at it.
+"""Web: the page that shows the images and takes keys, touches and gamepads of the browser that
+looks at it.
 
 `http://127.0.0.1:PORT/TOKEN/` and below it:
 
     GET  .                  the page; page.js and page.css beside it
-    GET  status?after=N     JSON: what the session says, and the number of the newest pictures; waits for one after N
-    GET  view/NAME.jpg      the newest picture of a view
+    GET  status?after=N     JSON: what the session says, and the number of the newest images; waits
+    for one after N GET  view/NAME.jpg      the newest image of a view
     POST input              JSON: what is held and what was pressed (`Hands.receive`)
 
-The server listens on loopback alone. Whoever lacks the random token gets 404 and learns nothing; a page of another
-site that knows the port is refused by its Host (DNS rebinding) and its Origin. A browser that falls silent for half a
-second holds nothing any more.
+The server listens on loopback alone. Whoever lacks the random token gets 404 and learns nothing; a
+page of another site that knows the port is refused by its Host (DNS rebinding) and its Origin. A
+browser that falls silent for half a second holds nothing any more.
 """
 
 import dataclasses
@@ -32,7 +33,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.teleoperation.gamepad import Gamepad
 from surgicai_vision.teleoperation.inputs import Input, merged
 from surgicai_vision.teleoperation.keyboard import TABLE, Keyboard, key_names
-from surgicai_vision.teleoperation.loop import Pictures
+from surgicai_vision.teleoperation.loop import Images
 from surgicai_vision.teleoperation.session import Status
 
 HOST = "127.0.0.1"
@@ -43,7 +44,7 @@ SILENT = 0.5
 BROWSERS = 8
 """Pages open at the same time whose hands are known."""
 PATIENCE = 1.0
-"""Seconds that a request for the next pictures waits at most."""
+"""Seconds that a request for the next images waits at most."""
 LONGEST = 4096
 """Bytes of an input, at most."""
 QUALITY = 85
@@ -63,7 +64,9 @@ HEADERS = MappingProxyType(
 
 @dataclasses.dataclass
 class _Browser:
-    """The hands at one open page: its keys, its gamepad, the number of its last message and when that came."""
+    """The hands at one open page: its keys, its gamepad, the number of its last message and when
+    that came.
+    """
 
     keyboard: Keyboard
     gamepad: Gamepad
@@ -86,8 +89,9 @@ class Hands:
         """Take a page's message.
 
         Args:
-            message: {"client": str, "number": int, "held": [code], "pressed": [code], "axes": [float],
-                "buttons": [float]}; "pressed" went down since the message before. Older numbers are passed over.
+            message: {"client": str, "number": int, "held": [code], "pressed": [code], "axes":
+                [float], "buttons": [float]}; "pressed" went down since the message before. Older
+                numbers are passed over.
 
         Raises:
             InputError: anything else.
@@ -112,7 +116,9 @@ class Hands:
                     browser.keyboard.release_all()
                     browser.gamepad.release_all()
             return merged(
-                device.poll() for browser in self._browsers.values() for device in (browser.keyboard, browser.gamepad)
+                device.poll()
+                for browser in self._browsers.values()
+                for device in (browser.keyboard, browser.gamepad)
             )
 
     def _welcome(self, client: str) -> _Browser:
@@ -133,62 +139,67 @@ def _checked(message: Any) -> tuple[str, int, list[str], list[str], list[float],
     fine = isinstance(client, str) and len(client) <= 64 and isinstance(number, int)
     fine = fine and all(isinstance(row, list) and len(row) <= 64 for row in (*texts, *numbers))
     fine = fine and all(isinstance(code, str) for row in texts for code in row)
-    fine = fine and all(isinstance(value, (int, float)) and -2 < value < 2 for row in numbers for value in row)
+    fine = fine and all(
+        isinstance(value, (int, float)) and -2 < value < 2 for row in numbers for value in row
+    )
     if not fine:
         raise InputError("An input must have client, number, held, pressed, axes and buttons.")
     return str(client), int(number or 0), *texts, *numbers
 
 
 class Show:
-    """The newest pictures and status, handed from the session's thread to the server's; a `Screen`.
+    """The newest images and status, handed from the session's thread to the server's; a `Screen`.
 
-    A picture that is the one before, the very object, keeps its number, and a page does not fetch it again.
+    An image that is the one before, the very object, keeps its number, and a page does not fetch it
+    again.
     """
 
     closed = False
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._number, self._picture, self._asked, self.watched = 0, 0, False, False
-        self._pictures: Pictures = {}
+        self._number, self._image, self._asked, self.watched = 0, 0, False, False
+        self._images: Images = {}
         self._encoded: dict[str, bytes] = {}
         self._status: dict[str, Any] = {}
 
     def wants(self) -> bool:
-        """Say whether a page waits for a picture."""
+        """Say whether a page waits for an image."""
         return self._asked
 
-    def show(self, pictures: Pictures, status: Status) -> None:
-        """Offer new pictures to whoever waits."""
+    def show(self, images: Images, status: Status) -> None:
+        """Offer new images to whoever waits."""
         with self._changed:
             self._number += 1
-            if pictures is not self._pictures:
-                self._picture += 1
-                self._pictures, self._encoded = pictures, {}
+            if images is not self._images:
+                self._image += 1
+                self._images, self._encoded = images, {}
             self._asked = False
             self._status = dataclasses.asdict(status)
             self._changed.notify_all()
 
     def status(self, after: int) -> dict[str, Any]:
-        """Return the newest status with its number, a newer one than `after` if it comes in time."""
+        """Return the newest status with its number, a newer one than `after` if it comes in
+        time.
+        """
         with self._changed:
             self.watched = True
             if self._number <= after:
                 self._asked = True
                 self._changed.wait_for(lambda: self._number > after, PATIENCE)
-            return {**self._status, "number": self._number, "picture": self._picture}
+            return {**self._status, "number": self._number, "image": self._image}
 
     def jpeg(self, view: str) -> bytes | None:
-        """Return the newest picture of a view; None where there is none."""
+        """Return the newest image of a view; None where there is none."""
         with self._changed:
-            number, picture, known = self._picture, self._pictures.get(view), self._encoded.get(view)
-        if known is not None or picture is None:
+            number, image, known = self._image, self._images.get(view), self._encoded.get(view)
+        if known is not None or image is None:
             return known
         # Outside the lock: the session's thread must not wait for it.
-        done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         encoded = data.tobytes() if done else b""
         with self._changed:
-            if number == self._picture:
+            if number == self._image:
                 self._encoded[view] = encoded
         return encoded
 
@@ -215,7 +226,9 @@ class WebView:
             self._server = _Server(port, self)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise InputError(f"--port {port} is not free ({reason}); give another, or 0 for any.") from None
+            raise InputError(
+                f"--port {port} is not free ({reason}); give another, or 0 for any."
+            ) from None
         self.port = self._server.server_address[1]
         self.url = f"http://{HOST}:{self.port}/{self.token}/"
         self.invitation = (
@@ -225,7 +238,9 @@ class WebView:
         self.wants, self.show, self.poll = self.screen.wants, self.screen.show, self.hands.poll
 
     def __enter__(self) -> "WebView":
-        threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True).start()
+        threading.Thread(
+            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True
+        ).start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -236,7 +251,9 @@ class WebView:
         self._server.server_close()
 
     def answer(self, path: str, query: str) -> tuple[bytes, str] | None:
-        """Return the content of an address below the token, and its type; None where there is nothing."""
+        """Return the content of an address below the token, and its type; None where there is
+        nothing.
+        """
         if path == "":
             return self._page, "text/html; charset=utf-8"
         if path == "status":
@@ -246,8 +263,8 @@ class WebView:
         if path in FILES:
             return (FOLDER / path).read_bytes(), f"{FILES[path]}; charset=utf-8"
         name = path.removeprefix("view/").removesuffix(".jpg")
-        picture = self.screen.jpeg(name) if path == f"view/{name}.jpg" else None
-        return None if picture is None else (picture, "image/jpeg")
+        image = self.screen.jpeg(name) if path == f"view/{name}.jpg" else None
+        return None if image is None else (image, "image/jpeg")
 
 
 class _Server(ThreadingHTTPServer):
@@ -296,7 +313,10 @@ class _Handler(BaseHTTPRequestHandler):
         path = self._path()
         if path is None:
             return
-        if path != "input" or self.headers.get("Content-Type", "").split(";")[0] != "application/json":
+        if (
+            path != "input"
+            or self.headers.get("Content-Type", "").split(";")[0] != "application/json"
+        ):
             self._refuse(HTTPStatus.NOT_FOUND)
             return
         try:
@@ -328,7 +348,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send(self, status: HTTPStatus, content: bytes, kind: str) -> None:
         self.send_response(status)
-        headers: Mapping[str, str] = {**HEADERS, "Content-Type": kind, "Content-Length": str(len(content))}
+        headers: Mapping[str, str] = {
+            **HEADERS,
+            "Content-Type": kind,
+            "Content-Length": str(len(content)),
+        }
         for name, value in headers.items():
             self.send_header(name, value)
         if self.close_connection:
@@ -353,6 +377,8 @@ def _page(views: tuple[str, ...], title: str) -> bytes:
     import jinja2
 
     loader = jinja2.FileSystemLoader(FOLDER)
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
+    )
     template = environment.get_template("page.html.j2")
     return template.render(views=views, title=title, rows=TABLE, key_names=key_names).encode()

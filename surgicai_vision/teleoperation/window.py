@@ -1,7 +1,7 @@
-"""Window: the pictures in a window of this machine's display, its keyboard and its gamepads.
+"""Window: the images in a window of this machine's display, its keyboard and its gamepads.
 
-GLFW comes with MuJoCo. Its window only takes pixels, by the four oldest calls of OpenGL; what is in them is drawn
-elsewhere, as for the web. GLFW demands the main thread.
+GLFW comes with MuJoCo. Its window only takes pixels, by the four oldest calls of OpenGL; what is in
+them is drawn elsewhere, as for the web. GLFW demands the main thread.
 """
 
 import ctypes
@@ -20,17 +20,21 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.teleoperation.gamepad import Gamepad
 from surgicai_vision.teleoperation.inputs import Input, merged
 from surgicai_vision.teleoperation.keyboard import Keyboard
-from surgicai_vision.teleoperation.loop import Pictures
+from surgicai_vision.teleoperation.loop import Images
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, Status
 
 NO_WINDOW = "No window can be opened ({}); add --web for a page that any browser shows, also through ssh -L."
 BAR, GAP = 88, 4
-"""Height of the lines of text under the pictures, and space between these [pixel]."""
+"""Height of the lines of text under the images, and space between these [pixel]."""
 NARROWEST = 480
 """Width at which the lines fit [pixel]."""
-KEYS = "WASD EQ move   IK JL UO turn   Space jaw   Shift fine   V view   → keep   ← again   Esc stop"
+KEYS = (
+    "WASD EQ move   IK JL UO turn   Space jaw   Shift fine   V view   → keep   ← again   Esc stop"
+)
 PAPER, INK, SOFT = (20, 23, 26), (232, 234, 236), (154, 164, 173)
-COLOURS = MappingProxyType({"waiting": (92, 195, 224), DRIVING: (255, 107, 107), "stopped": (154, 164, 173)})
+COLOURS = MappingProxyType(
+    {"waiting": (92, 195, 224), DRIVING: (255, 107, 107), "stopped": (154, 164, 173)}
+)
 """State → colour of its mark; a judged episode is green or orange."""
 GOOD, BAD = (95, 194, 138), (239, 138, 114)
 _COLOUR_BUFFER, _RGB, _UNSIGNED_BYTE, _ALIGNMENT = 0x4000, 0x1907, 0x1401, 0x0CF5
@@ -55,7 +59,7 @@ class Window:
     Args:
         views: the cameras shown.
         title: what stands in its title.
-        size: side of a picture [pixel].
+        size: side of an image [pixel].
 
     Raises:
         InputError: no display, or no OpenGL in its windows.
@@ -98,11 +102,11 @@ class Window:
         """Say whether the window is seen."""
         return not self._glfw.get_window_attrib(self._handle, self._glfw.ICONIFIED)
 
-    def show(self, pictures: Pictures, status: Status) -> None:
-        """Show pictures side by side, the leading one first, and what the session says."""
+    def show(self, images: Images, status: Status) -> None:
+        """Show images side by side, the leading one first, and what the session says."""
         for column, view in enumerate(sorted(self._views, key=lambda name: name != status.view)):
             left = column * (self._size + GAP)
-            self._canvas[: self._size, left : left + self._size] = pictures[view]
+            self._canvas[: self._size, left : left + self._size] = images[view]
             tag = self._tags[view]
             self._canvas[: tag.shape[0], left : left + tag.shape[1]] = tag
         lines = status_lines(status)
@@ -124,7 +128,8 @@ class Window:
         glfw.make_context_current(handle)
         glfw.swap_interval(0)  # the pacer keeps the time
         self._gl = {
-            name: ctypes.CFUNCTYPE(None, *types)(glfw.get_proc_address(name)) for name, types in GL_CALLS.items()
+            name: ctypes.CFUNCTYPE(None, *types)(glfw.get_proc_address(name))
+            for name, types in GL_CALLS.items()
         }
         glfw.make_context_current(None)
         return handle
@@ -178,12 +183,16 @@ def _reason(glfw: Any) -> str:
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return "there is no display"
     text = glfw.get_error()[1]
-    return (text.decode() if isinstance(text, bytes) else str(text or "unknown to GLFW")).split("\n")[0]
+    return (text.decode() if isinstance(text, bytes) else str(text or "unknown to GLFW")).split(
+        "\n"
+    )[0]
 
 
 def _codes(glfw: Any) -> dict[int, str]:
     """Return GLFW's keys, which are named by place too, as codes of a browser."""
-    letters = {getattr(glfw, f"KEY_{letter}"): f"Key{letter}" for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"}
+    letters = {
+        getattr(glfw, f"KEY_{letter}"): f"Key{letter}" for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+    }
     return letters | {
         glfw.KEY_RIGHT: "ArrowRight",
         glfw.KEY_LEFT: "ArrowLeft",
@@ -197,7 +206,9 @@ def _codes(glfw: Any) -> dict[int, str]:
 
 
 def _standard(glfw: Any) -> tuple[list[float], list[float]]:
-    """Return axes and buttons of the first gamepad in the W3C's order; nothing where there is none."""
+    """Return axes and buttons of the first gamepad in the W3C's order; nothing where there is
+    none.
+    """
     for joystick in range(glfw.JOYSTICK_1, glfw.JOYSTICK_LAST + 1):
         if glfw.joystick_present(joystick) and glfw.joystick_is_gamepad(joystick):
             state = glfw.get_gamepad_state(joystick)
@@ -231,27 +242,31 @@ def colour_of(status: Status) -> tuple[int, int, int]:
 
 
 def text_bar(lines: tuple[str, str], colour: tuple[int, int, int], width: int) -> NDArray[np.uint8]:
-    """Return the lines, and the keys below them, as a picture (BAR, width, 3), in sizes at which they fit."""
+    """Return the lines, and the keys below them, as an image (BAR, width, 3), in sizes at which
+    they fit.
+    """
     from PIL import Image, ImageDraw
 
-    picture = Image.new("RGB", (width, BAR), PAPER)
-    pen = ImageDraw.Draw(picture)
+    image = Image.new("RGB", (width, BAR), PAPER)
+    pen = ImageDraw.Draw(image)
     pen.rectangle((0, 0, 5, BAR), fill=colour)
     for row, (line, ink) in enumerate(((lines[0], INK), (lines[1], INK), (KEYS, SOFT))):
         fonts = [_font(size) for size in (15, 13, 11, 9, 7)]
-        font = next((font for font in fonts if pen.textlength(line, font=font) <= width - 20), fonts[-1])
+        font = next(
+            (font for font in fonts if pen.textlength(line, font=font) <= width - 20), fonts[-1]
+        )
         pen.text((14, 17 + 27 * row), line, fill=ink, font=font, anchor="lm")
-    return np.asarray(picture)
+    return np.asarray(image)
 
 
 def name_tag(name: str) -> NDArray[np.uint8]:
-    """Return a small picture of a view's name, (height, width, 3)."""
+    """Return a small image of a view's name, (height, width, 3)."""
     from PIL import Image, ImageDraw
 
     font = _font(12)
-    picture = Image.new("RGB", (int(font.getlength(name)) + 12, 20), PAPER)
-    ImageDraw.Draw(picture).text((6, 10), name, fill=INK, font=font, anchor="lm")
-    return np.asarray(picture)
+    image = Image.new("RGB", (int(font.getlength(name)) + 12, 20), PAPER)
+    ImageDraw.Draw(image).text((6, 10), name, fill=INK, font=font, anchor="lm")
+    return np.asarray(image)
 
 
 @functools.cache

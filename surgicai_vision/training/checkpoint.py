@@ -3,12 +3,13 @@
 Interface:
 
 * `Checkpoint`: everything about a trained policy, frozen, with the folder it lies in.
-* `write_checkpoint(folder, checkpoint, tensors)`: `policy.safetensors` first, `checkpoint.json` last.
-* `read_checkpoint(folder) -> Checkpoint`: refuse in one line what is missing, damaged, tampered with or of
-  another format.
+* `write_checkpoint(folder, checkpoint, tensors)`: `policy.safetensors` first, `checkpoint.json`
+  last.
+* `read_checkpoint(folder) -> Checkpoint`: refuse in one line what is missing, damaged, tampered
+  with or of another format.
 * `read_tensors(checkpoint)`: the policy's weights and input statistics, hash checked.
-* `check_encoder(checkpoint, encoder)`, `check_task(checkpoint, task)`: refuse what the policy was not
-  trained on.
+* `check_encoder(checkpoint, encoder)`, `check_task(checkpoint, task)`: refuse what the policy was
+  not trained on.
 """
 
 import hashlib
@@ -28,7 +29,9 @@ from surgicai_vision.core.files import read_json, write_bytes, write_json
 FORMAT = 1
 CARD, WEIGHTS = "checkpoint.json", "policy.safetensors"
 ENCODER_STATISTICS = "encoder_statistics.safetensors"
-"""BatchNorm statistics of an encoder that drifted (`config.Deviations`); the encoder's hash covers them."""
+"""BatchNorm statistics of an encoder that drifted (`config.Deviations`); the encoder's hash covers
+them.
+"""
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class Checkpoint:
         recipe: the recipe's settings as plain data.
         recipe_name: "paper", "released" or "custom".
         views: cameras, in the order of the features; empty for proprioception alone.
-        image_size: side of the pictures it was trained on [px].
+        image_size: side of the images it was trained on [px].
         encoder: the encoder's record; None without views.
         proprioception: True when the tip pose and jaw are fed too.
         seed: seed of the initialisation, the split and the order of frames.
@@ -114,10 +117,14 @@ class Checkpoint:
         return (self.encoder.shape,) * len(self.views) if self.encoder else ()
 
 
-def write_checkpoint(folder: Path, checkpoint: Checkpoint, tensors: Mapping[str, torch.Tensor]) -> Checkpoint:
+def write_checkpoint(
+    folder: Path, checkpoint: Checkpoint, tensors: Mapping[str, torch.Tensor]
+) -> Checkpoint:
     """Write weights, then card; return the checkpoint as it now lies in `folder`."""
     content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
-    checkpoint = replace(checkpoint, policy_sha256=hashlib.sha256(content).hexdigest(), folder=folder)
+    checkpoint = replace(
+        checkpoint, policy_sha256=hashlib.sha256(content).hexdigest(), folder=folder
+    )
     folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / WEIGHTS, content)
     plain = to_mapping(replace(checkpoint, folder=None))  # type: ignore[arg-type]
@@ -135,14 +142,24 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     """
     folder = Path(folder)
     if not (folder / CARD).is_file():
-        hint = "its training has not ended" if (folder / "training.json").exists() else f"no {CARD} in it"
-        raise BadFile(f"{folder} is not a checkpoint ({hint}); make one with 'surgicai-vision train'.")
+        hint = (
+            "its training has not ended"
+            if (folder / "training.json").exists()
+            else f"no {CARD} in it"
+        )
+        raise BadFile(
+            f"{folder} is not a checkpoint ({hint}); make one with 'surgicai-vision train'."
+        )
     plain = read_json(folder / CARD)
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         found = plain.get("format") if isinstance(plain, dict) else None
-        raise BadFile(f"{folder / CARD} has format {found!r}; this version reads {FORMAT}. Train again.")
+        raise BadFile(
+            f"{folder / CARD} has format {found!r}; this version reads {FORMAT}. Train again."
+        )
     if plain.pop("card_sha256", None) != digest(plain):
-        raise BadFile(f"{folder / CARD} was changed after training (its hash does not fit); train again.")
+        raise BadFile(
+            f"{folder / CARD} was changed after training (its hash does not fit); train again."
+        )
     try:
         checkpoint = replace(from_mapping(Checkpoint, plain, str(folder / CARD)), folder=folder)
     except (InputError, TypeError) as error:
@@ -159,7 +176,9 @@ def read_tensors(checkpoint: Checkpoint) -> dict[str, torch.Tensor]:
     except OSError as error:
         raise BadFile(f"Cannot read {path}: {error.strerror}; train again.") from None
     if hashlib.sha256(content).hexdigest() != checkpoint.policy_sha256:
-        raise BadFile(f"{path} is not the file its {CARD} was written for (sha256 differs); train again.")
+        raise BadFile(
+            f"{path} is not the file its {CARD} was written for (sha256 differs); train again."
+        )
     try:
         return load(content)
     except SafetensorError as error:
@@ -183,8 +202,16 @@ def check_encoder(checkpoint: Checkpoint, encoder: Any) -> None:
             raise InputError(f"The checkpoint {checkpoint.folder} {has}.")
         return
     card = to_mapping(encoder.card)
-    given = {"weights": encoder.weights_sha256, "pool": encoder.pool, **{key: card[key] for key in SEEN}}
-    trained = {"weights": wanted.weights_sha256, "pool": wanted.pool, **{key: wanted.card[key] for key in SEEN}}
+    given = {
+        "weights": encoder.weights_sha256,
+        "pool": encoder.pool,
+        **{key: card[key] for key in SEEN},
+    }
+    trained = {
+        "weights": wanted.weights_sha256,
+        "pool": wanted.pool,
+        **{key: wanted.card[key] for key in SEEN},
+    }
     for key, value in trained.items():
         if given[key] != value:
             raise InputError(
@@ -197,4 +224,6 @@ def check_task(checkpoint: Checkpoint, task: str) -> None:
     """Refuse a checkpoint trained on another task."""
     if checkpoint.task.task != task:
         trained = checkpoint.task.task
-        raise InputError(f"The checkpoint {checkpoint.folder} was trained on task '{trained}', not '{task}'.")
+        raise InputError(
+            f"The checkpoint {checkpoint.folder} was trained on task '{trained}', not '{task}'."
+        )

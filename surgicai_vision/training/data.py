@@ -1,4 +1,6 @@
-"""Training data: what training reads of a dataset, how frames are split and batched, statistics of the inputs."""
+"""Training data: what training reads of a dataset, how frames are split and batched, statistics of
+the inputs.
+"""
 
 import math
 from collections.abc import Sequence
@@ -25,14 +27,21 @@ class TrainingData(Protocol):
 
 
 def with_clock(columns: dict[str, np.ndarray], vector: str | None) -> dict[str, np.ndarray]:
-    """Return the columns, and `names.CLOCKED_STATE` (N, 10) beside them where that is the `vector` asked for."""
+    """Return the columns, and `names.CLOCKED_STATE` (N, 10) beside them where that is the `vector`
+    asked for.
+    """
     if vector != names.CLOCKED_STATE:
         return columns
     steps = np.rint(np.asarray(columns["timestamp"]) * names.FPS)
-    return {**columns, vector: np.concatenate([columns[names.STATE], clock(steps)], axis=1, dtype=np.float32)}
+    return {
+        **columns,
+        vector: np.concatenate([columns[names.STATE], clock(steps)], axis=1, dtype=np.float32),
+    }
 
 
-def split(episode_index: np.ndarray, recipe: Any, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
+def split(
+    episode_index: np.ndarray, recipe: Any, seed: int
+) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
     """Split the frames into training and validation.
 
     Args:
@@ -41,8 +50,8 @@ def split(episode_index: np.ndarray, recipe: Any, seed: int) -> tuple[np.ndarray
         seed: of the draw.
 
     Returns:
-        Training rows, validation rows (both sorted int64), and the episodes held out (whole ones only).
-        At least one episode is held out when the share is above 0 and there are two or more.
+        Training rows, validation rows (both sorted int64), and the episodes held out (whole ones
+        only). At least one episode is held out when the share is above 0 and there are two or more.
     """
     generator = np.random.default_rng(seed)
     units = np.unique(episode_index) if recipe.split == "episode" else np.arange(len(episode_index))
@@ -64,7 +73,8 @@ def cuts(count: int, size: int) -> list[int]:
 def over_places(
     mean: torch.Tensor, std: torch.Tensor, visual: Sequence[tuple[int, ...]]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Give all places of a feature map their channel's statistics: a place that never changes is not made loud.
+    """Give all places of a feature map their channel's statistics: a place that never changes is
+    not made loud.
 
     Args:
         mean: (inputs,) means of the inputs, the views' rows first.
@@ -78,7 +88,12 @@ def over_places(
         if len(shape) == 3:
             m, s = mean[at : at + size].view(shape), std[at : at + size].view(shape)
             channel = m.mean((1, 2), keepdim=True)
-            s.copy_(((s**2 + m**2).mean((1, 2), keepdim=True) - channel**2).clamp(min=0).sqrt().expand(shape))
+            s.copy_(
+                ((s**2 + m**2).mean((1, 2), keepdim=True) - channel**2)
+                .clamp(min=0)
+                .sqrt()
+                .expand(shape)
+            )
             m.copy_(channel.expand(shape))
         at += size
     return mean, std

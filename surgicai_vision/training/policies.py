@@ -35,7 +35,9 @@ def recipe_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in (configs_folder() / "recipes").glob("*.yaml")))
 
 
-def load_recipe(policy: str = "bc", recipe: str | Path = "paper", changes: Mapping[str, Any] | None = None) -> Any:
+def load_recipe(
+    policy: str = "bc", recipe: str | Path = "paper", changes: Mapping[str, Any] | None = None
+) -> Any:
     """Read a recipe and apply changes.
 
     Args:
@@ -85,14 +87,18 @@ def restore(checkpoint: Any) -> Any:
         policy = plugin.make(from_mapping(plugin.recipe, checkpoint.recipe), checkpoint.visual)
         policy.load_state_dict(read_tensors(checkpoint))
     except RuntimeError as error:
-        raise BadFile(f"{checkpoint.folder} does not fit its own recipe ({str(error).splitlines()[0]}).") from None
+        raise BadFile(
+            f"{checkpoint.folder} does not fit its own recipe ({str(error).splitlines()[0]})."
+        ) from None
     policy.eval().requires_grad_(False)
     policy.checkpoint = checkpoint
     return policy
 
 
-def load_encoder_of(checkpoint: Any, weights: Path | str | None = None, accept_licence: bool = False) -> Any:
-    """Load the encoder a policy was trained on, verified; None for a policy without pictures.
+def load_encoder_of(
+    checkpoint: Any, weights: Path | str | None = None, accept_licence: bool = False
+) -> Any:
+    """Load the encoder a policy was trained on, verified; None for a policy without images.
 
     Raises:
         InputError: the encoder at hand is not the one trained on; else as `load_encoder`.
@@ -104,6 +110,8 @@ def load_encoder_of(checkpoint: Any, weights: Path | str | None = None, accept_l
         deviations = from_mapping(Deviations, checkpoint.recipe.get("deviations") or {})
         statistics = checkpoint.folder / ENCODER_STATISTICS if deviations.batch_norm_drift else None
         active = deviations if deviations != Deviations() else None
-        encoder = load_encoder(record.name, weights, record.pool, accept_licence, active, statistics)
+        encoder = load_encoder(
+            record.name, weights, record.pool, accept_licence, active, statistics
+        )
     check_encoder(checkpoint, encoder)
     return encoder

@@ -1,7 +1,8 @@
-"""BatchNorm drift: what the released code's "frozen" networks became while policies were trained on them.
+"""BatchNorm drift: what the released code's "frozen" networks became while policies were trained on
+them.
 
-`drift(dataset, views, encoder, …) -> Path`: the statistics' file, made once and kept in the feature cache. Only
-for the deviation `batch_norm_drift` (`config.Deviations`).
+`drift(dataset, views, encoder, …) -> Path`: the statistics' file, made once and kept in the feature
+cache. Only for the deviation `batch_norm_drift` (`config.Deviations`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,7 +31,7 @@ def drift(
     cache_root: Path | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Return the file of the statistics that `encoder` drifts to on pictures of a dataset.
+    """Return the file of the statistics that `encoder` drifts to on images of a dataset.
 
     Args:
         dataset: an opened dataset.
@@ -38,7 +39,7 @@ def drift(
         encoder: the encoder before it drifts, with the preprocessing it is used with.
         weights: file with its pretrained weights.
         accept_licence: accept weights under a non-commercial licence.
-        seed: of the draw of pictures.
+        seed: of the draw of images.
         cache_root: folder of the feature cache.
         progress: called with (steps done, steps in all).
     """
@@ -52,13 +53,20 @@ def drift(
     return path
 
 
-def _batches(dataset: Any, views: Sequence[str], encoder: Any, seed: int, progress: Progress) -> Iterator[Any]:
-    """Yield normalised batches of frames drawn at random; frames are read in order, which is fast."""
+def _batches(
+    dataset: Any, views: Sequence[str], encoder: Any, seed: int, progress: Progress
+) -> Iterator[Any]:
+    """Yield normalised batches of frames drawn at random; frames are read in order, which is
+    fast.
+    """
     generator = np.random.default_rng((seed, 2))
     rows = np.sort(generator.integers(0, dataset.length, BATCH * STEPS))
     sight = generator.integers(0, len(views), BATCH * STEPS)
     frames = np.concatenate(
-        [dataset.frames(views[view], row, row + 1) for row, view in zip(rows.tolist(), sight, strict=True)]
+        [
+            dataset.frames(views[view], row, row + 1)
+            for row, view in zip(rows.tolist(), sight, strict=True)
+        ]
     )
     for step, chosen in enumerate(np.split(generator.permutation(BATCH * STEPS), STEPS)):
         yield encoder.preprocess(frames[chosen])

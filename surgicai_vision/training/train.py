@@ -2,11 +2,12 @@
 
 Interface:
 
-* `train(dataset, features, policy, recipe, seed=…, out=…, progress=…) -> Checkpoint`: train from the
-  feature cache. Running it again goes on where it was broken off, or returns what is done.
+* `train(dataset, features, policy, recipe, seed=…, out=…, progress=…) -> Checkpoint`: train from
+  the feature cache. Running it again goes on where it was broken off, or returns what is done.
 * What it reads of a dataset, its split and its batches: `surgicai_vision.training.data`.
 
-Layout of the folder while it trains; the first and the last two stay (see `surgicai_vision.training.checkpoint`):
+Layout of the folder while it trains; the first and the last two stay (see
+`surgicai_vision.training.checkpoint`):
 
     training.json          what was asked for; marks the folder as ours
     training_state.pt      weights, optimiser and random state every few epochs
@@ -14,8 +15,9 @@ Layout of the folder while it trains; the first and the last two stay (see `surg
     policy.safetensors     weights and the statistics of the inputs
     checkpoint.json        everything about them, with their hash; written last
 
-The split is by episode unless the recipe says otherwise. The validation loss is reported and chooses
-nothing: the last epoch is the checkpoint. The same seed gives the same weights on one machine.
+The split is by episode unless the recipe says otherwise. The validation loss is reported and
+chooses nothing: the last epoch is the checkpoint. The same seed gives the same weights on one
+machine.
 """
 
 import ctypes
@@ -38,7 +40,13 @@ from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, UnknownName
 from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
 from surgicai_vision.features.cache import Features
-from surgicai_vision.training.checkpoint import CARD, Checkpoint, EncoderRecord, read_checkpoint, write_checkpoint
+from surgicai_vision.training.checkpoint import (
+    CARD,
+    Checkpoint,
+    EncoderRecord,
+    read_checkpoint,
+    write_checkpoint,
+)
 from surgicai_vision.training.data import TrainingData, cuts, over_places, split, with_clock
 
 REQUEST, STATE = "training.json", "training_state.pt"
@@ -98,21 +106,26 @@ def train(
     request = _request(task, start)
     check_output(out, may_resume=REQUEST)
     if (out / REQUEST).exists() and read_json(out / REQUEST) != request:
-        raise OutputExists(f"--out {out} holds another training; give a folder that does not exist yet.")
+        raise OutputExists(
+            f"--out {out} holds another training; give a folder that does not exist yet."
+        )
     if (out / CARD).exists():
         return read_checkpoint(out)
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / REQUEST, request)
     _keep_memory()
     with torch.random.fork_rng(devices=[]), _one_thread():
-        checkpoint = _Training(task, start, torch.device(device)).run(out, save_every, progress, log)
+        checkpoint = _Training(task, start, torch.device(device)).run(
+            out, save_every, progress, log
+        )
     (out / STATE).unlink(missing_ok=True)
     return checkpoint
 
 
 def _keep_memory() -> None:
-    """Let glibc keep what is freed: a batch of feature maps is allocated anew each step, and handing its pages back
-    and forth costs 1.5 times the arithmetic (221 against 84 ms of CPU a step of 256 maps of 48 × 28 × 28).
+    """Let glibc keep what is freed: a batch of feature maps is allocated anew each step, and
+    handing its pages back and forth costs 1.5 times the arithmetic (221 against 84 ms of CPU a step
+    of 256 maps of 48 × 28 × 28).
     """
     with suppress(OSError, AttributeError):  # another C library
         mallopt = ctypes.CDLL(None).mallopt
@@ -122,8 +135,8 @@ def _keep_memory() -> None:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Compute with one thread: the network is small (threads cost more than they save, seventeen times more
-    on busy cores), and sums keep their order whatever the machine.
+    """Compute with one thread: the network is small (threads cost more than they save, seventeen
+    times more on busy cores), and sums keep their order whatever the machine.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -155,10 +168,17 @@ def _check(task: _Task) -> None:
     if not isinstance(task.recipe, task.policy.recipe):
         raise InputError(f"Policy '{task.policy.name}' needs a {task.policy.recipe.__name__}.")
     for entry in task.features:
-        if entry.manifest["dataset"] != task.dataset.fingerprint or len(entry.rows) != task.dataset.length:
-            raise InputError(f"The features of view '{entry.view}' are of another dataset; encode this one.")
+        if (
+            entry.manifest["dataset"] != task.dataset.fingerprint
+            or len(entry.rows) != task.dataset.length
+        ):
+            raise InputError(
+                f"The features of view '{entry.view}' are of another dataset; encode this one."
+            )
     if len({entry.manifest["encoder_fingerprint"] for entry in task.features}) > 1:
-        raise InputError("The features come from several encoders; encode every view by the same one.")
+        raise InputError(
+            "The features come from several encoders; encode every view by the same one."
+        )
     with torch.random.fork_rng(devices=[]):
         vector = task.untrained().inputs.vector
     columns = with_clock(task.dataset.columns(), vector)
@@ -178,7 +198,9 @@ def _request(task: _Task, start: Any) -> dict[str, Any]:
         "dataset": task.dataset.fingerprint,
         "views": [entry.view for entry in task.features],
         "encoder": task.features[0].manifest["encoder_fingerprint"] if task.features else None,
-        "start": None if start is None else digest([float(p.double().sum()) for p in start.state_dict().values()]),
+        "start": None
+        if start is None
+        else digest([float(p.double().sum()) for p in start.state_dict().values()]),
         "code_version": __version__,
     }
 
@@ -193,14 +215,18 @@ class _Training:
         self.rows, self.held_rows, self.held_episodes = split(index, task.recipe, task.seed)
         self.demonstrations = len(np.unique(index[self.rows]))
         if len(self.rows) < 2:
-            raise InputError(f"There are {len(self.rows)} frames to train on; at least 2 are needed.")
+            raise InputError(
+                f"There are {len(self.rows)} frames to train on; at least 2 are needed."
+            )
         torch.manual_seed(task.seed)
         self.policy = task.untrained()
         vector, target = self.policy.inputs.vector, np.array(columns[task.policy.target])
         self.vector = np.asarray(columns[vector], np.float32) if vector else None
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
         last = np.searchsorted(index, index, side="right") - 1
-        ahead = np.minimum(np.arange(len(index)) + math.ceil(task.policy.ahead / task.recipe.every), last)
+        ahead = np.minimum(
+            np.arange(len(index)) + math.ceil(task.policy.ahead / task.recipe.frame_stride), last
+        )
         self.target = torch.from_numpy(target[ahead].astype(kind))
         if start is None:
             self._measure()
@@ -212,7 +238,9 @@ class _Training:
         self.losses: list[float] = []
         self.held_losses: list[float] = []
 
-    def run(self, out: Path, save_every: int, progress: Progress | None, log: Log | None) -> Checkpoint:
+    def run(
+        self, out: Path, save_every: int, progress: Progress | None, log: Log | None
+    ) -> Checkpoint:
         """Train all epochs; return the last one's checkpoint."""
         epochs = self.task.recipe.epochs
         self._resume(out / STATE)
@@ -238,14 +266,20 @@ class _Training:
         """Return the recipe's optimiser and its schedule, or None where the learning rate stays."""
         recipe = self.task.recipe
         kind = torch.optim.AdamW if recipe.weight_decay else torch.optim.Adam
-        optimiser = kind(self.policy.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+        optimiser = kind(
+            self.policy.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay
+        )
         if recipe.schedule == "constant":
             return optimiser, None
         steps = recipe.epochs * len(cuts(len(self.rows), recipe.batch_size))
-        return optimiser, torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.learning_rate, total_steps=steps)
+        return optimiser, torch.optim.lr_scheduler.OneCycleLR(
+            optimiser, recipe.learning_rate, total_steps=steps
+        )
 
     def _observed(self, rows: np.ndarray) -> torch.Tensor:
-        """Return the raw inputs of some frames, (n, inputs) float32: the views' features, then the vector."""
+        """Return the raw inputs of some frames, (n, inputs) float32: the views' features, then the
+        vector.
+        """
         parts = [torch.from_numpy(entry.rows[rows]).float() for entry in self.task.features]
         if self.vector is not None:
             parts.append(torch.from_numpy(self.vector[rows]))
@@ -253,7 +287,9 @@ class _Training:
 
     def _measure(self) -> None:
         """Store mean and standard deviation of the inputs over the training frames."""
-        pieces = [self.rows[at : at + STATISTICS_ROWS] for at in range(0, len(self.rows), STATISTICS_ROWS)]
+        pieces = [
+            self.rows[at : at + STATISTICS_ROWS] for at in range(0, len(self.rows), STATISTICS_ROWS)
+        ]
         mean = torch.zeros(self.policy.inputs.dim, dtype=torch.float64)
         squares = torch.zeros_like(mean)
         for piece in pieces:
@@ -268,14 +304,20 @@ class _Training:
     def _copy(self, start: Any) -> None:
         """Start from a trained policy, its input statistics included."""
         if start.inputs != self.policy.inputs:
-            raise InputError(f"The policy to start from sees {start.inputs}, the new one {self.policy.inputs}.")
+            raise InputError(
+                f"The policy to start from sees {start.inputs}, the new one {self.policy.inputs}."
+            )
         try:
             self.policy.load_state_dict(start.state_dict())
         except RuntimeError as error:
-            raise InputError(f"The policy to start from has other layers ({str(error).splitlines()[0]}).") from None
+            raise InputError(
+                f"The policy to start from has other layers ({str(error).splitlines()[0]})."
+            ) from None
 
     def _batches(self) -> list[np.ndarray]:
-        """Return the training rows of one epoch in a new order; a last batch of one joins the one before."""
+        """Return the training rows of one epoch in a new order; a last batch of one joins the one
+        before.
+        """
         order = self.order.permutation(self.rows)
         return np.split(order, cuts(len(order), self.task.recipe.batch_size)[1:])
 
@@ -293,7 +335,9 @@ class _Training:
                 self.schedule.step()
             total += loss.item() * len(rows)
         if not np.isfinite(total):
-            raise SurgicaiError("The training loss is not finite; lower the learning rate or look at the features.")
+            raise SurgicaiError(
+                "The training loss is not finite; lower the learning rate or look at the features."
+            )
         return total / len(self.rows)
 
     @torch.no_grad()
@@ -304,7 +348,9 @@ class _Training:
         for at in range(0, len(self.held_rows), STATISTICS_ROWS):
             rows = self.held_rows[at : at + STATISTICS_ROWS]
             observed = self.policy.normalise(self._observed(rows).to(self.device))
-            total += self.policy.loss(observed, self.target[rows].to(self.device)).item() * len(rows)
+            total += self.policy.loss(observed, self.target[rows].to(self.device)).item() * len(
+                rows
+            )
         return total / len(self.held_rows)
 
     def _save(self, path: Path) -> None:
@@ -314,7 +360,9 @@ class _Training:
             "policy": self.policy.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "schedule": self.schedule.state_dict() if self.schedule else {},
-            "order": json.dumps(self.order.bit_generator.state),  # its integers are wider than a tensor's
+            "order": json.dumps(
+                self.order.bit_generator.state
+            ),  # its integers are wider than a tensor's
             "random": torch.get_rng_state(),
             "losses": self.losses,
             "held_losses": self.held_losses,
@@ -350,7 +398,8 @@ class _Training:
             views=tuple(entry.view for entry in task.features),
             image_size=dataset.image_size,
             encoder=_record(task.features[0]) if task.features else None,
-            proprioception=self.vector is not None and self.policy.inputs.vector != names.PRIVILEGED_STATE,
+            proprioception=self.vector is not None
+            and self.policy.inputs.vector != names.PRIVILEGED_STATE,
             seed=task.seed,
             epoch=len(self.losses),
             dataset=dataset.fingerprint,

@@ -125,10 +125,13 @@ def test_version(capsys):
         (["record-demos", "--noise", "-0.1"], "--noise is -0.1; it must be within 0 and 1"),
         (["record-demos", "--executor", "rai"], "Did you mean 'ray'?"),
         (["render-demos", "--address", "10.0.0.1:6379"], "give --executor ray with it"),
-        (["record-demos", "--recoveries", "2"], "--recoveries is 2.0"),
+        (["record-demos", "--perturb-start-fraction", "2"], "--perturb-start-fraction is 2.0"),
         (["train", "--encoder", "rndom"], "Did you mean 'random'?"),
         (["train", "--encoder", "none", "--view", "back"], "leave --view out"),
-        (["train", "--encoder", "random", "--view", "back"], "surgicai-vision render-demos --task grasp"),
+        (
+            ["train", "--encoder", "random", "--view", "back"],
+            "surgicai-vision render-demos --task grasp",
+        ),
         (["train", "--encoder", "random", "--dataset", "missing"], "missing"),
         (["encode", "--encoder", "random", "--dataset", "missing"], "missing"),
         (["import-demos", "missing.pkl", "--task", "handoff"], "missing.pkl"),
@@ -183,7 +186,9 @@ def test_a_full_output_folder_is_refused(arguments, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("place", ["/proc/nothing", "file/below"])
-@pytest.mark.parametrize("arguments", [["evaluate", "zero"], ["record-demos"], ["quickstart"], ["sweep", "smoke"]])
+@pytest.mark.parametrize(
+    "arguments", [["evaluate", "zero"], ["record-demos"], ["quickstart"], ["sweep", "smoke"]]
+)
 def test_an_output_folder_that_cannot_be_made_is_refused(arguments, place, tmp_path, capsys):
     (tmp_path / "file").write_text("a file, no folder")
     assert "--out" in fails(capsys, *arguments, "--out", place)
@@ -237,7 +242,9 @@ def test_shipped_quickstart_is_the_default():
     assert quickstart.plan_of(shipped) == quickstart.plan_of(default)
 
 
-@pytest.mark.parametrize("path", sorted((configs_folder() / "sweep").glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((configs_folder() / "sweep").glob("*.yaml")), ids=lambda path: path.stem
+)
 def test_shipped_sweeps_list_their_cells(path, capsys):
     assert main(["sweep", str(path), "--dry-run", "--json"]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -253,7 +260,10 @@ def test_a_wrong_grid_is_refused(tmp_path, capsys):
 
 
 def test_cells_without_weights_are_listed_as_not_run(tmp_path, capsys):
-    path = write(tmp_path / "grid.yaml", "task: [grasp]\nencoder: [r3m, random]\nview: [back, 'front,back']\n")
+    path = write(
+        tmp_path / "grid.yaml",
+        "task: [grasp]\nencoder: [r3m, random]\nview: [back, 'front,back']\n",
+    )
     assert main(["sweep", str(path), "--dry-run", "--json"]) == 0
     out = capsys.readouterr().out
     result = json.loads(out.splitlines()[-1])
@@ -274,10 +284,21 @@ def test_evaluate_prints_one_json_object_last(capsys, tmp_path):
     write(tmp_path / "short.yaml", "env: {max_steps: 4}\nepisodes: 2\nworkers: 1\n")
     assert main(["evaluate", "zero", "--config", "short.yaml", "--json"]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert (result["policy"], result["episodes"], result["successes"], result["errors"]) == ("zero", 2, 0, 0)
+    assert (result["policy"], result["episodes"], result["successes"], result["errors"]) == (
+        "zero",
+        2,
+        0,
+        0,
+    )
     assert result["ci95"][0] == 0.0
-    assert sorted(os.listdir(result["out"])) == ["episodes.parquet", "evaluation.json", "films.safetensors"]
-    assert main(["evaluate", "zero", "--config", "short.yaml"]) == 0, "a second run replaces the first"
+    assert sorted(os.listdir(result["out"])) == [
+        "episodes.parquet",
+        "evaluation.json",
+        "films.safetensors",
+    ]
+    assert main(["evaluate", "zero", "--config", "short.yaml"]) == 0, (
+        "a second run replaces the first"
+    )
 
 
 def test_every_verb_has_its_module():
@@ -296,7 +317,17 @@ def test_quiet_console_shows_nothing(capsys):
 
 
 def test_scene_draws_the_sheet(capsys, tmp_path):
-    arguments = ["scene", "--view", "front,back", "--size", "64", "--quality", "fast", "--sheet", "a/sheet.png"]
+    arguments = [
+        "scene",
+        "--view",
+        "front,back",
+        "--size",
+        "64",
+        "--quality",
+        "fast",
+        "--sheet",
+        "a/sheet.png",
+    ]
     assert main([*arguments, "--json"]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert result["views"] == ["front", "back"]

@@ -17,7 +17,17 @@ from surgicai_vision.core.files import whole_folder
 
 TABLE = {
     name: JobKind(f"fake_jobs:{name}", ("names",))
-    for name in ("square", "count", "die_once", "die", "refuse", "crash", "slow", "environment", "where")
+    for name in (
+        "square",
+        "count",
+        "die_once",
+        "die",
+        "refuse",
+        "crash",
+        "slow",
+        "environment",
+        "where",
+    )
 }
 
 
@@ -42,18 +52,33 @@ def test_results_come_in_order_whatever_the_workers(tmp_path):
 
 def test_finished_jobs_are_not_done_again(tmp_path):
     log = tmp_path / "log"
-    jobs = [Job("count", {"number": number, "log": str(log)}, label=("log",)) for number in range(4)]
+    jobs = [
+        Job("count", {"number": number, "log": str(log)}, label=("log",)) for number in range(4)
+    ]
     seen = []
     run(jobs[:2], tmp_path / "store", workers=0, table=TABLE)
-    run(jobs, tmp_path / "store", workers=0, table=TABLE, progress=lambda *row: seen.append(row), unit="frames")
+    run(
+        jobs,
+        tmp_path / "store",
+        workers=0,
+        table=TABLE,
+        progress=lambda *row: seen.append(row),
+        unit="frames",
+    )
     assert log.read_text().split() == ["0", "1", "2", "3"]
     assert seen == [(2, 4, "frames"), (3, 4, "frames"), (4, 4, "frames")]
 
 
 def test_key_depends_on_arguments_and_inputs_but_not_on_labels():
     base = Job("square", {"number": 1, "path": "a"}, ("x",), label=("path",))
-    assert base.key(TABLE) == Job("square", {"number": 1, "path": "b"}, ("x",), label=("path",)).key(TABLE)
-    others = [Job("square", {"number": 2}, ("x",)), Job("square", {"number": 1}, ("y",)), Job("crash", {"number": 1})]
+    assert base.key(TABLE) == Job(
+        "square", {"number": 1, "path": "b"}, ("x",), label=("path",)
+    ).key(TABLE)
+    others = [
+        Job("square", {"number": 2}, ("x",)),
+        Job("square", {"number": 1}, ("y",)),
+        Job("crash", {"number": 1}),
+    ]
     assert len({base.key(TABLE), *(job.key(TABLE) for job in others)}) == 4
 
 
@@ -125,8 +150,12 @@ if __name__ == "__main__":
 def test_interrupted_run_continues(tmp_path, signal_number):
     store = tmp_path / "store"
     script = tmp_path / "script.py"
-    script.write_text(SCRIPT.format(tests=str(Path(__file__).parents[1] / "helpers"), store=str(store)))
-    process = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    script.write_text(
+        SCRIPT.format(tests=str(Path(__file__).parents[1] / "helpers"), store=str(store))
+    )
+    process = subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
     for line in process.stdout:
         if line.startswith("2 "):
             break
@@ -180,14 +209,24 @@ def test_building_nothing_leaves_nothing(tmp_path):
 
 def listening():
     """Return where this machine listens for TCP besides loopback, in the kernel's spelling."""
-    lines = [line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()]
-    loopback = ("0100007F:", "0000000000000000FFFF00000100007F:", "00000000000000000000000001000000:")
+    lines = [
+        line.split()
+        for name in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()
+    ]
+    loopback = (
+        "0100007F:",
+        "0000000000000000FFFF00000100007F:",
+        "00000000000000000000000001000000:",
+    )
     return {row[1] for row in lines if row[3] == "0A" and not row[1].startswith(loopback)}
 
 
 def test_ray_runs_the_same_jobs_on_loopback_and_replaces_a_killed_worker(tmp_path, monkeypatch):
     """One cluster for all of it: starting Ray takes seconds."""
-    if importlib.util.find_spec("ray") is None:  # found, not imported: the engine sets what it listens on
+    if (
+        importlib.util.find_spec("ray") is None
+    ):  # found, not imported: the engine sets what it listens on
         pytest.skip("Ray is an extra: surgicai-vision[ray]")
     monkeypatch.setenv(
         "PYTHONPATH", str(Path(__file__).parents[1] / "helpers")
@@ -206,7 +245,9 @@ def test_ray_runs_the_same_jobs_on_loopback_and_replaces_a_killed_worker(tmp_pat
     assert [folder.name for folder in folders] == [job.key(TABLE) for job in jobs]
     assert heard[0][0] == (2, 6, "jobs"), "the store is the truth"
     assert all(not foreign for _, foreign in heard), "only loopback listens"
-    again = run(jobs, store, workers=2, table=TABLE, engine=Engine("ray"))  # nothing to do: no cluster is started
+    again = run(
+        jobs, store, workers=2, table=TABLE, engine=Engine("ray")
+    )  # nothing to do: no cluster is started
     assert again == folders
 
 
@@ -221,4 +262,7 @@ def test_ray_is_asked_for_in_words(monkeypatch):
 
 
 def test_registered_jobs_name_modules_of_this_package():
-    assert all(kind.function.startswith("surgicai_vision.") and ":" in kind.function for kind in JOBS.values())
+    assert all(
+        kind.function.startswith("surgicai_vision.") and ":" in kind.function
+        for kind in JOBS.values()
+    )

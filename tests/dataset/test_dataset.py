@@ -15,9 +15,16 @@ from fake_env import FakeEnv
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
-from surgicai_vision.dataset import check_dataset, codecs, metadata, open_dataset, render_demos, schema
+from surgicai_vision.dataset import (
+    check_dataset,
+    codecs,
+    metadata,
+    open_dataset,
+    render_demos,
+    schema,
+)
 from surgicai_vision.dataset import render as render_module
-from surgicai_vision.dataset.stats import PictureStatistics, column_statistics
+from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
 from surgicai_vision.dataset.stride import thinned
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.store import list_demos, read_demo
@@ -36,7 +43,9 @@ def fake(monkeypatch):
 
     monkeypatch.setattr(render_module, "_env", env)
     monkeypatch.setattr(render_module, "_renderer", lambda: "none")
-    monkeypatch.setattr(render_module, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()})
+    monkeypatch.setattr(
+        render_module, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()}
+    )
 
 
 @pytest.fixture
@@ -50,7 +59,7 @@ def render(demos, out, **more):
     return render_demos(demos, out, **options)
 
 
-def test_every_frame_is_the_picture_of_its_state(tmp_path, fake, demos):
+def test_every_frame_is_the_image_of_its_state(tmp_path, fake, demos):
     summary = render(demos, tmp_path / "set", segmentation=True)
     dataset = open_dataset(tmp_path / "set")
     episodes = [read_demo(path) for path in list_demos(demos)]
@@ -62,13 +71,19 @@ def test_every_frame_is_the_picture_of_its_state(tmp_path, fake, demos):
             env.set_state_vector(state)
             observation = env.observe()
             for view in ("front", "back"):
-                np.testing.assert_array_equal(dataset.frames(view, frame, frame + 1)[0], observation["pixels"][view])
-                np.testing.assert_array_equal(dataset.depth(view, frame, frame + 1)[0], observation["depth"][view])
+                np.testing.assert_array_equal(
+                    dataset.frames(view, frame, frame + 1)[0], observation["pixels"][view]
+                )
+                np.testing.assert_array_equal(
+                    dataset.depth(view, frame, frame + 1)[0], observation["depth"][view]
+                )
                 parts = dataset.segmentation(view, frame, frame + 1)[0]
                 np.testing.assert_array_equal(parts, observation["segmentation"][view])
             np.testing.assert_array_equal(columns[names.STATE][frame], env.agent_pos())
             np.testing.assert_array_equal(columns[names.BOTH_ARMS][frame], env.both_arms())
-            np.testing.assert_array_equal(columns[names.PRIVILEGED_STATE][frame], env.state_vector())
+            np.testing.assert_array_equal(
+                columns[names.PRIVILEGED_STATE][frame], env.state_vector()
+            )
             np.testing.assert_array_equal(columns[names.ACTION][frame], episode.action[step])
             assert columns[names.SEED][frame] == episode.seed
             assert columns[names.DONE][frame] == (step == len(episode) - 1)
@@ -84,7 +99,7 @@ def test_every_fifth_frame_is_one_of_all(tmp_path, fake, demos, monkeypatch):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     render(demos, tmp_path / "all")
-    summary = render(demos, tmp_path / "set", every=5)
+    summary = render(demos, tmp_path / "set", frame_stride=5)
     whole, few = open_dataset(tmp_path / "all"), open_dataset(tmp_path / "set")
     rows = np.concatenate([np.arange(start, stop, 5) for start, stop in whole.bounds()])
     assert summary.frames == few.length == len(rows) < whole.length
@@ -94,16 +109,20 @@ def test_every_fifth_frame_is_one_of_all(tmp_path, fake, demos, monkeypatch):
     for key in schema.COLUMNS:
         if key != names.DONE:
             np.testing.assert_array_equal(few.columns()[key], whole.columns()[key][rows])
-    np.testing.assert_allclose(few.columns()["timestamp"], whole.columns()["timestamp"][rows], atol=1e-6)
+    np.testing.assert_allclose(
+        few.columns()["timestamp"], whole.columns()["timestamp"][rows], atol=1e-6
+    )
     assert check_dataset(tmp_path / "set").problems == ()
     lerobot = LeRobotDataset("local/set", root=tmp_path / "set")
     assert lerobot.fps == 10 and len(lerobot) == few.length
     assert thinned(few, 5) is few
-    np.testing.assert_array_equal(thinned(few, 10).columns()[names.SEED], thinned(whole, 10).columns()[names.SEED])
+    np.testing.assert_array_equal(
+        thinned(few, 10).columns()[names.SEED], thinned(whole, 10).columns()[names.SEED]
+    )
     with pytest.raises(InputError, match="the dataset holds one every 5"):
         thinned(few, 1)
-    with pytest.raises(InputError, match=r"every is 4; .* 1, 2, 5, 10, 25, 50"):
-        render(demos, tmp_path / "none", every=4)
+    with pytest.raises(InputError, match=r"frame_stride is 4; .* 1, 2, 5, 10, 25, 50"):
+        render(demos, tmp_path / "none", frame_stride=4)
     with pytest.raises(InputError, match="a replay needs each step's"):
         replay_subject(few)
 
@@ -124,7 +143,7 @@ def test_frames_across_episodes_equal_single_frames(tmp_path, fake, demos):
 def test_digest_is_that_of_the_decoded_content(tmp_path, fake, demos):
     summary = render(demos, tmp_path / "set", segmentation=True)
     dataset = open_dataset(tmp_path / "set")
-    keys = [key for key, _, _ in schema.picture_keys(dataset.views, True, True)]
+    keys = [key for key, _, _ in schema.image_keys(dataset.views, True, True)]
     columns, digests = dataset.columns(), []
     decoded = {key: list(dataset.decoded(key, 0, dataset.length)) for key in keys}
     for number in range(3):
@@ -147,11 +166,15 @@ def test_interrupted_rendering_continues_to_the_same_bytes(tmp_path, fake, demos
         render(demos, tmp_path / "set", progress=stop)
     assert not (tmp_path / "set").exists()
     assert render(demos, tmp_path / "set").digest == whole.digest
-    assert open_dataset(tmp_path / "set").fingerprint == open_dataset(tmp_path / "whole").fingerprint
+    assert (
+        open_dataset(tmp_path / "set").fingerprint == open_dataset(tmp_path / "whole").fingerprint
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["demos", "set", "whole"]
 
 
-def test_rendering_again_does_nothing_and_other_options_are_refused(tmp_path, fake, demos, monkeypatch):
+def test_rendering_again_does_nothing_and_other_options_are_refused(
+    tmp_path, fake, demos, monkeypatch
+):
     first = render(demos, tmp_path / "set")
     monkeypatch.setattr(render_module, "_env", None)
     assert render(demos, tmp_path / "set").digest == first.digest
@@ -193,16 +216,22 @@ def test_lerobot_opens_it_offline(tmp_path, fake, demos, monkeypatch):
 
     render(demos, tmp_path / "set")
     ours = open_dataset(tmp_path / "set")
-    theirs = LeRobotDataset("local/set", root=tmp_path / "set", depth_output_unit="m", video_backend="pyav")
+    theirs = LeRobotDataset(
+        "local/set", root=tmp_path / "set", depth_output_unit="m", video_backend="pyav"
+    )
     assert (theirs.num_frames, theirs.num_episodes, theirs.fps) == (ours.length, 3, names.FPS)
     for index in (0, 5, ours.length - 1):
         item = theirs[index]
         assert item["task"] == names.TASK_TEXTS["grasp"]
-        rgb = np.round(item[names.image_key("back")].numpy().transpose(1, 2, 0) * 255).astype(np.uint8)
+        rgb = np.round(item[names.image_key("back")].numpy().transpose(1, 2, 0) * 255).astype(
+            np.uint8
+        )
         np.testing.assert_array_equal(rgb, ours.frames("back", index, index + 1)[0])
         depth = item[names.depth_key("front")].numpy()[0]
         np.testing.assert_array_equal(depth, ours.depth("front", index, index + 1)[0, ..., 0])
-        np.testing.assert_array_equal(item[names.ACTION].numpy(), ours.columns()[names.ACTION][index])
+        np.testing.assert_array_equal(
+            item[names.ACTION].numpy(), ours.columns()[names.ACTION][index]
+        )
     _edit(theirs, tmp_path)
     statistics = theirs.meta.stats[names.ACTION]
     np.testing.assert_allclose(statistics["mean"], ours.columns()[names.ACTION].mean(0), atol=1e-6)
@@ -214,7 +243,7 @@ def test_statistics_equal_lerobots(fake):
 
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (6, 20, 24, 3), dtype=np.uint8)
-    running = PictureStatistics()
+    running = ImageStatistics()
     for frame in frames:
         running.add(frame)
     theirs = get_feature_stats(frames.transpose(0, 3, 1, 2), axis=(0, 2, 3), keepdims=True)
@@ -248,14 +277,21 @@ def _edit(dataset, folder):
 
 
 def test_metadata_equals_lerobots(tmp_path, fake, demos):
-    """What we write without LeRobot is what LeRobot writes: same tables, same types, same numbers."""
+    """What we write without LeRobot is what LeRobot writes: same tables, same types, same
+    numbers.
+    """
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.feature_utils import get_hf_features_from_features
 
     render(demos, tmp_path / "set", segmentation=True)
     table = schema.features(("front", "back"), SIZE, True, True)
     theirs = LeRobotDatasetMetadata.create(
-        "local/set", names.FPS, table, robot_type=metadata.ROBOT_TYPE, root=tmp_path / "theirs", use_videos=False
+        "local/set",
+        names.FPS,
+        table,
+        robot_type=metadata.ROBOT_TYPE,
+        root=tmp_path / "theirs",
+        use_videos=False,
     )
     text = names.TASK_TEXTS["grasp"]
     theirs.save_episode_tasks([text])
@@ -272,7 +308,10 @@ def test_metadata_equals_lerobots(tmp_path, fake, demos):
     written = pq.read_table(tmp_path / "theirs/meta/episodes/chunk-000/file-000.parquet")
     assert ours.select(written.column_names).equals(written)
     for name in ("info.json", "stats.json"):
-        one, two = (json.loads((tmp_path / which / "meta" / name).read_text()) for which in ("set", "theirs"))
+        one, two = (
+            json.loads((tmp_path / which / "meta" / name).read_text())
+            for which in ("set", "theirs")
+        )
         if name == "info.json":
             assert one == two
             assert list(one["features"]) == list(two["features"])
@@ -281,7 +320,9 @@ def test_metadata_equals_lerobots(tmp_path, fake, demos):
             for key in one:
                 for statistic in one[key]:
                     np.testing.assert_allclose(one[key][statistic], two[key][statistic], atol=1e-9)
-    one, two = (pq.read_table(tmp_path / which / "meta/tasks.parquet") for which in ("set", "theirs"))
+    one, two = (
+        pq.read_table(tmp_path / which / "meta/tasks.parquet") for which in ("set", "theirs")
+    )
     assert one.equals(two)
     arrow = get_hf_features_from_features(theirs.features).arrow_schema
     data = pq.read_schema(tmp_path / "set/data/chunk-000/file-000.parquet")
@@ -290,7 +331,7 @@ def test_metadata_equals_lerobots(tmp_path, fake, demos):
 
 
 @pytest.mark.parametrize("shape", [(20, 30, 3), (17, 17, 1)])
-def test_pictures_are_lossless(shape):
+def test_images_are_lossless(shape):
     rng = np.random.default_rng(1)
     rgb = rng.integers(0, 256, shape, dtype=np.uint8)
     np.testing.assert_array_equal(codecs.decode(codecs.encode(rgb), "x")[..., : shape[2]], rgb)
@@ -298,10 +339,15 @@ def test_pictures_are_lossless(shape):
     np.testing.assert_array_equal(codecs.decode(codecs.encode(depth), "x"), depth)
 
 
-@pytest.mark.parametrize("spoil", ["no meta", "not json", "key gone", "short data", "data gone", "not parquet"])
+@pytest.mark.parametrize(
+    "spoil", ["no meta", "not json", "key gone", "short data", "data gone", "not parquet"]
+)
 def test_damaged_dataset_is_a_bad_file(tmp_path, fake, demos, spoil):
     render(demos, tmp_path / "set", depth=False)
-    meta, data = tmp_path / "set" / names.META_FILE, tmp_path / "set/data/chunk-000/file-000.parquet"
+    meta, data = (
+        tmp_path / "set" / names.META_FILE,
+        tmp_path / "set/data/chunk-000/file-000.parquet",
+    )
     content = json.loads(meta.read_text())
     if spoil == "no meta":
         meta.unlink()
@@ -325,7 +371,9 @@ def test_one_row_group_an_episode(tmp_path, fake, demos):
     render(demos, tmp_path / "set")
     file = pq.ParquetFile(tmp_path / "set/data/chunk-000/file-000.parquet")
     lengths = [len(read_demo(path)) for path in list_demos(demos)]
-    assert [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)] == lengths
+    assert [
+        file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)
+    ] == lengths
 
 
 def rewrite(path, change):
@@ -334,11 +382,11 @@ def rewrite(path, change):
     pq.write_table(change(table), path, row_group_size=len(table))
 
 
-def picture(frame):
+def image(frame):
     return {"bytes": codecs.encode(frame), "path": "x"}
 
 
-def with_picture(table, key, row, value):
+def with_image(table, key, row, value):
     column = table.column(key).to_pylist()
     column[row] = value if isinstance(value, dict) else column[value]
     field = table.field(key)
@@ -354,20 +402,35 @@ def with_value(table, key, row, value):
 
 FRONT, DEPTH = names.image_key("front"), names.depth_key("back")
 DAMAGE = {
-    "black": (lambda t: with_picture(t, FRONT, 3, picture(np.zeros((SIZE, SIZE, 3), np.uint8))), "frame 3.*black"),
-    "size": (lambda t: with_picture(t, FRONT, 2, picture(np.eye(20, dtype=np.uint8)[..., None])), "20 × 20"),
-    "repeated": (lambda t: with_picture(t, FRONT, 2, 1), "frame 2.*picture before it again"),
-    "no picture": (lambda t: with_picture(t, FRONT, 1, {"bytes": b"PNG", "path": "x"}), "cannot be decoded"),
+    "black": (
+        lambda t: with_image(t, FRONT, 3, image(np.zeros((SIZE, SIZE, 3), np.uint8))),
+        "frame 3.*black",
+    ),
+    "size": (
+        lambda t: with_image(t, FRONT, 2, image(np.eye(20, dtype=np.uint8)[..., None])),
+        "20 × 20",
+    ),
+    "repeated": (lambda t: with_image(t, FRONT, 2, 1), "frame 2.*image before it again"),
+    "no image": (
+        lambda t: with_image(t, FRONT, 1, {"bytes": b"PNG", "path": "x"}),
+        "cannot be decoded",
+    ),
     "depth": (
-        lambda t: with_picture(t, DEPTH, 0, picture(np.full((SIZE, SIZE, 1), np.nan, np.float32))),
+        lambda t: with_image(t, DEPTH, 0, image(np.full((SIZE, SIZE, 1), np.nan, np.float32))),
         "frame 0.*not finite and positive",
     ),
-    "nan": (lambda t: with_value(t, names.STATE, 4, [float("nan")] * 7), "observation.state: 1 frames.*first 4"),
+    "nan": (
+        lambda t: with_value(t, names.STATE, 4, [float("nan")] * 7),
+        "observation.state: 1 frames.*first 4",
+    ),
     "order": (lambda t: with_value(t, "index", 4, 9), "index: not 0, 1, 2"),
     "frame": (lambda t: with_value(t, "frame_index", 2, 0), "episode 0: frame_index"),
     "done": (lambda t: with_value(t, names.DONE, 0, True), "episode 0: next.done"),
     "seed": (lambda t: with_value(t, names.SEED, 0, 77), "different seeds"),
-    "statistics": (lambda t: with_value(t, names.REWARD, 0, -50.0), "min of next.reward is not that"),
+    "statistics": (
+        lambda t: with_value(t, names.REWARD, 0, -50.0),
+        "min of next.reward is not that",
+    ),
     "content": (lambda t: with_value(t, names.ACTION, 0, [0.1] * 7), "digest: the content has"),
 }
 
@@ -376,7 +439,12 @@ def test_a_good_dataset_has_no_problems(tmp_path, fake, demos):
     summary = render(demos, tmp_path / "set", segmentation=True)
     report = check_dataset(tmp_path / "set")
     assert report.problems == ()
-    assert (report.ok, report.frames, report.episodes, report.digest) == (True, summary.frames, 3, summary.digest)
+    assert (report.ok, report.frames, report.episodes, report.digest) == (
+        True,
+        summary.frames,
+        3,
+        summary.digest,
+    )
 
 
 @pytest.mark.parametrize("name", DAMAGE)
@@ -393,12 +461,18 @@ def test_check_finds_damaged_metadata(tmp_path, fake, demos):
     render(demos, tmp_path / "set")
     info = tmp_path / "set/meta/info.json"
     info.write_text(info.read_text().replace('"total_episodes": 3', '"total_episodes": 4'))
-    assert "meta/info.json: its counts are not those of the data." in check_dataset(tmp_path / "set").problems
+    assert (
+        "meta/info.json: its counts are not those of the data."
+        in check_dataset(tmp_path / "set").problems
+    )
     (tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").write_bytes(b"")
-    assert any("LeRobot's metadata cannot be read" in line for line in check_dataset(tmp_path / "set").problems)
+    assert any(
+        "LeRobot's metadata cannot be read" in line
+        for line in check_dataset(tmp_path / "set").problems
+    )
 
 
-# -- the real environment ---------------------------------------------------------------------------------------------
+# -- the real environment --------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -411,7 +485,9 @@ def recorded(tmp_path_factory):
 
 def test_recording_does_not_depend_on_the_workers(tmp_path, recorded):
     again = record(TaskConfig("place"), episodes=2, out=tmp_path / "demos", workers=0)
-    assert [path.read_bytes() for path in again] == [path.read_bytes() for path in list_demos(recorded)]
+    assert [path.read_bytes() for path in again] == [
+        path.read_bytes() for path in list_demos(recorded)
+    ]
 
 
 def test_rendering_does_not_depend_on_the_workers_and_equals_what_was_seen_live(tmp_path, recorded):
@@ -434,8 +510,12 @@ def test_rendering_does_not_depend_on_the_workers_and_equals_what_was_seen_live(
     for step, action in enumerate(demo.action):
         for view in ("front", "back"):
             frame = row + step
-            np.testing.assert_array_equal(dataset.frames(view, frame, frame + 1)[0], observation["pixels"][view])
-            np.testing.assert_array_equal(dataset.depth(view, frame, frame + 1)[0], observation["depth"][view])
+            np.testing.assert_array_equal(
+                dataset.frames(view, frame, frame + 1)[0], observation["pixels"][view]
+            )
+            np.testing.assert_array_equal(
+                dataset.depth(view, frame, frame + 1)[0], observation["depth"][view]
+            )
             parts = dataset.segmentation(view, frame, frame + 1)[0]
             np.testing.assert_array_equal(parts, observation["segmentation"][view])
         np.testing.assert_array_equal(columns[names.STATE][row + step], observation["agent_pos"])
@@ -452,7 +532,9 @@ def test_cameras_stand_in_the_metadata(tmp_path, recorded):
     assert list(cameras) == ["back", "wrist_psm2"] == list(dataset.views)
     # Vertical field of view 0.8 rad on 32 pixels.
     np.testing.assert_allclose(cameras["back"]["intrinsics"][1][1], 16 / np.tan(0.4), rtol=1e-3)
-    np.testing.assert_allclose(np.array(cameras["back"]["T_world_camera"])[:3, 3], [0, -0.0359, 0.1659], atol=1e-6)
+    np.testing.assert_allclose(
+        np.array(cameras["back"]["T_world_camera"])[:3, 3], [0, -0.0359, 0.1659], atol=1e-6
+    )
     assert cameras["wrist_psm2"]["T_world_camera"] is None, "it moves with the arm"
     assert dataset.meta["renderers"][0]
 
@@ -472,7 +554,9 @@ def test_killed_rendering_continues_to_the_same_dataset(tmp_path, recorded, mome
     """SIGKILL while rendering and at the end; `benchmarks/kill.py` does it at random moments."""
     script = tmp_path / "script.py"
     script.write_text(KILLED)
-    process = subprocess.Popen([sys.executable, script, recorded, tmp_path / "set"], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, script, recorded, tmp_path / "set"], stdout=subprocess.PIPE, text=True
+    )
     lines = {"first episode": 1, "between": 2, "assembling": 3}[moment]
     for _ in range(lines):
         process.stdout.readline()
@@ -484,5 +568,7 @@ def test_killed_rendering_continues_to_the_same_dataset(tmp_path, recorded, mome
     again = render_demos(recorded, tmp_path / "set", **options)
     assert bool(seen[0]) == (lines > 1), "what was finished is not done again"
     assert again.digest == render_demos(recorded, tmp_path / "whole", size=64, workers=0).digest
-    assert open_dataset(tmp_path / "set").fingerprint == open_dataset(tmp_path / "whole").fingerprint
+    assert (
+        open_dataset(tmp_path / "set").fingerprint == open_dataset(tmp_path / "whole").fingerprint
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["script.py", "set", "whole"]

@@ -29,7 +29,9 @@ def offline(tmp_path, monkeypatch):
 
 
 def write_lerobot(root, video=False, **options):
-    """Write a foreign dataset of three episodes and two tasks with LeRobot; return it before `finalize`."""
+    """Write a foreign dataset of three episodes and two tasks with LeRobot; return it before
+    `finalize`.
+    """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     plain = {"dtype": "float32", "names": None}
@@ -95,23 +97,33 @@ def same_items(one, other, count):
 def test_what_lerobots_writer_loses_when_killed_is_kept(tmp_path, foreign):
     killed = shutil.copytree(foreign / "killed", tmp_path / "set")
     report = check_dataset(killed)
-    assert "data/chunk-000/file-000.parquet has no footer: its writer was killed." in report.problems
+    assert (
+        "data/chunk-000/file-000.parquet has no footer: its writer was killed." in report.problems
+    )
     assert "meta/episodes is missing." in report.problems
     before = {path: path.read_bytes() for path in files(killed)}
     repair = repair_dataset(killed)
     assert (repair.episodes, repair.claimed, repair.frames) == (3, 3, sum(LENGTHS))
     assert check_dataset(killed).problems == ()
     assert repair.original == tmp_path / "set.broken"
-    kept = {killed / path.relative_to(repair.original): path.read_bytes() for path in files(repair.original)}
+    kept = {
+        killed / path.relative_to(repair.original): path.read_bytes()
+        for path in files(repair.original)
+    }
     assert kept == before, "the original is as it was"
-    assert sorted(path.name for path in tmp_path.iterdir() if path.name != "cache") == ["set", "set.broken"]
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name != "cache") == [
+        "set",
+        "set.broken",
+    ]
     mended, whole = opened(killed), opened(foreign / "whole")
     assert mended.num_episodes == 3
     same_items(mended, whole, sum(LENGTHS))
     for key, statistics in whole.meta.stats.items():
         for name in ("min", "max", "mean", "std", "count"):
-            # LeRobot's own std of pictures is 4e-5 off numpy's.
-            np.testing.assert_allclose(mended.meta.stats[key][name], statistics[name], atol=1e-4, err_msg=key)
+            # LeRobot's own std of images is 4e-5 off numpy's.
+            np.testing.assert_allclose(
+                mended.meta.stats[key][name], statistics[name], atol=1e-4, err_msg=key
+            )
 
 
 def test_a_video_dataset_is_repaired_by_counting_its_frames(tmp_path):
@@ -133,7 +145,9 @@ def change(path, column, row, value):
     values = table.column(column).to_pylist()
     values[row] = value
     field = table.field(column)
-    table = table.set_column(table.schema.get_field_index(column), field, pa.array(values, field.type))
+    table = table.set_column(
+        table.schema.get_field_index(column), field, pa.array(values, field.type)
+    )
     pq.write_table(table, path)
 
 
@@ -160,8 +174,12 @@ DAMAGE = {
     "more counted": (counts_more, 3, "it counts 8 episodes"),
     "rows missing": (fewer_rows, 3, "rows are not the episodes"),
     "torn": (torn, 2, "no footer"),
-    "picture spoilt": (lambda f: change(f / DATA, CAMERA, 8, {"bytes": b"no", "path": "x"}), 1, "cannot be decoded"),
-    "picture missing": (
+    "image spoilt": (
+        lambda f: change(f / DATA, CAMERA, 8, {"bytes": b"no", "path": "x"}),
+        1,
+        "cannot be decoded",
+    ),
+    "image missing": (
         lambda f: change(f / DATA, CAMERA, 8, {"bytes": None, "path": "x.png"}),
         1,
         "x.png is missing",
@@ -173,7 +191,11 @@ DAMAGE = {
     ),
     "gap": (lambda f: change(f / DATA, "frame_index", 12, 9), 2, "its frame_index is"),
     "nan": (lambda f: change(f / DATA, names.STATE, 12, [float("nan")] * 4), 2, "not finite"),
-    "statistics": (lambda f: (f / "meta/stats.json").write_text("{"), 3, "stats.json is not valid JSON"),
+    "statistics": (
+        lambda f: (f / "meta/stats.json").write_text("{"),
+        3,
+        "stats.json is not valid JSON",
+    ),
     "tasks": (lambda f: (f / "meta/tasks.parquet").unlink(), 3, "tasks.parquet cannot be read"),
 }
 
@@ -195,7 +217,7 @@ def test_the_longest_whole_prefix_of_a_foreign_dataset_is_kept(tmp_path, foreign
         same_items(mended, opened(foreign / "whole"), sum(LENGTHS[:kept]))
 
 
-def test_pictures_beside_the_data_are_taken_in(tmp_path, foreign):
+def test_images_beside_the_data_are_taken_in(tmp_path, foreign):
     folder = shutil.copytree(foreign / "whole", tmp_path / "set")
     content = pq.read_table(folder / DATA).column(CAMERA)[3].as_py()["bytes"]
     (folder / "images").mkdir(exist_ok=True)
@@ -269,12 +291,14 @@ def test_two_folders_swap_names(tmp_path):
 
 def table(count, first=0):
     rng = np.random.default_rng(first)
-    picture = [{"bytes": rng.bytes(9000), "path": f"{index}"} for index in range(count)]
+    image = [{"bytes": rng.bytes(9000), "path": f"{index}"} for index in range(count)]
     return pa.table(
         {
-            "picture": pa.array(picture, pa.struct({"bytes": pa.binary(), "path": pa.string()})),
+            "image": pa.array(image, pa.struct({"bytes": pa.binary(), "path": pa.string()})),
             "vector": pa.FixedSizeListArray.from_arrays(pa.array(rng.normal(size=count * 7)), 7),
-            "grid": pa.array(rng.normal(size=(count, 2, 3)).tolist(), pa.list_(pa.list_(pa.float64()))),
+            "grid": pa.array(
+                rng.normal(size=(count, 2, 3)).tolist(), pa.list_(pa.list_(pa.float64()))
+            ),
             "done": pa.array(np.arange(count) == count - 1),
             "index": pa.array(np.arange(first, first + count)),
         }
@@ -285,16 +309,28 @@ def table(count, first=0):
 def test_footerless_parquet_is_read_up_to_the_last_whole_row_group(tmp_path, writing):
     parts, sizes = [], []
     writer = pq.ParquetWriter(
-        tmp_path / "whole", table(1).schema, compression=writing.compression, use_dictionary=writing.dictionary
+        tmp_path / "whole",
+        table(1).schema,
+        compression=writing.compression,
+        use_dictionary=writing.dictionary,
     )
     for count in (150, 1, 7, 300):
         parts.append(table(count, sum(map(len, parts))))
         writer.write_table(parts[-1])
         sizes.append((tmp_path / "whole").stat().st_size)
     content = (tmp_path / "whole").read_bytes()
-    for size, groups in ((sizes[3], 4), (sizes[3] - 1, 3), (sizes[1] + 5000, 2), (sizes[0] - 3, 0), (3, 0), (0, 0)):
+    for size, groups in (
+        (sizes[3], 4),
+        (sizes[3] - 1, 3),
+        (sizes[1] + 5000, 2),
+        (sizes[0] - 3, 0),
+        (3, 0),
+        (0, 0),
+    ):
         (tmp_path / "cut").write_bytes(content[:size])
-        assert salvage(tmp_path / "cut", parts[0].slice(0, 1), tmp_path / "mended", writing) == groups
+        assert (
+            salvage(tmp_path / "cut", parts[0].slice(0, 1), tmp_path / "mended", writing) == groups
+        )
         if groups:
             assert pq.read_table(tmp_path / "mended").equals(pa.concat_tables(parts[:groups]))
     writer.close()
@@ -306,7 +342,10 @@ def test_thrift_round_trip_and_rubbish():
         2: (thrift.BINARY, b"abc"),
         3: (thrift.TRUE, True),
         20: (thrift.LIST, (thrift.I64, list(range(-20, 20)))),
-        21: (thrift.STRUCT, {1: (thrift.DOUBLE, 0.5), 2: (thrift.FALSE, False), 300: (thrift.I64, 2**60)}),
+        21: (
+            thrift.STRUCT,
+            {1: (thrift.DOUBLE, 0.5), 2: (thrift.FALSE, False), 300: (thrift.I64, 2**60)},
+        ),
     }
     content = thrift.write_struct(fields)
     assert thrift.read_struct(content, 0) == (fields, len(content))

@@ -81,7 +81,11 @@ def test_what_is_pushed_is_what_is_pulled(tmp_path, dataset, fake_hub):
     assert report.digest == open_dataset(dataset).meta["digest"]
     assert check_dataset(tmp_path / "pulled").problems == ()
     assert open_dataset(tmp_path / "pulled").fingerprint == open_dataset(dataset).fingerprint
-    assert sorted(path.name for path in (tmp_path / "pulled").iterdir()) == ["README.md", "data", "meta"]
+    assert sorted(path.name for path in (tmp_path / "pulled").iterdir()) == [
+        "README.md",
+        "data",
+        "meta",
+    ]
     assert not list(tmp_path.glob("*.work"))
     with pytest.raises(OutputExists):
         pull_dataset(REPO, tmp_path / "pulled", api=fake_hub)
@@ -97,7 +101,12 @@ def test_the_card_says_what_it_is(dataset):
     assert "LeRobot" in table["tags"]
     assert table["configs"][0]["data_files"] == "data/*/*.parquet"
     meta = json.loads((dataset / names.META_FILE).read_text())
-    for part in (meta["digest"], "2 simulated demonstrations", names.depth_key("front"), names.TASK_TEXTS["grasp"]):
+    for part in (
+        meta["digest"],
+        "2 simulated demonstrations",
+        names.depth_key("front"),
+        names.TASK_TEXTS["grasp"],
+    ):
         assert part in body
 
 
@@ -118,7 +127,9 @@ def test_damage_is_neither_pushed_nor_pulled(tmp_path, dataset, fake_hub):
 
 def test_a_refusal_is_one_line(tmp_path, dataset):
     fake_hub = FakeHub(tmp_path / "hub", OSError("403 Forbidden\nYou need a token"))
-    with pytest.raises(SurgicaiError, match=r"The Hub refused somebody/suturing-grasp: 403 Forbidden$"):
+    with pytest.raises(
+        SurgicaiError, match=r"The Hub refused somebody/suturing-grasp: 403 Forbidden$"
+    ):
         push_dataset(dataset, REPO, api=fake_hub)
     with pytest.raises(SurgicaiError, match="The Hub refused"):
         pull_dataset(REPO, tmp_path / "pulled", api=fake_hub)
@@ -134,7 +145,10 @@ def test_bad_names_are_refused(tmp_path, dataset, name):
 
 
 def test_offline_is_said_at_once(tmp_path, dataset, monkeypatch, capsys):
-    for arguments in (["push", str(dataset), "--repo", REPO], ["pull", REPO, "--out", str(tmp_path / "pulled")]):
+    for arguments in (
+        ["push", str(dataset), "--repo", REPO],
+        ["pull", REPO, "--out", str(tmp_path / "pulled")],
+    ):
         assert main(["dataset", *arguments]) == 1
         assert "HF_HUB_OFFLINE is set" in capsys.readouterr().err
     assert not list(tmp_path.glob("pulled*"))
@@ -148,7 +162,9 @@ def test_a_hub_out_of_reach_is_said_in_one_line(monkeypatch):
     for name in ("https_proxy", "HTTPS_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(hub.socket, "create_connection", refuse)
-    with pytest.raises(SurgicaiError, match=r"at hub.example cannot be reached \(Network is unreachable\)"):
+    with pytest.raises(
+        SurgicaiError, match=r"at hub.example cannot be reached \(Network is unreachable\)"
+    ):
         hub._reach("https://hub.example")
 
 

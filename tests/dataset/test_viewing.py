@@ -12,7 +12,14 @@ from surgicai_vision.commands import render_demos as command
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
-from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, repair_dataset, video_jobs, view_dataset
+from surgicai_vision.dataset import (
+    check_dataset,
+    open_dataset,
+    render_demos,
+    repair_dataset,
+    video_jobs,
+    view_dataset,
+)
 from surgicai_vision.dataset.video import CODECS
 
 CONFIG = TaskConfig(max_steps=12)
@@ -42,10 +49,14 @@ def test_a_subset_of_views_is_what_rendering_them_gives(tmp_path, demos):
     rendered = render(demos, tmp_path / "alone", views=("front",))
     assert made.digest == rendered.digest
     assert made.video_error == {}
-    files = sorted(path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").rglob("*.*"))
+    files = sorted(
+        path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").rglob("*.*")
+    )
     for name in files:
         if str(name) != names.META_FILE:
-            assert (tmp_path / "front" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
+            assert (tmp_path / "front" / name).read_bytes() == (
+                tmp_path / "alone" / name
+            ).read_bytes(), name
     assert check_dataset(tmp_path / "front").problems == ()
     assert list(open_dataset(tmp_path / "front").meta["cameras"]) == ["front"]
 
@@ -65,7 +76,9 @@ def test_video_is_read_by_us_and_by_lerobot_and_its_error_is_measured(tmp_path, 
     made = render(demos, tmp_path / "video", video=codec)
     before, after = open_dataset(tmp_path / "set"), open_dataset(tmp_path / "video")
     assert check_dataset(tmp_path / "video").problems == ()
-    theirs = LeRobotDataset("local/set", root=tmp_path / "video", video_backend="pyav", depth_output_unit="m")
+    theirs = LeRobotDataset(
+        "local/set", root=tmp_path / "video", video_backend="pyav", depth_output_unit="m"
+    )
     for view in ("front", "back"):
         frames = after.frames(view)
         error = np.abs(frames.astype(float) - before.frames(view)).mean()
@@ -73,8 +86,8 @@ def test_video_is_read_by_us_and_by_lerobot_and_its_error_is_measured(tmp_path, 
         assert 0 < error < 12
         np.testing.assert_array_equal(after.frames(view, 7, 9), frames[7:9])
         for index in (0, 8, after.length - 1):
-            picture = np.round(theirs[index][names.image_key(view)].numpy().transpose(1, 2, 0) * 255)
-            assert np.abs(picture - frames[index]).max() <= 2, "two converters from YUV"
+            image = np.round(theirs[index][names.image_key(view)].numpy().transpose(1, 2, 0) * 255)
+            assert np.abs(image - frames[index]).max() <= 2, "two converters from YUV"
     np.testing.assert_array_equal(after.depth("back"), before.depth("back"))
     assert after.meta["video"] == codec
     assert after.meta["video_error"] == made.video_error
@@ -82,15 +95,22 @@ def test_video_is_read_by_us_and_by_lerobot_and_its_error_is_measured(tmp_path, 
         render(demos, tmp_path / "video")
 
 
-def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(tmp_path, demos, monkeypatch):
+def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(
+    tmp_path, demos, monkeypatch
+):
     render(demos, tmp_path / "set")
     monkeypatch.setattr(video_jobs, "BLOCK_FRAMES", 8)
     alone = view_dataset(tmp_path / "set", tmp_path / "alone", video="h264", workers=0)
     monkeypatch.setattr(video_jobs, "_dataset", None)  # not in this process
     together = view_dataset(tmp_path / "set", tmp_path / "together", video="h264", workers=2)
     assert (alone.digest, alone.video_error) == (together.digest, together.video_error)
-    assert open_dataset(tmp_path / "alone").fingerprint == open_dataset(tmp_path / "together").fingerprint
-    assert len(list((tmp_path / "alone").rglob("*.mp4"))) == 4, "two views, three episodes in two blocks"
+    assert (
+        open_dataset(tmp_path / "alone").fingerprint
+        == open_dataset(tmp_path / "together").fingerprint
+    )
+    assert len(list((tmp_path / "alone").rglob("*.mp4"))) == 4, (
+        "two views, three episodes in two blocks"
+    )
     assert check_dataset(tmp_path / "together").problems == ()
 
 
@@ -99,7 +119,8 @@ def test_views_of_a_video_dataset_and_its_repair(tmp_path, demos):
     view_dataset(tmp_path / "video", tmp_path / "back", views=("back",))
     assert check_dataset(tmp_path / "back").problems == ()
     np.testing.assert_array_equal(
-        open_dataset(tmp_path / "back").frames("back"), open_dataset(tmp_path / "video").frames("back")
+        open_dataset(tmp_path / "back").frames("back"),
+        open_dataset(tmp_path / "video").frames("back"),
     )
     with pytest.raises(InputError, match="holds videos already"):
         view_dataset(tmp_path / "video", tmp_path / "again", video="av1")

@@ -43,7 +43,9 @@ def test_events_find_the_five_subtasks_of_a_stitch(tmp_path):
     assert not first[: handoff.stop].any()
     assert first[handoff.stop]
     assert passed[pullout.stop] == 3
-    moved = np.linalg.norm(recording.needle[handoff.start, :3, 3] - recording.needle[handoff.stop, :3, 3])
+    moved = np.linalg.norm(
+        recording.needle[handoff.start, :3, 3] - recording.needle[handoff.stop, :3, 3]
+    )
     assert moved <= segments.ARRIVED
 
 
@@ -60,7 +62,10 @@ def test_events_find_a_second_stitch(tmp_path):
     motion = shown("suture")
     twice = dataclasses.replace(
         motion,
-        **{key: {arm: np.concatenate([a, a]) for arm, a in getattr(motion, key).items()} for key in ("tip", "jaw")},
+        **{
+            key: {arm: np.concatenate([a, a]) for arm, a in getattr(motion, key).items()}
+            for key in ("tip", "jaw")
+        },
         needle=np.concatenate([motion.needle] * 2),
         phase=np.tile(motion.phase, 2),
     )
@@ -79,7 +84,12 @@ def test_noise_of_a_tracker_leaves_the_subtasks_as_they_are(tmp_path):
         poses_[:, :3, 3] += rng.normal(0, 0.00005, (len(needle), 3))
     noisy = dataclasses.replace(motion, tip=tip, needle=needle)
     clean, other = (
-        segments.segments(recorded(write_bag(tmp_path / name, "mcap", streams(some, labels=False))), PAIR, WHOLE, None)
+        segments.segments(
+            recorded(write_bag(tmp_path / name, "mcap", streams(some, labels=False))),
+            PAIR,
+            WHOLE,
+            None,
+        )
         for name, some in (("clean", motion), ("noisy", noisy))
     )
     assert [segment.task for segment in other] == list(names.SUBTASKS)
@@ -93,7 +103,9 @@ def test_labels_of_other_systems_are_translated_and_unknown_ones_named(tmp_path)
     bag = write_bag(tmp_path / "trial", "mcap", found)
     with pytest.raises(InputError, match=r"label 'S2'.*labels:"):
         import_bags([bag], task=None, out=tmp_path / "demos")
-    made = import_bags([bag], task=None, out=tmp_path / "demos", config=BagConfig(labels={"s2": "place"}))
+    made = import_bags(
+        [bag], task=None, out=tmp_path / "demos", config=BagConfig(labels={"s2": "place"})
+    )
     assert [row.task for row in made] == ["grasp", "place", "handoff"]
 
 
@@ -116,6 +128,10 @@ def test_nothing_to_segment_by_is_said(tmp_path):
     with pytest.raises(InputError, match=r"no labels and no needle.*--task"):
         import_bags([bag], task=None, out=tmp_path / "demos")
     with pytest.raises(InputError, match="need the needle's pose"):
-        import_bags([bag], task=None, out=tmp_path / "demos", config=BagConfig(segmentation="events"))
+        import_bags(
+            [bag], task=None, out=tmp_path / "demos", config=BagConfig(segmentation="events")
+        )
     with pytest.raises(InputError, match="/subtask"):
-        import_bags([bag], task=None, out=tmp_path / "demos", config=BagConfig(segmentation="labels"))
+        import_bags(
+            [bag], task=None, out=tmp_path / "demos", config=BagConfig(segmentation="labels")
+        )

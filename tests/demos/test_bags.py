@@ -1,4 +1,6 @@
-"""Bags of ROS 1 and ROS 2: our own expert's motions go out and come back; what is wrong is told in one line."""
+"""Bags of ROS 1 and ROS 2: our own expert's motions go out and come back; what is wrong is told in
+one line.
+"""
 
 import itertools
 
@@ -29,7 +31,7 @@ def recorded(path, config=WHOLE):
     return recording_of(reader.read(path, config.all_topics), config, "400006")
 
 
-# -- the round trip ---------------------------------------------------------------------------------------------------
+# -- the round trip --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -45,7 +47,7 @@ def test_what_was_recorded_stands_where_it_stood(tmp_path, form):
         phase = names.SUBTASKS.index(row.task)
         first = int(np.argmax(motion.phase == phase))
         assert abs(len(demo) - (motion.phase == phase).sum()) <= 1
-        assert (demo.source, demo.seed, set(demo.phase)) == ("bag", -1, {phase})
+        assert (demo.demonstrator, demo.seed, set(demo.phase)) == ("bag", -1, {phase})
         for index, state in enumerate(demo.state):
             env.set_state_vector(state)
             for arm in names.ARMS:
@@ -70,7 +72,9 @@ def test_the_three_formats_and_single_files_say_the_same(tmp_path):
 def test_packed_bags_say_the_same(tmp_path, form):
     found = streams(shown("grasp"))
     plain = write_bag(tmp_path / "plain", "mcap", found)
-    packed = write_bag(tmp_path / "packed", "bag" if form in ("bz2", "lz4") else form, found, packed=form)
+    packed = write_bag(
+        tmp_path / "packed", "bag" if form in ("bz2", "lz4") else form, found, packed=form
+    )
     one, other = (reader.read(path, BagConfig().all_topics) for path in (plain, packed))
     assert all((one[key] == other[key]).all() for key in one)
 
@@ -107,19 +111,26 @@ def test_the_same_import_again_does_nothing_and_another_is_refused(tmp_path):
 
 
 def test_several_bags_become_one_folder(tmp_path):
-    found = [write_bag(tmp_path / f"trial{seed}", "mcap", streams(shown("grasp", seed))) for seed in (0, 3)]
+    found = [
+        write_bag(tmp_path / f"trial{seed}", "mcap", streams(shown("grasp", seed)))
+        for seed in (0, 3)
+    ]
     (made,) = import_bags(found, task="grasp", out=tmp_path / "demos")
     assert (made.task, len(made.paths), made.succeeded) == ("grasp", 2, 2)
 
 
-# -- time -------------------------------------------------------------------------------------------------------------
+# -- time ------------------------------------------------------------------------------------------
 
 
 def swinging(seconds):
-    """Return T_base_tip (N, 4, 4) that swings about the start: ±5 mm and ±40° at 1 Hz, a smooth known motion."""
+    """Return T_base_tip (N, 4, 4) that swings about the start: ±5 mm and ±40° at 1 Hz, a smooth
+    known motion.
+    """
     phase = 2 * np.pi * np.asarray(seconds)
     motion = np.tile(kinematics.start_in_base("psm2"), (len(phase), 1, 1))
-    turn = Rotation.from_rotvec(np.radians(40.0) * np.sin(phase)[:, None] * np.array([0.0, 0.6, 0.8]))
+    turn = Rotation.from_rotvec(
+        np.radians(40.0) * np.sin(phase)[:, None] * np.array([0.0, 0.6, 0.8])
+    )
     motion[:, :3, :3] = turn.as_matrix() @ motion[:, :3, :3]
     motion[:, :3, 3] += 0.005 * np.column_stack([np.sin(phase), np.cos(phase), np.sin(2 * phase)])
     return motion
@@ -149,12 +160,15 @@ def test_jitter_and_lost_messages_do_not_show_after_resampling(tmp_path, lost, l
     seconds = recording.time + max(pose[0], jaw[0]) / 1e9
     wanted = swinging(seconds)
     tip = recording.arms["psm2"].tip
-    # A chord over dt misses a swing of 5 mm at 2 Hz by up to A (2 π f dt)² / 8: 0.3 mm over five lost messages.
+    # A chord over dt misses a swing of 5 mm at 2 Hz by up to A (2 π f dt)² / 8: 0.3 mm over five
+    # lost messages.
     assert np.linalg.norm(tip[:, :3, 3] - wanted[:, :3, 3], axis=1).max() < 0.4e-3
     assert np.median(np.linalg.norm(tip[:, :3, 3] - wanted[:, :3, 3], axis=1)) < 0.03e-3
     angles = [geodesic_angle(a[:3, :3], b[:3, :3]) for a, b in zip(tip, wanted, strict=True)]
     assert max(angles) < np.radians(1.0)
-    np.testing.assert_allclose(recording.arms["psm2"].jaw, 0.5 * (0.4 + 0.2 * np.sin(seconds)), atol=1e-3)
+    np.testing.assert_allclose(
+        recording.arms["psm2"].jaw, 0.5 * (0.4 + 0.2 * np.sin(seconds)), atol=1e-3
+    )
 
 
 def test_a_commanded_jaw_holds_until_the_next_command(tmp_path):
@@ -182,7 +196,9 @@ def test_speed_stretches_the_motion(tmp_path):
 
 def test_without_stamps_the_time_of_reception_counts(tmp_path):
     times = irregular(200, 2, 3)
-    bag = write_bag(tmp_path / "trial", "bag", {"psm2_pose": (times, swinging(times / 1e9))}, stamped=False)
+    bag = write_bag(
+        tmp_path / "trial", "bag", {"psm2_pose": (times, swinging(times / 1e9))}, stamped=False
+    )
     tip = recorded(bag).arms["psm2"].tip
     wanted = swinging(recorded(bag).time + times[0] / 1e9)
     assert np.linalg.norm(tip[:, :3, 3] - wanted[:, :3, 3], axis=1).max() < 0.1e-3
@@ -208,7 +224,10 @@ def test_messages_out_of_order_and_repeated_are_put_right(tmp_path):
     bag = write_bag(tmp_path / "trial", "mcap", {"psm2_pose": (times, swinging(times / 1e9))})
     arrays = reader.read(bag, WHOLE.all_topics)
     order = np.random.default_rng(0).permutation(np.append(np.arange(len(times)), [5, 5, 9]))
-    mixed = {key: array[order] if array.ndim and key != "topics" else array for key, array in arrays.items()}
+    mixed = {
+        key: array[order] if array.ndim and key != "topics" else array
+        for key, array in arrays.items()
+    }
     one, other = (recording_of(some, WHOLE, "400006").arms["psm2"].tip for some in (arrays, mixed))
     np.testing.assert_array_equal(one, other)
 
@@ -224,14 +243,18 @@ def test_a_gap_costs_the_part_it_lies_in(tmp_path):
     assert [row.task for row in made] == ["grasp", "insert", "handoff", "pullout"]
     with pytest.raises(InputError, match=r"place: a topic is silent for over 0\.2 s"):
         import_bags([bag], task="place", out=tmp_path / "other")
-    patient = import_bags([bag], task="place", out=tmp_path / "other", config=BagConfig(max_gap=1.0))
+    patient = import_bags(
+        [bag], task="place", out=tmp_path / "other", config=BagConfig(max_gap=1.0)
+    )
     assert len(patient[0].paths) == 1
 
 
 def test_pauses_are_left_out_and_slow_motion_is_not():
     count = 300
     tip = np.tile(kinematics.start_in_base("psm2"), (count, 1, 1))
-    way = np.concatenate([np.linspace(0, 0.01, 100), np.full(100, 0.01), 0.01 + np.linspace(0, 0.001, 100)])
+    way = np.concatenate(
+        [np.linspace(0, 0.01, 100), np.full(100, 0.01), 0.01 + np.linspace(0, 0.001, 100)]
+    )
     tip[:, 0, 3] += way + 2e-6 * np.random.default_rng(0).normal(size=count)
     kept = segments.moving(tip, np.zeros(count))
     rested = (kept > 110) & (kept < 190)
@@ -243,7 +266,9 @@ def test_pauses_are_left_out_and_slow_motion_is_not():
 
 
 def test_yaw_past_half_a_turn_is_no_jump(tmp_path):
-    """SurgicAI's half of the insertions turn the long way round; through quaternions of either sign none does."""
+    """SurgicAI's half of the insertions turn the long way round; through quaternions of either sign
+    none does.
+    """
     times = (np.arange(100) * 20_000_000).astype(np.int64)
     motion = np.tile(kinematics.start_in_base("psm2"), (100, 1, 1))
     yaw = np.arctan2(motion[0, 1, 0], motion[0, 0, 0])
@@ -255,11 +280,14 @@ def test_yaw_past_half_a_turn_is_no_jump(tmp_path):
     np.testing.assert_allclose(turns, 0.6 / 99, rtol=1e-3)
 
 
-# -- frames and units -------------------------------------------------------------------------------------------------
+# -- frames and units ------------------------------------------------------------------------------
 
 
 def seven(pose):
-    return (*pose[:3, 3].tolist(), *Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True).tolist())
+    return (
+        *pose[:3, 3].tolist(),
+        *Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True).tolist(),
+    )
 
 
 def some_pose(seed):
@@ -279,7 +307,9 @@ def test_frames_and_units_are_converted(tmp_path):
     lying[:, :3, 3] *= 10.0
     found = {"psm2_pose": (found["psm2_pose"][0], tips), "needle": (found["needle"][0], lying)}
     config = BagConfig(
-        frames=Frames(psm2=seven(frame), tip=seven(tool), needle=seven(world), needle_offset=seven(mark)),
+        frames=Frames(
+            psm2=seven(frame), tip=seven(tool), needle=seven(world), needle_offset=seven(mark)
+        ),
         length_scale=0.001,
         needle_scale=0.1,
     )
@@ -341,7 +371,8 @@ def test_states_of_ambf_are_read_by_the_definition_in_the_bag(tmp_path):
     with Writer(tmp_path / "trial.bag") as writer:
         topics = ("/ambf/env/Needle/State", "/ambf/env/psm2/baselink/State")
         needle, arm = (
-            writer.add_connection(topic, "ambf_msgs/msg/RigidBodyState", typestore=store) for topic in topics
+            writer.add_connection(topic, "ambf_msgs/msg/RigidBodyState", typestore=store)
+            for topic in topics
         )
         for index, lying in enumerate(motion.needle):
             time = START + index * 20_000_000
@@ -350,14 +381,20 @@ def test_states_of_ambf_are_read_by_the_definition_in_the_bag(tmp_path):
             x, y, z, *turn = seven(lying)
             point = types["geometry_msgs/msg/Point"](10 * x, 10 * y, 10 * z)
             w, i, j, k = turn
-            pose = types["geometry_msgs/msg/Pose"](point, types["geometry_msgs/msg/Quaternion"](i, j, k, w))
+            pose = types["geometry_msgs/msg/Pose"](
+                point, types["geometry_msgs/msg/Quaternion"](i, j, k, w)
+            )
             joints = np.append(motion.joints["psm2"][index], [0.1, 0.1]).astype(np.float32)
             joints[2] *= 10
-            message = types["ambf_msgs/msg/RigidBodyState"](header, index, "body", 0.1, pose, joints)
+            message = types["ambf_msgs/msg/RigidBodyState"](
+                header, index, "body", 0.1, pose, joints
+            )
             for connection in (needle, arm):
                 writer.write(connection, time, store.serialize_ros1(message, connection.msgtype))
     state = "/ambf/env/psm2/baselink/State"
-    config = BagConfig("ambf", Topics(psm2_joints=state, psm2_jaw=state, needle="/ambf/env/Needle/State"))
+    config = BagConfig(
+        "ambf", Topics(psm2_joints=state, psm2_jaw=state, needle="/ambf/env/Needle/State")
+    )
     recording = recorded(tmp_path / "trial.bag", config)
     np.testing.assert_allclose(recording.needle, motion.needle, atol=1e-9)
     np.testing.assert_allclose(recording.arms["psm2"].tip, motion.tip["psm2"], atol=1e-6)

@@ -1,4 +1,6 @@
-"""Bags and options that are wrong: each is told in one line that names what there is, and nothing of a bag is run."""
+"""Bags and options that are wrong: each is told in one line that names what there is, and nothing
+of a bag is run.
+"""
 
 import json
 import sys
@@ -18,7 +20,9 @@ from surgicai_vision.demos.store import read_marker
 @pytest.fixture(scope="module")
 def trial(tmp_path_factory):
     """A bag of a grasp, without labels."""
-    return write_bag(tmp_path_factory.mktemp("bags") / "trial", "bag", streams(shown("grasp"), labels=False))
+    return write_bag(
+        tmp_path_factory.mktemp("bags") / "trial", "bag", streams(shown("grasp"), labels=False)
+    )
 
 
 def test_topics_that_are_not_there_are_refused_with_those_that_are(trial, tmp_path):
@@ -27,12 +31,18 @@ def test_topics_that_are_not_there_are_refused_with_those_that_are(trial, tmp_pa
             BagConfig(topics=Topics(needle="/needle")),
             r"no topic /needle \(needle\); it has /needle/measured_cp \(geom",
         ),
-        (BagConfig("ambf"), r"none of /CRTK/psm1/measured_cp, .*The topics are /PSM1/measured_cp \(geom"),
+        (
+            BagConfig("ambf"),
+            r"none of /CRTK/psm1/measured_cp, .*The topics are /PSM1/measured_cp \(geom",
+        ),
         (
             BagConfig(topics=Topics(needle="/PSM1/jaw/measured_js")),
             "holds sensor_msgs/JointState; needle is read from",
         ),
-        (BagConfig(topics=Topics(psm2_pose="/PSM2/jaw/measured_js")), "psm2_pose is read from geometry_msgs/PoseSt"),
+        (
+            BagConfig(topics=Topics(psm2_pose="/PSM2/jaw/measured_js")),
+            "psm2_pose is read from geometry_msgs/PoseSt",
+        ),
     ):
         with pytest.raises(InputError, match=message) as caught:
             import_bags([trial], task="grasp", out=tmp_path / "demos", config=config)
@@ -48,15 +58,20 @@ def test_a_task_that_is_not_shown_is_refused(trial, tmp_path):
 
 
 def test_an_arm_that_is_not_recorded_is_named(tmp_path):
-    found = {role: rows for role, rows in streams(shown("grasp")).items() if not role.startswith("psm2")}
+    found = {
+        role: rows for role, rows in streams(shown("grasp")).items() if not role.startswith("psm2")
+    }
     bag = write_bag(tmp_path / "trial", "mcap", found)
     with pytest.raises(
-        InputError, match=r"grasp is done by psm2, whose pose is not on /PSM2/measured_cp\. The topics"
+        InputError,
+        match=r"grasp is done by psm2, whose pose is not on /PSM2/measured_cp\. The topics",
     ):
         import_bags([bag], task="grasp", out=tmp_path / "demos")
     found = {role: rows for role, rows in streams(shown("grasp")).items() if role != "psm2_jaw"}
     bag = write_bag(tmp_path / "jawless", "mcap", found)
-    with pytest.raises(InputError, match="grasp needs the jaw of psm2, which is not on /PSM2/jaw/measured_js"):
+    with pytest.raises(
+        InputError, match="grasp needs the jaw of psm2, which is not on /PSM2/jaw/measured_js"
+    ):
         import_bags([bag], task="grasp", out=tmp_path / "demos")
 
 
@@ -76,7 +91,17 @@ def test_an_arm_that_is_not_recorded_is_named(tmp_path):
 def test_a_wrong_table_is_one_line(trial, tmp_path, capsys, table, message):
     (tmp_path / "bag.yaml").write_text(yaml.safe_dump({"bag": table}))
     assert (
-        main(["import-demos", str(trial), "--config", str(tmp_path / "bag.yaml"), "--out", str(tmp_path / "o")]) == 2
+        main(
+            [
+                "import-demos",
+                str(trial),
+                "--config",
+                str(tmp_path / "bag.yaml"),
+                "--out",
+                str(tmp_path / "o"),
+            ]
+        )
+        == 2
     )
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
@@ -85,7 +110,12 @@ def test_a_wrong_table_is_one_line(trial, tmp_path, capsys, table, message):
 
 def test_the_command_line_reads_a_folder_of_bags(tmp_path, capsys):
     for seed in (0, 3):
-        write_bag(tmp_path / f"bags/trial{seed}", "mcap", streams(shown("grasp", seed)), {**TOPICS, "needle": "/n"})
+        write_bag(
+            tmp_path / f"bags/trial{seed}",
+            "mcap",
+            streams(shown("grasp", seed)),
+            {**TOPICS, "needle": "/n"},
+        )
     (tmp_path / "bag.yaml").write_text(
         "bag: {drop_pauses: false, topics: {label: /subtask}}\nenv: {scene: {thread: 0}}"
     )
@@ -103,12 +133,15 @@ def test_the_command_line_reads_a_folder_of_bags(tmp_path, capsys):
     assert result["bags"] == 2
     assert result["tasks"]["grasp"]["episodes"] == 2
     assert result["tasks"]["grasp"]["pauses"] == 0
-    assert read_marker(tmp_path / "demos/grasp")["source"] == "bag"
+    assert read_marker(tmp_path / "demos/grasp")["demonstrator"] == "bag"
 
 
 def test_options_of_bags_are_refused_for_pickles(tmp_path, capsys):
     (tmp_path / "x.pkl").write_bytes(b"")
-    assert main(["import-demos", str(tmp_path / "x.pkl"), "--task", "grasp", "--topic", "needle=/n"]) == 2
+    assert (
+        main(["import-demos", str(tmp_path / "x.pkl"), "--task", "grasp", "--topic", "needle=/n"])
+        == 2
+    )
     assert "--topic is of bags" in capsys.readouterr().err
     assert main(["import-demos", str(tmp_path), "--task", "grasp"]) == 2
     assert "a folder without bags" in capsys.readouterr().err
@@ -126,7 +159,10 @@ def test_missing_and_packed_bags_are_told(tmp_path):
         import_bags([tmp_path / "nothing.bag"], task="grasp", out=tmp_path / "demos")
     bag = write_bag(tmp_path / "trial", "db3", streams(shown("grasp")))
     table = yaml.safe_load((bag / "metadata.yaml").read_text())
-    table["rosbag2_bagfile_information"] |= {"compression_mode": "FILE", "compression_format": "zstd"}
+    table["rosbag2_bagfile_information"] |= {
+        "compression_mode": "FILE",
+        "compression_format": "zstd",
+    }
     (bag / "metadata.yaml").write_text(yaml.safe_dump(table))
     with pytest.raises(BadFile, match="unpack it first"):
         import_bags([bag], task="grasp", out=tmp_path / "demos")

@@ -12,7 +12,14 @@ from surgicai_vision.core.errors import BadFile, InputError, OutputExists, Surgi
 from surgicai_vision.demos import record as recording
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.rollout import Disturbance, roll
-from surgicai_vision.demos.store import Demo, list_demos, read_demo, read_marker, write_demo, write_marker
+from surgicai_vision.demos.store import (
+    Demo,
+    list_demos,
+    read_demo,
+    read_marker,
+    write_demo,
+    write_marker,
+)
 
 CONFIG = TaskConfig(max_steps=12)
 
@@ -21,7 +28,7 @@ CONFIG = TaskConfig(max_steps=12)
 def fake(monkeypatch):
     """Record from the stand-in environment, in this process."""
     monkeypatch.setattr(recording, "_env", lambda config: FakeEnv(config))
-    monkeypatch.setattr(recording, "SOURCES", {"expert": "fake_env:FakeExpert"})
+    monkeypatch.setattr(recording, "DEMONSTRATORS", {"expert": "fake_env:FakeExpert"})
 
 
 @pytest.fixture
@@ -56,7 +63,9 @@ def test_noise_is_executed_and_the_label_is_the_experts(tmp_path):
         np.testing.assert_array_equal(env.get_state(), state)
         np.testing.assert_array_equal(FakeExpert(env).action(), label)
         env.step(executed)
-    np.testing.assert_array_equal(roll(env, FakeExpert(env), 3, disturbance=Disturbance(0.2)).demo.state, noisy.state)
+    np.testing.assert_array_equal(
+        roll(env, FakeExpert(env), 3, disturbance=Disturbance(0.2)).demo.state, noisy.state
+    )
 
 
 def test_each_episode_draws_its_own_noise_within_the_range():
@@ -65,14 +74,20 @@ def test_each_episode_draws_its_own_noise_within_the_range():
     demos = [roll(env, FakeExpert(env), seed, disturbance=spread).demo for seed in range(12)]
     off = [np.abs(demo.executed - demo.action)[:, 1:6].mean() for demo in demos]
     assert max(off) > 1.5 * min(off) > 0, "episodes differ in their noise"
-    even = [roll(env, FakeExpert(env), seed, disturbance=Disturbance(0.6)).demo for seed in range(12)]
-    assert np.mean(off) < np.mean([np.abs(demo.executed - demo.action)[:, 1:6].mean() for demo in even])
+    even = [
+        roll(env, FakeExpert(env), seed, disturbance=Disturbance(0.6)).demo for seed in range(12)
+    ]
+    assert np.mean(off) < np.mean(
+        [np.abs(demo.executed - demo.action)[:, 1:6].mean() for demo in even]
+    )
 
 
 def test_the_range_of_noise_reaches_the_recording(tmp_path):
     """It did not: the jobs were given the largest noise alone."""
     config = TaskConfig("grasp", max_steps=100)
-    calm = record(config, episodes=2, out=tmp_path / "a", disturbance=Disturbance(0.6, noise_from=0.0))
+    calm = record(
+        config, episodes=2, out=tmp_path / "a", disturbance=Disturbance(0.6, noise_from=0.0)
+    )
     loud = record(config, episodes=2, out=tmp_path / "b", disturbance=Disturbance(0.6))
     for one, other in zip(calm, loud, strict=True):
         one, other = read_demo(one), read_demo(other)
@@ -82,12 +97,17 @@ def test_the_range_of_noise_reaches_the_recording(tmp_path):
 def test_an_episode_lingers_after_its_success():
     env = FakeEnv(CONFIG)
     plain = roll(env, FakeExpert(env), 3).demo
-    longer = roll(env, FakeExpert(env), 3, linger=4).demo
+    longer = roll(env, FakeExpert(env), 3, post_success_steps=4).demo
     assert len(longer.action) == len(plain.action) + 4
     np.testing.assert_array_equal(longer.state[: len(plain.state)], plain.state)
-    assert not longer.success[: len(plain.action) - 1].any() and longer.success[len(plain.action) - 1]
+    assert (
+        not longer.success[: len(plain.action) - 1].any() and longer.success[len(plain.action) - 1]
+    )
     short = FakeEnv(dataclasses.replace(CONFIG, max_steps=len(plain.action) + 1))
-    assert len(roll(short, FakeExpert(short), 3, linger=4).demo.action) == len(plain.action) + 1, "up to the limit"
+    assert (
+        len(roll(short, FakeExpert(short), 3, post_success_steps=4).demo.action)
+        == len(plain.action) + 1
+    ), "up to the limit"
 
 
 class Patient(FakeEnv):
@@ -101,18 +121,31 @@ class Patient(FakeEnv):
 
 def test_a_recovery_starts_elsewhere_and_its_push_is_not_recorded():
     env = Patient(dataclasses.replace(CONFIG, max_steps=60))
-    pushed = [roll(env, FakeExpert(env), seed, disturbance=Disturbance(recoveries=0.5)).demo for seed in range(20)]
+    pushed = [
+        roll(env, FakeExpert(env), seed, disturbance=Disturbance(perturb_start_fraction=0.5)).demo
+        for seed in range(20)
+    ]
     starts = [int(demo.state[0, 2]) for demo in pushed]
     assert 4 <= sum(start > 0 for start in starts) <= 16
     assert {start for start in starts if start} <= set(range(8, 26))
     # A push that ends the episode is undone: the start stays as it was.
     short = FakeEnv(CONFIG)
     for seed in range(20):
-        start = roll(short, FakeExpert(short), seed, disturbance=Disturbance(recoveries=1.0)).demo.state[0, 2]
+        start = roll(
+            short, FakeExpert(short), seed, disturbance=Disturbance(perturb_start_fraction=1.0)
+        ).demo.state[0, 2]
         assert start < CONFIG.max_steps
 
 
-@pytest.mark.parametrize("wrong", [{"noise": -0.1}, {"noise": float("nan")}, {"recoveries": 1.1}, {"noise_from": 0.1}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"noise": -0.1},
+        {"noise": float("nan")},
+        {"perturb_start_fraction": 1.1},
+        {"noise_from": 0.1},
+    ],
+)
 def test_a_senseless_disturbance_is_refused(wrong):
     with pytest.raises(InputError, match="within 0 and"):
         Disturbance(**wrong)
@@ -121,7 +154,9 @@ def test_a_senseless_disturbance_is_refused(wrong):
 def test_disturbed_recordings_are_another_request(tmp_path, fake):
     calm = record(CONFIG, episodes=2, out=tmp_path / "calm", seed=1, workers=0)
     disturbed = Disturbance(noise=0.1)
-    noisy = record(CONFIG, episodes=2, out=tmp_path / "noisy", seed=1, workers=0, disturbance=disturbed)
+    noisy = record(
+        CONFIG, episodes=2, out=tmp_path / "noisy", seed=1, workers=0, disturbance=disturbed
+    )
     assert read_demo(calm[0]).executed is None
     assert read_demo(noisy[0]).executed is not None
     assert "noise" not in read_marker(tmp_path / "calm")["request"]
@@ -177,7 +212,12 @@ def test_folder_without_marker_or_with_a_gap_is_refused(tmp_path, demo):
 def test_record_skips_failed_seeds_and_writes_them_down(tmp_path, fake):
     seen = []
     paths = record(
-        CONFIG, episodes=6, seed=0, out=tmp_path / "demos", workers=0, progress=lambda *row: seen.append(row)
+        CONFIG,
+        episodes=6,
+        seed=0,
+        out=tmp_path / "demos",
+        workers=0,
+        progress=lambda *row: seen.append(row),
     )
     demos = [read_demo(path) for path in paths]
     skipped = [row["seed"] for row in read_marker(tmp_path / "demos")["skipped"]]
@@ -219,11 +259,15 @@ def test_record_continues_where_it_was_stopped(tmp_path, fake, monkeypatch):
 
 def test_record_gives_up_on_an_expert_that_fails(tmp_path, fake, monkeypatch):
     monkeypatch.setattr(FakeExpert, "action", lambda self: np.zeros(7, np.float32))
-    with pytest.raises(SurgicaiError, match=r"succeeded at 0 of \d+ starts of grasp; 2 were wanted \(seed 0: no"):
+    with pytest.raises(
+        SurgicaiError, match=r"succeeded at 0 of \d+ starts of grasp; 2 were wanted \(seed 0: no"
+    ):
         record(CONFIG, episodes=2, out=tmp_path / "demos", workers=0)
 
 
 @pytest.mark.parametrize(("episodes", "seed"), [(0, 0), (-3, 0), (1, -1)])
 def test_record_refuses_senseless_numbers(tmp_path, episodes, seed):
-    with pytest.raises(InputError, match=f"episodes is {episodes}, seed {seed}, linger 0"):
+    with pytest.raises(
+        InputError, match=f"episodes is {episodes}, seed {seed}, post_success_steps 0"
+    ):
         record(CONFIG, episodes=episodes, seed=seed, out=tmp_path / "demos")

@@ -60,7 +60,13 @@ def test_movement_primitives_print_the_share_that_succeeds(text, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     assert main(["record-demos", "--task", "place", "--episodes", "1", "--workers", "1"]) == 0
     capsys.readouterr()
-    (line,) = re.findall(r"^    surgicai-vision (record-demos .*--source dmp.*)$", text, re.MULTILINE)
+    (line,) = re.findall(
+        r"^    surgicai-vision (record-demos .*--demonstrator dmp.*)$", text, re.MULTILINE
+    )
     words = line.replace("--episodes 50", "--episodes 2").split()
     assert main([*words, "--workers", "1", "--out", "dmp"]) == 0
-    assert re.search(r"^2/\d+ starts succeeded \(95 % interval \d+% to \d+%\)", capsys.readouterr().out, re.MULTILINE)
+    assert re.search(
+        r"^2/\d+ starts succeeded \(95 % interval \d+% to \d+%\)",
+        capsys.readouterr().out,
+        re.MULTILINE,
+    )

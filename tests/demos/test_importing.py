@@ -1,4 +1,6 @@
-"""Importing SurgicAI's recordings: what comes in is checked, what comes out stands where the recording says."""
+"""Importing SurgicAI's recordings: what comes in is checked, what comes out stands where the
+recording says.
+"""
 
 import dataclasses
 import os
@@ -53,7 +55,11 @@ def transitions(episodes=2, step="shipped", start=START, goal=GOAL, close=True):
                     "achieved_goal": pose.astype(np.float32),
                     "desired_goal": target.astype(np.float32),
                 }
-            row |= {"action": action, "reward": np.array([-0.1], np.float32), "done": np.array([float(done)])}
+            row |= {
+                "action": action,
+                "reward": np.array([-0.1], np.float32),
+                "done": np.array([float(done)]),
+            }
             rows.append({**row, "info": {"is_success": bool(done)}})
             now = after
             if done:
@@ -75,8 +81,15 @@ def test_imported_states_stand_at_the_recorded_poses(tmp_path, recording):
     import surgicai_vision.envs as envs
 
     seen = []
-    summary = import_demos(recording, task="handoff", out=tmp_path / "demos", progress=lambda *row: seen.append(row))
-    assert (len(summary.paths), summary.step, summary.disagreeing, summary.skipped) == (2, "shipped", 0, ())
+    summary = import_demos(
+        recording, task="handoff", out=tmp_path / "demos", progress=lambda *row: seen.append(row)
+    )
+    assert (len(summary.paths), summary.step, summary.disagreeing, summary.skipped) == (
+        2,
+        "shipped",
+        0,
+        (),
+    )
     assert seen == [(1, 2, "episodes"), (2, 2, "episodes")]
     episodes = split(surgicai_pickle.read(recording))
     env = envs.make(read_demo(summary.paths[0]).config)
@@ -96,7 +109,9 @@ def test_imported_states_stand_at_the_recorded_poses(tmp_path, recording):
             transform = replay.needle_path(episode, "handoff")[0]
             np.testing.assert_allclose(env.needle_pose()[:3], transform[:3, 3], atol=1e-6)
         above = np.linalg.inv(transform) @ point[:, 3]
-        np.testing.assert_allclose(above[:3] - needle.point(np.radians(105.0)), [0, 0, 0.005], atol=1e-6)
+        np.testing.assert_allclose(
+            above[:3] - needle.point(np.radians(105.0)), [0, 0, 0.005], atol=1e-6
+        )
 
 
 def test_actions_move_our_arm_along_the_recorded_path(tmp_path, recording):
@@ -125,7 +140,9 @@ def test_importing_again_does_nothing_and_another_file_is_refused(tmp_path, reco
 
 @pytest.mark.parametrize("task", ["grasp", "place", "insert", "pullout"])
 def test_a_task_the_motion_contradicts_is_refused(tmp_path, recording, task):
-    with pytest.raises(InputError, match=f"no {task}: it moves psm1 .* 0.80 rad; that fits handoff"):
+    with pytest.raises(
+        InputError, match=f"no {task}: it moves psm1 .* 0.80 rad; that fits handoff"
+    ):
         import_demos(recording, task=task, out=tmp_path / "demos")
     assert not (tmp_path / "demos").exists()
 
@@ -154,9 +171,13 @@ def test_the_step_preset_is_inferred_and_deviations_counted(step):
 def test_a_step_that_is_no_preset_gets_the_smallest_larger_one():
     """The first release's insertions: 0.25 mm, 2°."""
     episodes = split(as_arrays(transitions(1, "paper")))
-    finer = dataclasses.replace(episodes[0], pose=episodes[0].pose * np.array([0.5, 0.5, 0.5, 1, 1, 1, 1]))
+    finer = dataclasses.replace(
+        episodes[0], pose=episodes[0].pose * np.array([0.5, 0.5, 0.5, 1, 1, 1, 1])
+    )
     assert infer_step([finer]) == ("paper", 0)
-    coarser = dataclasses.replace(episodes[0], pose=episodes[0].pose * np.array([8, 8, 8, 1, 1, 1, 1]))
+    coarser = dataclasses.replace(
+        episodes[0], pose=episodes[0].pose * np.array([8, 8, 8, 1, 1, 1, 1])
+    )
     with pytest.raises(InputError, match="No step size explains the motion"):
         infer_step([coarser])
 
@@ -164,7 +185,9 @@ def test_a_step_that_is_no_preset_gets_the_smallest_larger_one():
 def test_the_yaw_goes_the_short_way():
     episode = split(as_arrays(transitions(1)))[0]
     yaw = np.linspace(3.0, 3.0 - 4.2, len(episode.pose))
-    wound = dataclasses.replace(episode, pose=np.column_stack([episode.pose[:, :5], yaw, episode.pose[:, 6]]))
+    wound = dataclasses.replace(
+        episode, pose=np.column_stack([episode.pose[:, :5], yaw, episode.pose[:, 6]])
+    )
     short = unwound(wound)
     assert (is_wound(wound), is_wound(short)) == (True, False)
     assert is_wound(episode) is False
@@ -182,14 +205,19 @@ def test_actions_that_do_not_fit_the_inferred_step_get_a_larger_one():
     count = len(episode.pose)
     turning = episode.pose.copy()
     turning[:, 4] = 0.9
-    turning[:, 3], turning[:, 5] = np.radians(1.5) * np.arange(count), -np.radians(1.5) * np.arange(count)
+    turning[:, 3], turning[:, 5] = (
+        np.radians(1.5) * np.arange(count),
+        -np.radians(1.5) * np.arange(count),
+    )
     assert roomy([dataclasses.replace(episode, pose=turning)], "paper") == "released"
 
 
 def as_arrays(rows):
     return {
         "observation": np.stack([row["obs"]["observation"] for row in rows]).astype(float),
-        "next_observation": np.stack([row["next_obs"]["observation"] for row in rows]).astype(float),
+        "next_observation": np.stack([row["next_obs"]["observation"] for row in rows]).astype(
+            float
+        ),
         "action": np.stack([row["action"] for row in rows]),
         "reward": np.array([row["reward"][0] for row in rows]),
         "done": np.array([row["done"][0] for row in rows]),
@@ -209,7 +237,9 @@ BAD = {
     "a dictionary": lambda: {"obs": 1},
     "an array": lambda: np.zeros((5, 21)),
     "numbers": lambda: [1, 2, 3],
-    "no action": lambda: [{key: value for key, value in transitions(1)[0].items() if key != "action"}],
+    "no action": lambda: [
+        {key: value for key, value in transitions(1)[0].items() if key != "action"}
+    ],
     "short action": lambda: altered(action=np.zeros(6)),
     "text action": lambda: altered(action="abc"),
     "nan": lambda: altered(action=np.full(7, np.nan)),
@@ -242,13 +272,19 @@ def test_what_is_no_recording_is_one_line(tmp_path, content):
 def test_npz_with_objects_or_bombs_is_refused(tmp_path):
     arrays = as_arrays(transitions(1))
     arrays["is_success"] = arrays.pop("success")
-    good, objects, bomb, short = (tmp_path / f"{name}.npz" for name in ("good", "objects", "bomb", "short"))
+    good, objects, bomb, short = (
+        tmp_path / f"{name}.npz" for name in ("good", "objects", "bomb", "short")
+    )
     np.savez(good, **arrays)
     assert read_foreign(good)["action"].shape == arrays["action"].shape
     np.savez(objects, **{**arrays, "action": np.array([os.system, None], dtype=object)})
     np.savez_compressed(bomb, **{**arrays, "action": np.zeros((2_000_000, 7))})
     np.savez(short, action=arrays["action"])
-    for path, message in ((objects, "not a readable npz"), (bomb, "unpacks to more"), (short, "has no array done")):
+    for path, message in (
+        (objects, "not a readable npz"),
+        (bomb, "unpacks to more"),
+        (short, "has no array done"),
+    ):
         with pytest.raises(BadFile, match=message):
             read_foreign(path)
 
@@ -303,7 +339,7 @@ def test_what_the_child_cannot_finish_is_a_bad_file(tmp_path, recording, monkeyp
         read_foreign(recording)
 
 
-# -- SurgicAI's own recordings ----------------------------------------------------------------------------------------
+# -- SurgicAI's own recordings ---------------------------------------------------------------------
 
 SETS = {
     "grasp": "approach_v2",
@@ -338,14 +374,17 @@ def test_needle_poses_agree_with_those_derived_independently(shared, task):
     start = 0
     for episode in split(surgicai_pickle.read(path)):
         poses = replay.needle_path(episode, task)[:-1]
-        # 0.1 mm and 1e-4 of a rotation's elements: the derivation had float32 and rounded hole poses.
+        # 0.1 mm and 1e-4 of a rotation's elements: the derivation had float32 and rounded hole
+        # poses.
         np.testing.assert_allclose(poses, derived[start : start + len(poses)], atol=1e-4)
         start += len(poses)
     assert start == len(derived)
 
 
 def test_the_original_pickle_is_imported_whole(tmp_path, shared):
-    summary = import_demos(shared / "surgicai/regrasp_all_episodes_merged.pkl", task="handoff", out=tmp_path / "demos")
+    summary = import_demos(
+        shared / "surgicai/regrasp_all_episodes_merged.pkl", task="handoff", out=tmp_path / "demos"
+    )
     assert (len(summary.paths), summary.steps, summary.step) == (50, 3300, "shipped")
     assert (summary.disagreeing, summary.clipped, summary.skipped) == (0, 0, ())
     assert read_marker(tmp_path / "demos")["task"] == "handoff"
@@ -353,6 +392,8 @@ def test_the_original_pickle_is_imported_whole(tmp_path, shared):
 
 
 def test_insertions_that_turn_the_long_way_are_imported_too(tmp_path, shared):
-    summary = import_demos(shared / "surgicai/surgicai_insert_v2.npz", task="insert", out=tmp_path / "demos")
+    summary = import_demos(
+        shared / "surgicai/surgicai_insert_v2.npz", task="insert", out=tmp_path / "demos"
+    )
     assert (len(summary.paths), summary.skipped, summary.clipped) == (50, (), 0)
     assert summary.unwound == 25

@@ -1,7 +1,9 @@
-"""Two hundred malformed and malicious inputs: each is refused with one line, and nothing in it runs.
+"""Two hundred malformed and malicious inputs: each is refused with one line, and nothing in it
+runs.
 
-Made here, by format: pickle, npz and bags (recordings), safetensors (demonstrations), parquet (datasets), YAML
-(options). An audit hook sees every process, socket and write that a reader would start.
+Made here, by format: pickle, npz and bags (recordings), safetensors (demonstrations), parquet
+(datasets), YAML (options). An audit hook sees every process, socket and write that a reader would
+start.
 """
 
 import io
@@ -57,7 +59,11 @@ COUNTS = {"pickle": 0, "npz": 0, "safetensors": 0, "parquet": 0, "yaml": 0, "bag
 def _hook(event, arguments):
     if not WATCH["on"]:
         return
-    writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+    writes = (
+        event == "open"
+        and isinstance(arguments[2], int)
+        and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+    )
     if event.startswith(FORBIDDEN) or writes:
         WATCH["seen"].append((event, str(arguments)[:100]))
 
@@ -130,10 +136,16 @@ def pickles(trace):
     cases = {}
     for protocol in (0, 2, 4, 5):
         for name, call in evil_calls(trace).items():
-            row = [transition(reward=call)] if name != "getattr" else [transition(reward=Call(getattr, "a", "upper"))]
+            row = (
+                [transition(reward=call)]
+                if name != "getattr"
+                else [transition(reward=Call(getattr, "a", "upper"))]
+            )
             cases[f"{name} {protocol}"] = pickle.dumps(row, protocol)
     whole = pickle.dumps([transition()] * 3, 4)
-    cases.update({f"cut {size}": whole[:size] for size in (0, 1, 2, 10, 50, len(whole) // 2, len(whole) - 1)})
+    cases.update(
+        {f"cut {size}": whole[:size] for size in (0, 1, 2, 10, 50, len(whole) // 2, len(whole) - 1)}
+    )
     plain = {
         "number": 3,
         "text": "x",
@@ -279,7 +291,9 @@ def demonstrations():
         "header of nothing": tensors(table, body, 0),
         "no json": struct.pack("<Q", 4) + b"}{][" + body,
         "a list": tensors([1, 2], body),
-        "no metadata": tensors({key: row for key, row in table.items() if key != "__metadata__"}, body),
+        "no metadata": tensors(
+            {key: row for key, row in table.items() if key != "__metadata__"}, body
+        ),
         "other metadata": tensors({**table, "__metadata__": {"demo": "3"}}, body),
         "metadata no json": tensors({**table, "__metadata__": {"demo": "{"}}, body),
         "no action": tensors({key: row for key, row in table.items() if key != "action"}, body),
@@ -302,7 +316,9 @@ def demonstrations():
         "not finite": tensors(table, np.full(len(body) // 8 + 1, np.nan).tobytes()[: len(body)]),
         "pickle": pickle.dumps(Call(os.system, "true")),
     }
-    cases.update({f"cut {size}": whole[:size] for size in (1, 7, 8, 9, 100, len(whole) // 2, len(whole) - 1)})
+    cases.update(
+        {f"cut {size}": whole[:size] for size in (1, 7, 8, 9, 100, len(whole) // 2, len(whole) - 1)}
+    )
     return cases
 
 
@@ -325,13 +341,15 @@ def parquet_bytes(table):
     return buffer.getvalue()
 
 
-def pictures_of(table, content):
-    """Return the table with another content in its first picture."""
+def images_of(table, content):
+    """Return the table with another content in its first image."""
     key = names.image_key("front")
     rows = table.column(key).to_pylist()
     rows[0] = {"bytes": content, "path": "/etc/passwd"}
     field = table.field(key)
-    return parquet_bytes(table.set_column(table.schema.get_field_index(key), field, pa.array(rows, field.type)))
+    return parquet_bytes(
+        table.set_column(table.schema.get_field_index(key), field, pa.array(rows, field.type))
+    )
 
 
 def data_files(dataset):
@@ -355,20 +373,31 @@ def data_files(dataset):
         "a pickle": pickle.dumps(Call(os.system, "true")),
         "pages of noughts": whole[:4] + bytes(len(whole) - footer - 12) + whole[-8 - footer :],
     }
-    for size in (3, 8, 100, len(whole) // 4, len(whole) // 2, len(whole) - 9, len(whole) - 4, len(whole) - 1):
+    for size in (
+        3,
+        8,
+        100,
+        len(whole) // 4,
+        len(whole) // 2,
+        len(whole) - 9,
+        len(whole) - 4,
+        len(whole) - 1,
+    ):
         cases[f"cut {size}"] = whole[:size]
     for key in (names.ACTION, names.STATE, names.image_key("front"), "index", names.SEED):
         cases[f"no {key}"] = parquet_bytes(table.drop_columns([key]))
     for key in (names.ACTION, "index", names.REWARD):
         text = pa.array(["os.system"] * len(table))
-        cases[f"text in {key}"] = parquet_bytes(table.set_column(table.schema.get_field_index(key), key, text))
+        cases[f"text in {key}"] = parquet_bytes(
+            table.set_column(table.schema.get_field_index(key), key, text)
+        )
     wrong = {
         "rubbish": b"\x89PNG\r\n\x1a\n" + bytes(40),
         "script": b"#!/bin/sh\ntouch /tmp/x",
         "none": None,
         "void": b"",
     }
-    cases.update({f"picture: {name}": pictures_of(table, content) for name, content in wrong.items()})
+    cases.update({f"image: {name}": images_of(table, content) for name, content in wrong.items()})
     for place in range(4, len(whole) - footer - 300, (len(whole) - footer) // 6):
         cases[f"rubbish at {place}"] = whole[:place] + b"\xa5" * 200 + whole[place + 200 :]
     return cases
@@ -458,8 +487,16 @@ def test_yaml(tmp_path):
 def test_bags(tmp_path):
     trace = tmp_path / "trace"
     cases = {
-        **{f"ros1: {k}": v for k, v in on_disk(tmp_path / "1", ros1_bags(tmp_path / "a", str(trace)), "bag").items()},
-        **{f"mcap: {k}": v for k, v in on_disk(tmp_path / "2", mcaps(tmp_path / "b"), "mcap").items()},
+        **{
+            f"ros1: {k}": v
+            for k, v in on_disk(
+                tmp_path / "1", ros1_bags(tmp_path / "a", str(trace)), "bag"
+            ).items()
+        },
+        **{
+            f"mcap: {k}": v
+            for k, v in on_disk(tmp_path / "2", mcaps(tmp_path / "b"), "mcap").items()
+        },
         **{f"db3: {k}": v for k, v in databases(tmp_path / "3", str(trace)).items()},
     }
     sys.modules.pop("rosbags.usertypes", None)

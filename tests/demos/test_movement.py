@@ -61,11 +61,14 @@ def ends(demo):
 def apart(a, b):
     """Largest distance [m] and angle [rad] between two motions, sample by sample."""
     turns = turn_of(multiply(a.rotation, conjugate(b.rotation)))
-    return np.linalg.norm(a.position - b.position, axis=1).max(), np.linalg.norm(turns, axis=1).max()
+    return np.linalg.norm(a.position - b.position, axis=1).max(), np.linalg.norm(
+        turns, axis=1
+    ).max()
 
 
 @pytest.mark.parametrize(
-    ("samples", "cut"), [(8, False), (20, False), (60, False), (200, False), (20, True), (60, True), (200, True)]
+    ("samples", "cut"),
+    [(8, False), (20, False), (60, False), (200, False), (20, True), (60, True), (200, True)],
 )
 def test_reproduces_its_own_demonstration(samples, cut):
     whole = motion(samples)
@@ -115,7 +118,9 @@ def test_orientation_takes_the_short_way():
     straight = dataclasses.replace(learn([demo]), weights=np.zeros((80, 6)), drift=np.zeros(6))
     near = quaternion_of(np.array([0.0, 0.0, 1.0]))
     for goal in (near, -near):  # the same rotation, its quaternion from either half
-        played = play(straight.start(np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), goal), demo.dt, 80)
+        played = play(
+            straight.start(np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), goal), demo.dt, 80
+        )
         steps = turn_of(multiply(played.rotation[1:], conjugate(played.rotation[:-1])))
         assert np.linalg.norm(steps, axis=1).sum() == pytest.approx(1.0, abs=0.01)
 
@@ -136,7 +141,9 @@ def test_time_scales_and_the_path_stays():
 
 def test_filter_drops_slow_samples_only():
     demo = motion()
-    stopped = Motion(np.repeat(demo.position, 3, axis=0), np.repeat(demo.rotation, 3, axis=0), demo.dt)
+    stopped = Motion(
+        np.repeat(demo.position, 3, axis=0), np.repeat(demo.rotation, 3, axis=0), demo.dt
+    )
     np.testing.assert_array_equal(filtered(stopped).position, filtered(demo).position)
     for speed, turn, kept in ((0.9, 0.9, 1), (1.1, 0.9, 10), (0.9, 1.1, 10)):
         time = 0.02 * np.arange(10)[:, None]
@@ -169,21 +176,34 @@ turns = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
 @settings(max_examples=15, deadline=None)
 @given(shift=vectors, turn=turns, vector=turns)
 def test_a_moved_demonstration_gives_the_moved_path(shift, turn, vector):
-    """Round trip: learning in another frame and going back is learning here; and log is the inverse of exp."""
+    """Round trip: learning in another frame and going back is learning here; and log is the inverse
+    of exp.
+    """
     np.testing.assert_allclose(turn_of(quaternion_of(vector)), vector, atol=1e-12)
     demo, frame = motion(20), quaternion_of(turn)
     matrix = np.stack(
-        [turn_of(multiply(multiply(frame, quaternion_of(axis)), conjugate(frame))) for axis in np.eye(3)]
+        [
+            turn_of(multiply(multiply(frame, quaternion_of(axis)), conjugate(frame)))
+            for axis in np.eye(3)
+        ]
     )
-    moved = Motion(demo.position @ matrix + shift, multiply(np.broadcast_to(frame, (20, 4)), demo.rotation), demo.dt)
+    moved = Motion(
+        demo.position @ matrix + shift,
+        multiply(np.broadcast_to(frame, (20, 4)), demo.rotation),
+        demo.dt,
+    )
     here = play(learn([demo]).start(*ends(demo)), demo.dt, 19)
     there = play(learn([moved]).start(*ends(moved)), demo.dt, 19)
     np.testing.assert_allclose(there.position, here.position @ matrix + shift, atol=1e-9)
-    back = turn_of(multiply(there.rotation, conjugate(multiply(np.broadcast_to(frame, (20, 4)), here.rotation))))
+    back = turn_of(
+        multiply(
+            there.rotation, conjugate(multiply(np.broadcast_to(frame, (20, 4)), here.rotation))
+        )
+    )
     assert np.abs(back).max() < 1e-9
 
 
-# -- in the env -------------------------------------------------------------------------------------------------------
+# -- in the env ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +215,9 @@ def taught(tmp_path_factory):
         env = envs.make(TaskConfig(task))
         rollouts = (roll(env, Expert(env), seed) for seed in range(10))
         (folder / task).mkdir()
-        paths[task] = write_demo(folder / task, 0, next(one.demo for one in rollouts if one.success))
+        paths[task] = write_demo(
+            folder / task, 0, next(one.demo for one in rollouts if one.success)
+        )
     return paths
 
 
@@ -249,14 +271,19 @@ def test_refuses_lessons_that_do_not_fit(taught, tmp_path):
 
 def test_records_what_it_generates(taught, tmp_path):
     seed = read_demo(taught["insert"]).seed
-    out, given = tmp_path / "demos", {"source": "dmp", "demos": [taught["insert"]], "workers": 0}
+    out, given = (
+        tmp_path / "demos",
+        {"demonstrator": "dmp", "demos": [taught["insert"]], "workers": 0},
+    )
     paths = record(TaskConfig("insert"), episodes=3, seed=seed, out=out, **given)
     demos = [read_demo(path) for path in paths]
-    assert [demo.source for demo in demos] == ["dmp"] * 3
-    assert all(demo.success[-1] and demo.seed > seed for demo in demos), "the demonstration's own start is left out"
+    assert [demo.demonstrator for demo in demos] == ["dmp"] * 3
+    assert all(demo.success[-1] and demo.seed > seed for demo in demos), (
+        "the demonstration's own start is left out"
+    )
     assert len(read_marker(out)["request"]["demos"]) == 1
     with pytest.raises(InputError, match="learns from demonstrations"):
-        record(TaskConfig("insert"), episodes=1, out=tmp_path / "none", source="dmp")
+        record(TaskConfig("insert"), episodes=1, out=tmp_path / "none", demonstrator="dmp")
     with pytest.raises(InputError, match="learns from no demonstrations"):
         record(TaskConfig("insert"), episodes=1, out=tmp_path / "none", demos=[taught["insert"]])
 

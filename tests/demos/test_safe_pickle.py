@@ -1,4 +1,6 @@
-"""Pickles that are not trusted: arrays come out as they went in, everything else is refused and never run."""
+"""Pickles that are not trusted: arrays come out as they went in, everything else is refused and
+never run.
+"""
 
 import collections
 import io
@@ -43,7 +45,9 @@ def same(one, two):
 
 @pytest.mark.parametrize("protocol", [3, 4, 5])
 def test_arrays_and_containers_come_back(protocol):
-    tree = TREE if protocol < 5 else [{key: value for key, value in TREE[0].items() if key != "grid"}]
+    tree = (
+        TREE if protocol < 5 else [{key: value for key, value in TREE[0].items() if key != "grid"}]
+    )
     # Protocol 5 writes arrays through numpy's `_frombuffer`; read as protocol 4 was written.
     assert same(unpickle(pickle.dumps(tree, protocol=min(protocol, 4)), "x"), tree)
 
@@ -160,7 +164,8 @@ def test_bombs_are_refused():
     with pytest.raises(BadFile, match="nested deeper"):
         unpickle(deep, "x")
     doubled = assembled(
-        b"]\x94", b"".join(b"]\x94(" + b"h" + bytes([i]) + b"h" + bytes([i]) + b"e" for i in range(60))
+        b"]\x94",
+        b"".join(b"]\x94(" + b"h" + bytes([i]) + b"h" + bytes([i]) + b"e" for i in range(60)),
     )
     with pytest.raises(BadFile, match="nested deeper"):
         unpickle(doubled, "x")
@@ -175,7 +180,9 @@ def test_too_large_is_refused(monkeypatch):
         unpickle(pickle.dumps(TREE), "x")
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", b"\x80", b"\x80\x04.", b"PK\x03\x04", b"\x93NUMPY\x01\x00"])
+@pytest.mark.parametrize(
+    "content", [b"", b"hello", b"\x80", b"\x80\x04.", b"PK\x03\x04", b"\x93NUMPY\x01\x00"]
+)
 def test_what_is_no_pickle_is_a_bad_file(content):
     with pytest.raises(BadFile):
         unpickle(content, "x")
@@ -192,7 +199,9 @@ def test_truncated_is_a_bad_file(cut):
 
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(st.lists(st.tuples(st.integers(0, len(WHOLE) - 1), st.integers(0, 255)), min_size=1, max_size=8))
+@given(
+    st.lists(st.tuples(st.integers(0, len(WHOLE) - 1), st.integers(0, 255)), min_size=1, max_size=8)
+)
 def test_flipped_bytes_give_data_or_a_bad_file(changes):
     content = bytearray(WHOLE)
     for position, value in changes:
@@ -202,11 +211,13 @@ def test_flipped_bytes_give_data_or_a_bad_file(changes):
     except BadFile as error:
         assert "\n" not in str(error)  # noqa: PT017 (either outcome is right)
     else:
-        assert isinstance(tree, (list, dict, tuple, str, bytes, int, float, np.ndarray, np.generic, type(None)))
+        assert isinstance(
+            tree, (list, dict, tuple, str, bytes, int, float, np.ndarray, np.generic, type(None))
+        )
 
 
 def test_the_other_readers_of_files_know_no_pickle(root):
-    for part in ("demos", "dataset", "executor", "files.py"):
+    for part in ("demos", "dataset", "core"):
         path = root / "surgicai_vision" / part
         for source in path.rglob("*.py") if path.is_dir() else [path]:
             if source.name != "safe_pickle.py":

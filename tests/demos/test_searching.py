@@ -48,10 +48,14 @@ def test_it_meets_every_goal_and_reads_none() -> None:
 
 
 def test_its_demonstrations_show_every_attempt() -> None:
-    """They go on after the success, so that what a learner does after a failed attempt has been shown."""
+    """They go on after the success, so that what a learner does after a failed attempt has been
+    shown.
+    """
     env = envs.make(TaskConfig("grasp"))
     rollout = roll(env, Searcher(env), 500_000, "search")
-    assert rollout.success and len(rollout.demo) == env.config.max_steps and rollout.demo.success.any()
+    assert (
+        rollout.success and len(rollout.demo) == env.config.max_steps and rollout.demo.success.any()
+    )
     closing = rollout.demo.action[:, 6] < -0.5
     opening = rollout.demo.action[:, 6] > 0.5
     edges = range(Searcher.AGAIN, env.config.max_steps + 1, CLOCK_PERIOD)
@@ -77,7 +81,11 @@ class Stepped(FakeDataset):
         columns = super().columns()
         step = np.tile(np.arange(self.steps), self.episodes)
         clock = np.where(step >= self.steps // 2, 0.5, -0.5).astype(np.float32)
-        return {**columns, "timestamp": step / names.FPS, names.ACTION: np.repeat(clock[:, None], 7, axis=1)}
+        return {
+            **columns,
+            "timestamp": step / names.FPS,
+            names.ACTION: np.repeat(clock[:, None], 7, axis=1),
+        }
 
 
 class Still:

@@ -1,4 +1,6 @@
-"""Downloads of weights, against a server on this machine: resumed, hash checked, and given up at once."""
+"""Downloads of weights, against a server on this machine: resumed, hash checked, and given up at
+once.
+"""
 
 import hashlib
 import threading
@@ -98,7 +100,9 @@ def parts(folder: Path) -> list[Path]:
 def test_a_file_is_fetched_once_from_its_revision(hub: Hub, tmp_path: Path) -> None:
     path = find()
     assert path.read_bytes() == CONTENT and parts(tmp_path) == [path]
-    assert [asked[0] for asked in hub.asked] == [f"/{CARD.source}/resolve/{'a' * 40}/{CARD.filename}"]
+    assert [asked[0] for asked in hub.asked] == [
+        f"/{CARD.source}/resolve/{'a' * 40}/{CARD.filename}"
+    ]
     assert find() == path and len(hub.asked) == 1
     path.write_bytes(CONTENT[:-1] + b"?")
     with pytest.raises(BadFile, match="damaged"):
@@ -113,13 +117,19 @@ def test_a_transfer_that_breaks_off_goes_on_by_itself(hub: Hub) -> None:
 
 def test_another_call_goes_on_where_the_last_one_broke_off(hub: Hub, tmp_path: Path) -> None:
     hub.cuts = [120_000, 0]
-    with pytest.raises(MissingWeights, match=r"120000 of 300000 bytes.*the same command goes on.*imagenet-lite"):
+    with pytest.raises(
+        MissingWeights, match=r"120000 of 300000 bytes.*the same command goes on.*imagenet-lite"
+    ):
         find()
     (partial,) = parts(tmp_path)
     assert partial.read_bytes() == CONTENT[:120_000] and partial.suffix == ".partial"
     hub.asked.clear()
     path = find()
-    assert hub.asked[0][1] == "bytes=120000-" and parts(tmp_path) == [path] and path.read_bytes() == CONTENT
+    assert (
+        hub.asked[0][1] == "bytes=120000-"
+        and parts(tmp_path) == [path]
+        and path.read_bytes() == CONTENT
+    )
 
 
 def test_a_server_without_ranges_starts_over(hub: Hub) -> None:
@@ -132,7 +142,9 @@ def test_a_file_with_another_hash_is_deleted_and_refused(hub: Hub, tmp_path: Pat
     with pytest.raises(BadFile, match=f"expected {SHA256}; it was deleted"):
         find()
     assert parts(tmp_path) == []
-    with pytest.raises(BadFile, match="it was deleted"):  # an unpinned card takes the hub's own hash
+    with pytest.raises(
+        BadFile, match="it was deleted"
+    ):  # an unpinned card takes the hub's own hash
         find(replace(PINNED, sha256=None, revision="main"))
     hub.content = CONTENT
     assert find().read_bytes() == CONTENT
@@ -163,14 +175,24 @@ def test_without_a_network_the_alternatives_are_named_at_once(
 ) -> None:
     monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
     monkeypatch.setattr(download, "fetch", lambda *_: pytest.fail("the hub does not answer"))
-    with pytest.raises(MissingWeights, match=r"--weights FILE.*\$SURGICAI_VISION_WEIGHTS.*imagenet-lite") as caught:
+    with pytest.raises(
+        MissingWeights, match=r"--weights FILE.*\$SURGICAI_VISION_WEIGHTS.*imagenet-lite"
+    ) as caught:
         find()
-    assert SHA256 in str(caught.value) and parts(tmp_path) == [] and isinstance(caught.value, InputError)
+    assert (
+        SHA256 in str(caught.value)
+        and parts(tmp_path) == []
+        and isinstance(caught.value, InputError)
+    )
 
 
 def test_cards_say_what_is_pinned() -> None:
     from surgicai_vision.features.encoders import encoder_card, encoder_names
 
-    unpinned = {name for name in encoder_names() if not (card := encoder_card(name)).sha256 and card.filename}
+    unpinned = {
+        name
+        for name in encoder_names()
+        if not (card := encoder_card(name)).sha256 and card.filename
+    }
     assert unpinned == {"r3m-18", "r3m-34", "vc1"}
     assert "unpinned" in weights.missing_line(encoder_card("vc1"), OFFLINE)

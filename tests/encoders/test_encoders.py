@@ -26,8 +26,8 @@ def encoder(request: pytest.FixtureRequest) -> Iterator[Encoder]:
     return load_encoder(request.param)
 
 
-def pictures(count: int = 3, size: int = 224) -> np.ndarray:
-    """Smooth coloured pictures, each another."""
+def images(count: int = 3, size: int = 224) -> np.ndarray:
+    """Smooth coloured images, each another."""
     generator = np.random.default_rng(0)
     coarse = torch.from_numpy(generator.uniform(0, 255, (count, 3, 7, 7)).astype(np.float32))
     fine = torch.nn.functional.interpolate(coarse, (size, size), mode="bilinear")
@@ -39,14 +39,14 @@ def plain(colour: tuple[int, int, int]) -> np.ndarray:
 
 
 def test_feature_is_as_declared(encoder: Encoder) -> None:
-    features = encoder(pictures())
+    features = encoder(images())
     assert features.shape == (3, encoder.card.dim) and features.dtype == np.float32
     assert encoder.dim == encoder.card.dim == encoder.shape[0]
     assert np.isfinite(features).all() and features.std() > 0
 
 
-def test_same_picture_same_feature_in_any_batch(encoder: Encoder) -> None:
-    frames = pictures(20)
+def test_same_image_same_feature_in_any_batch(encoder: Encoder) -> None:
+    frames = images(20)
     together = encoder(frames)
     assert np.array_equal(together, encoder(frames))
     for at in (0, 7, 19):
@@ -55,35 +55,39 @@ def test_same_picture_same_feature_in_any_batch(encoder: Encoder) -> None:
 
 
 class Restless(torch.nn.Module):
-    """A network whose answer depends on how many pictures it is asked for at once."""
+    """A network whose answer depends on how many images it is asked for at once."""
 
     def __init__(self) -> None:
         super().__init__()
         self.asked: list[int] = []
 
-    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
-        self.asked.append(len(pictures))
-        return pictures.mean((2, 3)) + len(pictures)
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        self.asked.append(len(images))
+        return images.mean((2, 3)) + len(images)
 
 
-def test_left_over_pictures_are_padded_only_where_the_network_needs_it() -> None:
+def test_left_over_images_are_padded_only_where_the_network_needs_it() -> None:
     card = encoders.encoder_card("random")
-    frames = pictures(11)
+    frames = images(11)
     restless = Encoder(card, Restless(), dtype=torch.float32)
     together = restless(frames)
-    np.testing.assert_array_equal(np.concatenate([restless(frames[i : i + 1]) for i in range(11)]), together)
+    np.testing.assert_array_equal(
+        np.concatenate([restless(frames[i : i + 1]) for i in range(11)]), together
+    )
     network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten())
     calm = Encoder(card, network, dtype=torch.float32)
-    np.testing.assert_array_equal(np.concatenate([calm(frames[i : i + 1]) for i in range(11)]), calm(frames))
+    np.testing.assert_array_equal(
+        np.concatenate([calm(frames[i : i + 1]) for i in range(11)]), calm(frames)
+    )
     network.asked = []
     network.register_forward_pre_hook(lambda module, given: module.asked.append(len(given[0])))
     if calm._any_size:
         calm(frames)
-        assert sorted(network.asked) == [1, 2, 8], "every picture is computed once"
+        assert sorted(network.asked) == [1, 2, 8], "every image is computed once"
 
 
 def test_feature_survives_the_cache(encoder: Encoder) -> None:
-    features = encoder(pictures())
+    features = encoder(images())
     np.testing.assert_array_equal(features, features.astype(np.float16).astype(np.float32))
 
 
@@ -93,21 +97,23 @@ def test_red_and_blue_differ(encoder: Encoder) -> None:
 
 
 def test_frozen_for_good(encoder: Encoder) -> None:
-    """Nothing a training could do changes weights or buffers (the released code's BatchNorms drifted)."""
-    before, feature = encoder.state_sha256(), encoder(pictures())
+    """Nothing a training could do changes weights or buffers (the released code's BatchNorms
+    drifted).
+    """
+    before, feature = encoder.state_sha256(), encoder(images())
     network = encoder._network
     assert not any(parameter.requires_grad for parameter in network.parameters())
     network.train()
     for part in network.modules():
         part.train(True)
         assert not part.training
-    encoder(pictures(20))
+    encoder(images(20))
     assert encoder.state_sha256() == before
-    np.testing.assert_array_equal(encoder(pictures()), feature)
+    np.testing.assert_array_equal(encoder(images()), feature)
 
 
 def test_frames_of_other_sizes_are_resized_with_antialias(encoder: Encoder) -> None:
-    small, large = pictures(2, 224), pictures(2, 448)
+    small, large = images(2, 224), images(2, 448)
     near = encoder(large)
     assert np.linalg.norm(encoder(small) - near) < 0.3 * np.linalg.norm(near)
     stripes = np.zeros((1, 448, 448, 3), np.uint8)
@@ -117,7 +123,7 @@ def test_frames_of_other_sizes_are_resized_with_antialias(encoder: Encoder) -> N
 
 
 def test_normalisation_is_the_cards(encoder: Encoder) -> None:
-    card, frames = encoder.card, pictures(1)
+    card, frames = encoder.card, images(1)
     low, high = card.input_range
     wanted = (low + frames[0].astype(np.float64) / 255 * (high - low) - card.mean) / card.std
     got = encoder.preprocess(frames)[0].permute(1, 2, 0).cpu().numpy()
@@ -144,12 +150,20 @@ def test_no_frames_give_no_rows(encoder: Encoder) -> None:
 @pytest.mark.parametrize("name", encoder_names())
 def test_card_is_complete(name: str) -> None:
     card: EncoderCard = encoder_card(name)
-    assert card.name == name and card.architecture and card.source and card.revision and card.licence and card.paper
+    assert (
+        card.name == name
+        and card.architecture
+        and card.source
+        and card.revision
+        and card.licence
+        and card.paper
+    )
     assert "(global)" in card.layers
     assert card.channel_order == "RGB" and card.interpolation in ("bilinear", "bicubic")
     assert all(value > 0 for value in card.std) and card.dim > 0
     assert card.offline == (name in OFFLINE)
-    # The middle of the range must come out near zero: a mean in other units than its range does not.
+    # The middle of the range must come out near zero: a mean in other units than its range does
+    # not.
     middle = (sum(card.input_range) / 2 - np.array(card.mean)) / np.array(card.std)
     assert np.abs(middle).max() < 1
 
@@ -165,7 +179,8 @@ def test_r3m_takes_0_to_255_and_divides_itself() -> None:
 
 RANDOM_SHA256 = "4859e98433459ccf88d9ee47052477c9f921269164116b2b9f5b318f8a582b92"
 """State hash of `random` on x86-64. Regenerate:
-python -c "from surgicai_vision.features.encoders import load_encoder as l; print(l('random').weights_sha256)"."""
+python -c "from surgicai_vision.features.encoders import load_encoder as l;
+print(l('random').weights_sha256)"."""
 
 
 def test_random_is_reproducible_and_leaves_the_global_state() -> None:
@@ -179,7 +194,9 @@ def test_random_is_reproducible_and_leaves_the_global_state() -> None:
 
 
 def test_imagenet_lite_classifies() -> None:
-    """The tensors, mapped by position, are the trained network: it names what a photograph shows."""
+    """The tensors, mapped by position, are the trained network: it names what a photograph
+    shows.
+    """
     import timm
 
     from encoders.base import read_torch
@@ -188,8 +205,8 @@ def test_imagenet_lite_classifies() -> None:
     tensors = read_torch(packaged_file())
     network.load_state_dict(dict(zip(network.state_dict(), tensors.values(), strict=True)))
     with torch.inference_mode():
-        picture = torch.from_numpy(hopper()).permute(0, 3, 1, 2).float()
-        logits = network.eval()((picture - 127) / 128)
+        image = torch.from_numpy(hopper()).permute(0, 3, 1, 2).float()
+        logits = network.eval()((image - 127) / 128)
     assert int(logits.argmax()) == 652, "not 'military uniform'"
 
 
@@ -208,11 +225,17 @@ def test_early_features_are_the_whole_networks_on_the_way() -> None:
     whole = network_from(read_torch(packaged_file()), packaged_file()).eval()
     wanted = []
     whole.blocks[2].register_forward_hook(lambda module, given, answer: wanted.append(answer))
-    early = Encoder(*IMAGENET_LITE_EARLY.build(IMAGENET_LITE_EARLY.card, None), pool="spatial", dtype=torch.float32)
+    early = Encoder(
+        *IMAGENET_LITE_EARLY.build(IMAGENET_LITE_EARLY.card, None),
+        pool="spatial",
+        dtype=torch.float32,
+    )
     assert early.shape == (40, 28, 28)
     with torch.inference_mode():
         whole((torch.from_numpy(hopper()).permute(0, 3, 1, 2).float() - 127) / 128)
-    np.testing.assert_allclose(early(hopper()).reshape(1, 40, 28, 28), wanted[0].numpy(), rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(
+        early(hopper()).reshape(1, 40, 28, 28), wanted[0].numpy(), rtol=2e-3, atol=2e-3
+    )
 
 
 def test_unknown_encoder_suggests() -> None:
@@ -227,9 +250,17 @@ def test_missing_weights_are_named_at_once(monkeypatch: pytest.MonkeyPatch, tmp_
     started = time.monotonic()
     with pytest.raises(MissingWeights) as caught:
         load_encoder("r3m")
-    assert time.monotonic() - started < 30  # not a speed test: the hub client alone would retry for longer
+    assert (
+        time.monotonic() - started < 30
+    )  # not a speed test: the hub client alone would retry for longer
     line = str(caught.value)
-    for part in ("pytorch_model.bin", "surajnair/r3m-50", encoder_card("r3m").sha256, "--weights FILE", *OFFLINE):
+    for part in (
+        "pytorch_model.bin",
+        "surajnair/r3m-50",
+        encoder_card("r3m").sha256,
+        "--weights FILE",
+        *OFFLINE,
+    ):
         assert part in line
     assert "\n" not in line and "http" not in line
 

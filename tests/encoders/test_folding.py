@@ -1,4 +1,6 @@
-"""Folding BatchNorms: the answers stay, the passes go, and what does not run in order is left alone."""
+"""Folding BatchNorms: the answers stay, the passes go, and what does not run in order is left
+alone.
+"""
 
 import copy
 
@@ -33,9 +35,11 @@ def test_a_resnet_answers_as_before_without_one_batch_norm() -> None:
     before = copy.deepcopy(network.state_dict())
     folded = fold_batch_norms(network, 64)
     assert norms(network) == 20 and norms(folded) == 0
-    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items()), "the given one stays"
-    pictures = torch.randn(3, 3, 64, 64, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(folded(pictures), network(pictures), rtol=1e-4, atol=1e-4)
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items()), (
+        "the given one stays"
+    )
+    images = torch.randn(3, 3, 64, 64, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(folded(images), network(images), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", encoders.OFFLINE_ENCODERS)
@@ -52,8 +56,8 @@ class Backwards(nn.Module):
         self.convolution = nn.Conv2d(3, 3, 3)
         self.norm = nn.BatchNorm2d(3)
 
-    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
-        return self.convolution(self.norm(pictures))
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return self.convolution(self.norm(images))
 
 
 def test_what_stands_in_order_but_does_not_run_so_is_left_alone() -> None:

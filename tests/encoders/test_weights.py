@@ -1,4 +1,6 @@
-"""Weights: where they are found, which files are refused, and loaders on tables of the right names and shapes."""
+"""Weights: where they are found, which files are refused, and loaders on tables of the right names
+and shapes.
+"""
 
 from pathlib import Path
 
@@ -29,7 +31,10 @@ def saved(path: Path, content: object) -> Path:
 def r3m_file(path: Path, depth: int = 18) -> Path:
     """A file as R3M's: wrapped, with a data-parallel prefix and the heads we leave out."""
     tensors = table_of(timm.create_model(f"resnet{depth}", num_classes=0), "module.convnet.")
-    return saved(path, {"r3m": {**tensors, "module.lang_rew.pred.0.weight": torch.zeros(2, 2)}, "global_step": 7})
+    return saved(
+        path,
+        {"r3m": {**tensors, "module.lang_rew.pred.0.weight": torch.zeros(2, 2)}, "global_step": 7},
+    )
 
 
 def test_r3m_loader(tmp_path: Path) -> None:
@@ -41,23 +46,30 @@ def test_r3m_loader(tmp_path: Path) -> None:
     assert torch.allclose(got, wanted, rtol=1e-2)
 
 
-def test_clip_loader_takes_the_picture_tower(tmp_path: Path) -> None:
+def test_clip_loader_takes_the_image_tower(tmp_path: Path) -> None:
     import open_clip
 
     network = open_clip.create_model("ViT-B-32", load_weights=False, force_quick_gelu=True).visual
-    path = saved(tmp_path / "clip.bin", {**table_of(network, "visual."), "logit_scale": torch.zeros(())})
+    path = saved(
+        tmp_path / "clip.bin", {**table_of(network, "visual."), "logit_scale": torch.zeros(())}
+    )
     with pytest.warns(UserWarning, match="not the published"):
         encoder = load_encoder("clip", path)
     assert_stable(encoder, 512)
 
 
 def test_dinov2_loader_resamples_positions(tmp_path: Path) -> None:
-    path = saved(tmp_path / "dino.pth", table_of(timm.create_model("vit_small_patch14_dinov2", num_classes=0)))
+    path = saved(
+        tmp_path / "dino.pth",
+        table_of(timm.create_model("vit_small_patch14_dinov2", num_classes=0)),
+    )
     assert_stable(load_encoder("dinov2", path), 384)
 
 
 def test_vc1_loader_leaves_the_decoder_out(tmp_path: Path) -> None:
-    tensors = table_of(timm.create_model("vit_base_patch16_224", num_classes=0, global_pool="token"))
+    tensors = table_of(
+        timm.create_model("vit_base_patch16_224", num_classes=0, global_pool="token")
+    )
     extra = {"mask_token": torch.zeros(1, 1, 768), "decoder_embed.weight": torch.zeros(2, 2)}
     path = saved(tmp_path / "vc1.bin", {"model": {**tensors, **extra}})
     with pytest.raises(InputError, match="--accept-licence"):
@@ -74,7 +86,9 @@ def test_any_timm_network(tmp_path: Path) -> None:
 
 
 def assert_stable(encoder: Encoder, dim: int) -> None:
-    """Check the dimension, and that a feature depends neither on its batch nor on the thread count."""
+    """Check the dimension, and that a feature depends neither on its batch nor on the thread
+    count.
+    """
     frames = np.concatenate([np.roll(hopper(), 9 * shift, axis=2) for shift in range(11)])
     together = encoder(frames)
     assert together.shape == (11, dim) and encoder.card.dim == dim
@@ -89,22 +103,40 @@ def assert_stable(encoder: Encoder, dim: int) -> None:
 
 @pytest.mark.parametrize(
     ("name", "label", "probability"),
-    [("cat", 285, 0.73), ("coffee", 967, 0.994), ("palace", 698, 0.75)],  # Egyptian cat, espresso, palace
+    [
+        ("cat", 285, 0.73),
+        ("coffee", 967, 0.994),
+        ("palace", 698, 0.75),
+    ],  # Egyptian cat, espresso, palace
 )
-def test_known_imagenet_file_classifies(shared: Path, name: str, label: int, probability: float) -> None:
-    """Stride and statistics are the file's own: its classifier, on our features, says what is listed beside it."""
+def test_known_imagenet_file_classifies(
+    shared: Path, name: str, label: int, probability: float
+) -> None:
+    """Stride and statistics are the file's own: its classifier, on our features, says what is
+    listed beside it.
+    """
     path = known_file(shared)
     encoder, tensors = load_encoder("imagenet", path), load_file(path)
-    logits = torch.from_numpy(encoder(photograph(name))) @ tensors["fc.weight"].T + tensors["fc.bias"]
+    logits = (
+        torch.from_numpy(encoder(photograph(name))) @ tensors["fc.weight"].T + tensors["fc.bias"]
+    )
     probabilities = logits.softmax(1)[0]
     assert int(probabilities.argmax()) == label
-    assert float(probabilities.max()) == pytest.approx(probability, abs=0.04), "JPEG and bfloat16 cost up to 0.03"
+    assert float(probabilities.max()) == pytest.approx(probability, abs=0.04), (
+        "JPEG and bfloat16 cost up to 0.03"
+    )
     card = encoder.card
-    assert "conv1" in card.architecture and card.mean == (0.48502, 0.45795, 0.40760) and "Keras" in card.source
+    assert (
+        "conv1" in card.architecture
+        and card.mean == (0.48502, 0.45795, 0.40760)
+        and "Keras" in card.source
+    )
 
 
 def test_stride_decides_what_the_known_file_sees(shared: Path) -> None:
-    """With torchvision's stride the same tensors load and are less sure of the cat, by more than the test allows."""
+    """With torchvision's stride the same tensors load and are less sure of the cat, by more than
+    the test allows.
+    """
     card, network = imagenet.classifier(imagenet.CARD, known_file(shared))
     for stage in (network.layer2, network.layer3, network.layer4):
         stage[0].conv1.stride, stage[0].conv2.stride = (1, 1), (2, 2)
@@ -119,13 +151,17 @@ def known_file(shared: Path) -> Path:
     return path
 
 
-def test_folder_of_the_environment_finds_the_known_file(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_of_the_environment_finds_the_known_file(
+    shared: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(weights.FOLDER_VARIABLE, str(shared / "weights"))
     found = find_weights("imagenet")
     assert found is not None and found.name == "resnet50_keras_imagenet.safetensors"
 
 
-def test_order_and_hash_of_the_weights_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_order_and_hash_of_the_weights_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(weights.FOLDER_VARIABLE, str(tmp_path))
     with pytest.raises(MissingWeights):
         find_weights("r3m-18")

@@ -24,7 +24,9 @@ def in_jaws(env):
 
 
 def test_the_default_level_has_no_weld():
-    assert "psm2_attach" not in [build_scene().model.equality(index).name for index in range(build_scene().model.neq)]
+    assert "psm2_attach" not in [
+        build_scene().model.equality(index).name for index in range(build_scene().model.neq)
+    ]
 
 
 def test_the_needle_stays_without_friction():

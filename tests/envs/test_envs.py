@@ -1,4 +1,6 @@
-"""The environments' contract: gymnasium's own, determinism, the whole state in one vector, refusals."""
+"""The environments' contract: gymnasium's own, determinism, the whole state in one vector,
+refusals.
+"""
 
 import hashlib
 import subprocess
@@ -15,7 +17,7 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, SurgicaiError
 
-# -- gymnasium --------------------------------------------------------------------------------------------------------
+# -- gymnasium -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("obs_type", names.OBS_TYPES)
@@ -30,11 +32,11 @@ def test_gymnasium_accepts_every_env(task, obs_type):
     env.close()
 
 
-def test_render_gives_a_picture():
+def test_render_gives_a_image():
     env = gymnasium.make(names.ENV_IDS["grasp"], render_mode="rgb_array")
     env.reset(seed=0)
-    picture = env.render()
-    assert picture.shape == (480, 640, 3) and picture.dtype == np.uint8 and picture.std() > 10
+    image = env.render()
+    assert image.shape == (480, 640, 3) and image.dtype == np.uint8 and image.std() > 10
     env.close()
     assert make("grasp").render() is None
 
@@ -61,11 +63,11 @@ def test_an_episode_ends_at_its_limit_and_not_before(task):
     assert ends == [(False, False)] * 6 + [(False, True)]
 
 
-# -- determinism ------------------------------------------------------------------------------------------------------
+# -- determinism -----------------------------------------------------------------------------------
 
 TRAJECTORIES = """
 import sys
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = sys.argv[1:]
 from test_envs import fingerprint
 print(fingerprint())
 """
@@ -76,7 +78,11 @@ def fingerprint():
     total = hashlib.sha256()
     for task in names.TASKS:
         env = make(task)
-        rows = [env.reset(seed=11)[0], *(env.step(action)[0] for action in actions(25)), env.get_state()]
+        rows = [
+            env.reset(seed=11)[0],
+            *(env.step(action)[0] for action in actions(25)),
+            env.get_state(),
+        ]
         total.update(b"".join(row.tobytes() for row in rows))
     return total.hexdigest()
 
@@ -84,8 +90,16 @@ def fingerprint():
 def test_same_seed_same_trajectory_in_this_and_in_another_process(root):
     first = fingerprint()
     assert fingerprint() == first
-    command = [sys.executable, "-c", TRAJECTORIES, str(root / "tests" / "envs")]
-    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == first
+    command = [
+        sys.executable,
+        "-c",
+        TRAJECTORIES,
+        str(root / "tests" / "envs"),
+        str(root / "tests" / "helpers"),
+    ]
+    assert (
+        subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == first
+    )
 
 
 @pytest.mark.parametrize("task", names.TASKS)
@@ -106,8 +120,12 @@ def test_a_used_env_repeats_a_seed(task):
 
 @pytest.mark.parametrize("task", names.TASKS)
 def test_a_restored_state_has_the_same_future(task):
-    """From the middle of an episode, contacts and all: same observation, same future, bit for bit."""
-    steps = {"grasp": 50, "place": 30, "insert": 48, "handoff": 86, "pullout": 40, "suture": 345}[task]
+    """From the middle of an episode, contacts and all: same observation, same future, bit for
+    bit.
+    """
+    steps = {"grasp": 50, "place": 30, "insert": 48, "handoff": 86, "pullout": 40, "suture": 345}[
+        task
+    ]
     env, other = make(task), make(task)
     env.reset(seed=3)
     play(env, steps)
@@ -121,11 +139,13 @@ def test_a_restored_state_has_the_same_future(task):
         assert same(restored.observe(), seen)
         assert same(restored.measure(), info)
         assert np.array_equal(restored.get_state(), state)
-        assert all(same(restored.step(action)[0], row) for action, row in zip(done, future, strict=True))
+        assert all(
+            same(restored.step(action)[0], row) for action, row in zip(done, future, strict=True)
+        )
         assert np.array_equal(restored.get_state(), after)
 
 
-def test_a_restored_state_has_the_same_pictures():
+def test_a_restored_state_has_the_same_images():
     env = make("insert", obs_type="pixels_agent_pos")
     env.reset(seed=3)
     play(env, 30)
@@ -150,10 +170,16 @@ def test_wrong_states_are_refused():
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_vectorised_envs_are_single_envs(mode):
-    """Asynchronous ones with pictures: each worker makes its own OpenGL context."""
-    chosen = {"obs_type": "pixels_agent_pos", "cameras": ("back",), "image_size": 32} if mode == "async" else {}
+    """Asynchronous ones with images: each worker makes its own OpenGL context."""
+    chosen = (
+        {"obs_type": "pixels_agent_pos", "cameras": ("back",), "image_size": 32}
+        if mode == "async"
+        else {}
+    )
     kwargs = {"context": "spawn"} if mode == "async" else {}
-    vector = gymnasium.make_vec(names.ENV_IDS["place"], 2, vectorization_mode=mode, vector_kwargs=kwargs, **chosen)
+    vector = gymnasium.make_vec(
+        names.ENV_IDS["place"], 2, vectorization_mode=mode, vector_kwargs=kwargs, **chosen
+    )
     singles = [gymnasium.make(names.ENV_IDS["place"], **chosen) for _ in range(2)]
     moves = actions(2 * 10).reshape(10, 2, 7)
     try:
@@ -166,10 +192,12 @@ def test_vectorised_envs_are_single_envs(mode):
         vector.close()
 
 
-# -- refusals ---------------------------------------------------------------------------------------------------------
+# -- refusals --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wrong", [np.zeros(6), np.zeros(8), np.full(7, np.nan), np.array([np.inf] + [0.0] * 6)])
+@pytest.mark.parametrize(
+    "wrong", [np.zeros(6), np.zeros(8), np.full(7, np.nan), np.array([np.inf] + [0.0] * 6)]
+)
 def test_wrong_actions_are_refused(wrong):
     env = make("grasp")
     env.reset(seed=0)

@@ -119,7 +119,12 @@ def test_another_stitchs_hole_is_the_wrong_one_until_the_right_exit():
     pairs = PAIRS["simple"]
     lead_tip(gauge, *through(pairs[2].entry, True))
     assert gauge.wrong_hole and math.isnan(gauge.entry_error)
-    lead_tip(gauge, *through(pairs[2].entry, False), *through(pairs[0].entry, True), *through(pairs[0].exit, False))
+    lead_tip(
+        gauge,
+        *through(pairs[2].entry, False),
+        *through(pairs[0].entry, True),
+        *through(pairs[0].exit, False),
+    )
     assert not gauge.wrong_hole
 
 
@@ -145,7 +150,9 @@ def test_holes_move_with_a_shifted_phantom():
 def test_a_jump_is_no_passage():
     _, gauge = started()
     simulation = gauge._env.simulation
-    for point in through(PAIRS["simple"][0].entry, True) * 1.0 + np.array([[0, 0, 2e-3], [0, 0, -2e-3]]):
+    for point in through(PAIRS["simple"][0].entry, True) * 1.0 + np.array(
+        [[0, 0, 2e-3], [0, 0, -2e-3]]
+    ):
         pose = np.array(simulation.needle())
         pose[:3] += point - np.array(simulation.needle_point(needle.TIP_ANGLE))
         simulation.pose_needle(tuple(pose))
@@ -165,7 +172,9 @@ def test_crossing_has_a_direction_and_an_opening():
 
 
 def test_the_thread_does_not_press():
-    bare, threaded = (Plate(envs.make(TaskConfig(scene=SceneConfig(thread=count))).model) for count in (0, 10))
+    bare, threaded = (
+        Plate(envs.make(TaskConfig(scene=SceneConfig(thread=count))).model) for count in (0, 10)
+    )
     assert threaded._model.ngeom > bare._model.ngeom
     assert threaded._presses.sum() == bare._presses.sum()
 

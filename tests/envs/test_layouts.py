@@ -53,7 +53,8 @@ def test_the_straight_wound_can_be_stitched(task):
 
 def test_the_expert_recovers_from_seeded_noise():
     first, again, other = (
-        solved("place", SceneConfig(), noise=0.4, rng=np.random.default_rng(seed)) for seed in (1, 1, 2)
+        solved("place", SceneConfig(), noise=0.4, rng=np.random.default_rng(seed))
+        for seed in (1, 1, 2)
     )
     assert first[0]
     assert other[0]

@@ -1,4 +1,6 @@
-"""What the envs show: nothing shared, nothing constant, nothing privileged; starts, and the reward of goals."""
+"""What the envs show: nothing shared, nothing constant, nothing privileged; starts, and the reward
+of goals.
+"""
 
 import numpy as np
 import pytest
@@ -11,16 +13,22 @@ from surgicai_vision.demos.expert import Expert
 from surgicai_vision.scene import needle
 
 GOAL_JAW = 13
-"""The one constant of the 21 values: the goal's jaw is closed in every subtask (released code's layout)."""
+"""The one constant of the 21 values: the goal's jaw is closed in every subtask (released code's
+layout).
+"""
 
 
-# -- observations -----------------------------------------------------------------------------------------------------
+# -- observations ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("obs_type", names.OBS_TYPES)
 def test_observations_share_no_memory(obs_type):
     env = make("grasp", obs_type=obs_type)
-    rows = [flat(env.reset(seed=0)[0]), flat(env.step(np.ones(7, np.float32))[0]), flat(env.observe())]
+    rows = [
+        flat(env.reset(seed=0)[0]),
+        flat(env.step(np.ones(7, np.float32))[0]),
+        flat(env.observe()),
+    ]
     buffers = [env.data.qpos, env.data.xpos, env.data.ctrl]
     for index, row in enumerate(rows):
         for part in row.values():
@@ -49,20 +57,25 @@ def test_the_21_values_are_pose_goal_and_error():
     env = make("grasp")
     seen, info = env.reset(seed=0)
     tool = env.agent_pos()
-    assert np.allclose(seen[:3], tool[:3] * 100, atol=1e-4) and np.allclose(seen[3:7], tool[3:], atol=1e-6)
+    assert np.allclose(seen[:3], tool[:3] * 100, atol=1e-4) and np.allclose(
+        seen[3:7], tool[3:], atol=1e-6
+    )
     assert np.allclose(seen[14:17], seen[7:10] - seen[:3], atol=1e-4)
     assert np.linalg.norm(seen[17:20]) == pytest.approx(info["d_angle"], abs=1e-5)
 
 
 @pytest.mark.parametrize(("depth", "segmentation"), [(False, False), (True, True)])
 @pytest.mark.parametrize("obs_type", ["pixels", "pixels_agent_pos"])
-def test_vision_holds_pictures_and_proprioception_only(obs_type, depth, segmentation):
+def test_vision_holds_images_and_proprioception_only(obs_type, depth, segmentation):
     cameras = ("front", "wrist_psm2")
     config = TaskConfig("grasp")
     env = envs.make(config, obs_type, cameras, (24, 32), depth=depth, segmentation=segmentation)
     seen, _ = env.reset(seed=0)
     expected = {f"pixels.{camera}": ((24, 32, 3), np.uint8) for camera in cameras}
-    for group, dtype, chosen in (("depth", np.float32, depth), ("segmentation", np.uint8, segmentation)):
+    for group, dtype, chosen in (
+        ("depth", np.float32, depth),
+        ("segmentation", np.uint8, segmentation),
+    ):
         expected |= {f"{group}.{camera}": ((24, 32, 1), dtype) for camera in cameras if chosen}
     if obs_type == "pixels_agent_pos":
         expected["agent_pos"] = ((7,), np.float32)
@@ -73,7 +86,9 @@ def test_vision_holds_pictures_and_proprioception_only(obs_type, depth, segmenta
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_proprioception_does_not_know_the_needle(task):
-    """Move the needle and every goal with it, arms fixed: pictures change, the tool's numbers do not."""
+    """Move the needle and every goal with it, arms fixed: images change, the tool's numbers do
+    not.
+    """
     env = make(task, obs_type="pixels_agent_pos")
     seen, _ = env.reset(seed=0)
     qpos = env.data.qpos.copy()
@@ -85,11 +100,15 @@ def test_proprioception_does_not_know_the_needle(task):
     assert not np.array_equal(moved["pixels"]["back"], seen["pixels"]["back"])
 
 
-# -- starts -----------------------------------------------------------------------------------------------------------
+# -- starts ----------------------------------------------------------------------------------------
 
 TOUCHING = {
     "grasp": {("needle", "phantom")},
-    "place": {("needle", "psm2"), ("needle", "phantom"), ("phantom", "psm2")},  # taken from the tissue
+    "place": {
+        ("needle", "psm2"),
+        ("needle", "phantom"),
+        ("phantom", "psm2"),
+    },  # taken from the tissue
     "insert": {("needle", "psm2")},
     "handoff": {("needle", "psm2"), ("needle", "phantom")},
     "pullout": {("needle", "psm1"), ("needle", "phantom")},
@@ -106,7 +125,10 @@ def test_starts_are_physical_and_differ(task):
     for seed in range(40):
         seen, info = env.reset(seed=seed)
         first.append(seen)
-        parts = [[model.body(model.geom_bodyid[geom]).name for geom in contact.geom] for contact in data.contact]
+        parts = [
+            [model.body(model.geom_bodyid[geom]).name for geom in contact.geom]
+            for contact in data.contact
+        ]
         touching = {tuple(sorted(name.split("_")[0] for name in pair)) for pair in parts}
         assert touching <= TOUCHING[task]
         assert min(contact.dist for contact in data.contact) > -0.0004  # [m]: the jaws' soft grip
@@ -138,7 +160,7 @@ def test_the_needle_starts_where_the_released_code_puts_it():
     assert (np.abs(rows.mean(axis=0)) < 0.25 * half).all()
 
 
-# -- rewards ----------------------------------------------------------------------------------------------------------
+# -- rewards ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("tolerance", ["paper", "released"])
@@ -155,11 +177,15 @@ def test_compute_reward_is_the_reward(task, reward, tolerance):
         infos.append(info)
         if ended:
             break
-    achieved, desired = (np.array([row[key] for row in rows]) for key in ("achieved_goal", "desired_goal"))
+    achieved, desired = (
+        np.array([row[key] for row in rows]) for key in ("achieved_goal", "desired_goal")
+    )
     vectorised = env.compute_reward(achieved, desired, infos)
     assert vectorised.shape == (len(rows),)
     assert np.allclose(vectorised, rewards, rtol=0, atol=1e-6)
-    assert env.compute_reward(achieved[0], desired[0], infos[0]) == pytest.approx(rewards[0], abs=1e-6)
+    assert env.compute_reward(achieved[0], desired[0], infos[0]) == pytest.approx(
+        rewards[0], abs=1e-6
+    )
     expected = [-(info["d_trans"] + info["d_angle"] / 10) for info in infos]
     if reward == "sparse":
         expected = [0.0 if info["is_success"] else -1.0 for info in infos]
@@ -169,7 +195,9 @@ def test_compute_reward_is_the_reward(task, reward, tolerance):
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_the_goals_pose_alone_is_no_reward(task):
-    """Jaws closed on nothing, holes not passed: a needle put to its goal is rewarded where nothing else is asked."""
+    """Jaws closed on nothing, holes not passed: a needle put to its goal is rewarded where nothing
+    else is asked.
+    """
     env = make(task, obs_type="goal")
     seen, _ = env.reset(seed=1)
     achieved, desired = seen["desired_goal"].copy(), seen["desired_goal"]

@@ -1,4 +1,6 @@
-"""Randomisation: each axis changes what it should, from the seed alone, in a model of the env's own, and restores."""
+"""Randomisation: each axis changes what it should, from the seed alone, in a model of the env's
+own, and restores.
+"""
 
 import dataclasses
 import math
@@ -45,10 +47,12 @@ def played(env, seed, steps=10):
     """The observations of some random actions."""
     rng = np.random.default_rng(seed)
     seen = [env.reset(seed=seed)[0]]
-    return np.array(seen + [env.step(rng.uniform(-1, 1, 7).astype(np.float32))[0] for _ in range(steps)])
+    return np.array(
+        seen + [env.step(rng.uniform(-1, 1, 7).astype(np.float32))[0] for _ in range(steps)]
+    )
 
 
-def picture(env):
+def image(env):
     """What the front camera sees."""
     return env.observe()["pixels"]["front"]
 
@@ -64,7 +68,10 @@ def test_limits_are_refused_and_named(axis):
 def test_configuration_goes_through_plain_data():
     config = TaskConfig(randomisation=EVERYTHING)
     assert from_mapping(TaskConfig, to_mapping(config)) == config
-    assert envs.make_task("grasp", randomisation=to_mapping(EVERYTHING)).config.randomisation == EVERYTHING
+    assert (
+        envs.make_task("grasp", randomisation=to_mapping(EVERYTHING)).config.randomisation
+        == EVERYTHING
+    )
 
 
 def test_off_shares_the_model_and_draws_nothing():
@@ -77,7 +84,10 @@ def test_off_shares_the_model_and_draws_nothing():
 def test_an_axis_owns_its_model_and_leaves_the_shared_one_alone():
     env = envs.make(TaskConfig(randomisation=EVERYTHING))
     shared = build_scene(env.config.scene).model
-    before = {name: np.copy(getattr(shared, name)) for name in ("cam_pos", "geom_size", "mat_rgba", "mesh_vert")}
+    before = {
+        name: np.copy(getattr(shared, name))
+        for name in ("cam_pos", "geom_size", "mat_rgba", "mesh_vert")
+    }
     env.reset(seed=0)
     assert env.model is not shared
     for name, values in before.items():
@@ -99,18 +109,32 @@ def test_one_more_axis_leaves_the_draws_of_the_others():
     alone = randomisation.draw(RandomisationConfig(friction=0.2), rng(0))
     both = randomisation.draw(RandomisationConfig(friction=0.2, light=0.2), rng(0))
     assert len(alone) == len(both) == randomisation.SIZE
-    assert sum(a != b for a, b in zip(alone, both, strict=True)) == len(randomisation.UNITS["light"])
+    assert sum(a != b for a, b in zip(alone, both, strict=True)) == len(
+        randomisation.UNITS["light"]
+    )
 
 
 @pytest.mark.parametrize(
-    "axis", ["light", "colour", "camera_shift", "camera_turn", "camera_fovy", "needle_thickness", "needle_size"]
+    "axis",
+    [
+        "light",
+        "colour",
+        "camera_shift",
+        "camera_turn",
+        "camera_fovy",
+        "needle_thickness",
+        "needle_size",
+    ],
 )
-def test_an_axis_of_sight_changes_pictures(axis):
-    plain, changed = made(obs_type="pixels"), made(obs_type="pixels", **{axis: RANDOMISATION_LIMITS[axis] / 4})
+def test_an_axis_of_sight_changes_images(axis):
+    plain, changed = (
+        made(obs_type="pixels"),
+        made(obs_type="pixels", **{axis: RANDOMISATION_LIMITS[axis] / 4}),
+    )
     changed.reset(seed=1)
     plain.reset(seed=1)
     plain.set_state(changed.data.qpos, changed.data.qvel)
-    assert not np.array_equal(picture(plain), picture(changed))
+    assert not np.array_equal(image(plain), image(changed))
 
 
 def test_restored_elsewhere_it_looks_and_moves_the_same():
@@ -125,7 +149,9 @@ def test_restored_elsewhere_it_looks_and_moves_the_same():
     other.set_state_vector(one.get_state())
     for _ in range(4):
         for view in ("front", "back"):
-            np.testing.assert_array_equal(one.observe()["pixels"][view], other.observe()["pixels"][view])
+            np.testing.assert_array_equal(
+                one.observe()["pixels"][view], other.observe()["pixels"][view]
+            )
         np.testing.assert_array_equal(one.get_state(), other.get_state())
         assert one.measure()["d_trans"] == other.measure()["d_trans"]
         action = rng.uniform(-1, 1, 7).astype(np.float32)
@@ -155,7 +181,9 @@ def test_the_phantom_moves_with_its_goals():
     assert np.linalg.norm(shift) > 1e-4
     body = moved.named("body", "phantom")
     np.testing.assert_allclose(moved.data.xpos[body] - plain.data.xpos[body], shift, atol=1e-12)
-    np.testing.assert_allclose(np.subtract(moved.stitch.place_tip[:3], plain.stitch.place_tip[:3]), shift, atol=1e-12)
+    np.testing.assert_allclose(
+        np.subtract(moved.stitch.place_tip[:3], plain.stitch.place_tip[:3]), shift, atol=1e-12
+    )
 
 
 def test_the_endoscope_moves_as_one():
@@ -176,7 +204,9 @@ def test_a_thicker_needle_lies_higher():
 
 
 def test_a_needles_size_is_that_of_its_arc_its_mass_and_its_stitch():
-    """What collides, what is drawn, the tip that passage watches and the goals all lie on the arc that was drawn."""
+    """What collides, what is drawn, the tip that passage watches and the goals all lie on the arc
+    that was drawn.
+    """
     axes = {"randomisation": RandomisationConfig(needle_size=0.1), "scene": SceneConfig(thread=10)}
     env, plain = envs.make(TaskConfig("insert", **axes)), build_scene(SceneConfig(thread=10)).model
     radii = set()
@@ -189,17 +219,27 @@ def test_a_needles_size_is_that_of_its_arc_its_mass_and_its_stitch():
         for index in env.scene.needle_geoms:
             way = data.geom_xmat[index].reshape(3, 3)[:, 2] * model.geom_size[index, 1]
             for end in (data.geom_xpos[index] + way, data.geom_xpos[index] - way):
-                assert np.linalg.norm(pose[:3, :3].T @ (end - pose[:3, 3])) == pytest.approx(radius, abs=1e-9)
+                assert np.linalg.norm(pose[:3, :3].T @ (end - pose[:3, 3])) == pytest.approx(
+                    radius, abs=1e-9
+                )
         tip = env.simulation.needle_point(needle.TIP_ANGLE)
         np.testing.assert_allclose(data.site("needle_tip").xpos, tip, atol=1e-9)
-        np.testing.assert_allclose(data.body("thread_0").xpos, env.simulation.needle_point(0.0), atol=1e-9)
-        entry, leave = (np.array(hole.centre) for hole in (env.stitch.pair.entry, env.stitch.pair.exit))
+        np.testing.assert_allclose(
+            data.body("thread_0").xpos, env.simulation.needle_point(0.0), atol=1e-9
+        )
+        entry, leave = (
+            np.array(hole.centre) for hole in (env.stitch.pair.entry, env.stitch.pair.exit)
+        )
         for hole in (entry, leave):
             assert np.linalg.norm(hole - env.stitch.centre) == pytest.approx(radius, abs=1e-9)
         mesh = slice(
-            model.mesh("needle").vertadr[0], model.mesh("needle").vertadr[0] + model.mesh("needle").vertnum[0]
+            model.mesh("needle").vertadr[0],
+            model.mesh("needle").vertadr[0] + model.mesh("needle").vertnum[0],
         )
-        longer = np.ptp(model.mesh_vert[mesh], axis=0).max() - np.ptp(plain.mesh_vert[mesh], axis=0).max()
+        longer = (
+            np.ptp(model.mesh_vert[mesh], axis=0).max()
+            - np.ptp(plain.mesh_vert[mesh], axis=0).max()
+        )
         chord = 2 * needle.RADIUS * math.sin(needle.TIP_ANGLE / 2)
         assert longer == pytest.approx((size - 1.0) * chord, abs=5e-5)
         body = model.body("needle").id
@@ -228,7 +268,9 @@ def test_the_expert_threads_needles_of_any_size(task, seed):
 def test_a_size_that_leaves_no_room_for_the_stitch_is_refused():
     scene = SceneConfig(layout="3dmed_straight", hole_pair=4)
     with pytest.raises(InputError, match="needle_size"):
-        envs.make(TaskConfig("insert", scene=scene, randomisation=RandomisationConfig(needle_size=0.1)))
+        envs.make(
+            TaskConfig("insert", scene=scene, randomisation=RandomisationConfig(needle_size=0.1))
+        )
     envs.make(TaskConfig("grasp", scene=scene, randomisation=RandomisationConfig(needle_size=0.1)))
 
 
@@ -272,8 +314,12 @@ def test_the_fast_state_vector_equals_the_plain_one():
             fast = env.step(rng.uniform(-1, 1, 7).astype(np.float32))[0]
             arm, tip = env.subtask.arm, env.simulation.tip(env.subtask.arm)
             achieved, desired = env.subtask.target(env.simulation, env.stitch)
-            goal = env.simulation.to_base(arm, poses.compose(desired, poses.relative(achieved, tip)))
-            plain = observation.state_vector(arm, env.simulation.to_base(arm, tip), goal, env.simulation.jaw(arm))
+            goal = env.simulation.to_base(
+                arm, poses.compose(desired, poses.relative(achieved, tip))
+            )
+            plain = observation.state_vector(
+                arm, env.simulation.to_base(arm, tip), goal, env.simulation.jaw(arm)
+            )
             np.testing.assert_allclose(fast, plain, atol=2e-5)
 
 

@@ -1,4 +1,6 @@
-"""Success: what must not count does not, and a physics error never does. Each fraud is shown beside the honest way."""
+"""Success: what must not count does not, and a physics error never does. Each fraud is shown beside
+the honest way.
+"""
 
 import dataclasses
 import math
@@ -27,7 +29,9 @@ def put(env, pose):
 
 
 def drag(env, path):
-    """Move the needle along `path` under the judge's eyes, with no physics in the way; return the measurement."""
+    """Move the needle along `path` under the judge's eyes, with no physics in the way; return the
+    measurement.
+    """
     for pose in path:
         put(env, pose)
         hole_crossing.watch(env.simulation, env.simulation.memory, env.stitch.pair)
@@ -41,9 +45,14 @@ def shifted(pose, shift):
 
 
 def turning(stitch, first, last, shift=(0.0, 0.0, 0.0)):
-    """Needle poses on the circle from angle `first` to `last` in the entry [deg], 3° (half a mm) apart."""
+    """Needle poses on the circle from angle `first` to `last` in the entry [deg], 3° (half a mm)
+    apart.
+    """
     count = int(abs(last - first) / 3) + 2
-    return [shifted(stitch.on_arc(math.radians(angle)), shift) for angle in np.linspace(first, last, count)]
+    return [
+        shifted(stitch.on_arc(math.radians(angle)), shift)
+        for angle in np.linspace(first, last, count)
+    ]
 
 
 def sliding(pose, shift):
@@ -69,7 +78,7 @@ def start(task, **fields):
     return env
 
 
-# -- insert -----------------------------------------------------------------------------------------------------------
+# -- insert ----------------------------------------------------------------------------------------
 
 
 def test_the_circle_through_both_holes_is_an_insertion():
@@ -104,13 +113,21 @@ def test_tunnelling_beside_the_holes_does_not_count(side):
     angle = inserted_angle(env)
     beside = drag(env, turning(env.stitch, 130.0, angle, side * ASIDE))
     assert beside["d_trans"] < 0.005 and beside["holes_passed"] == 0 and not beside["is_success"]
-    info = drag(env, sliding(shifted(env.stitch.on_arc(math.radians(angle)), side * ASIDE), -side * ASIDE))
-    assert near(env, info) and hole_crossing.in_both(env.simulation, env.stitch.pair) and not info["is_success"]
+    info = drag(
+        env, sliding(shifted(env.stitch.on_arc(math.radians(angle)), side * ASIDE), -side * ASIDE)
+    )
+    assert (
+        near(env, info)
+        and hole_crossing.in_both(env.simulation, env.stitch.pair)
+        and not info["is_success"]
+    )
 
 
 @pytest.mark.parametrize("depth", [-0.0005, 0.0005])
 def test_dragging_along_the_entrys_plane_does_not_count(depth):
-    """The tip dips below the plane beside the opening and is dragged under it, or is dragged over it."""
+    """The tip dips below the plane beside the opening and is dragged under it, or is dragged over
+    it.
+    """
     env = start("insert")
     outward = env.stitch.pair.entry.rotation[:, 2]
     beside = shifted(env.stitch.place(), ASIDE + 0.002 * outward)
@@ -121,12 +138,20 @@ def test_dragging_along_the_entrys_plane_does_not_count(depth):
 
 def test_the_wrong_way_round_does_not_count():
     env = start("insert")
-    info = drag(env, turning(env.stitch, -2 * math.degrees(env.stitch.half) - 5.0, inserted_angle(env)))
-    assert near(env, info) and hole_crossing.in_both(env.simulation, env.stitch.pair) and not info["is_success"]
+    info = drag(
+        env, turning(env.stitch, -2 * math.degrees(env.stitch.half) - 5.0, inserted_angle(env))
+    )
+    assert (
+        near(env, info)
+        and hole_crossing.in_both(env.simulation, env.stitch.pair)
+        and not info["is_success"]
+    )
 
 
 def test_a_needle_torn_out_of_the_entry_alone_does_not_count():
-    """Honestly through both holes, then turned by 8° about the exit, through the tissue beside the entry."""
+    """Honestly through both holes, then turned by 8° about the exit, through the tissue beside the
+    entry.
+    """
     env = start("insert")
     inserted = turning(env.stitch, 130.0, inserted_angle(env))
     path = [*inserted, *sliding(inserted[-1], (0.0, 0.0015, 0.0))]
@@ -148,7 +173,7 @@ def test_another_pair_does_not_count():
     assert drag(env, turning(other, 130.0, inserted_angle(env)))["holes_passed"] == 0
 
 
-# -- pull-out ---------------------------------------------------------------------------------------------------------
+# -- pull-out --------------------------------------------------------------------------------------
 
 
 def to_the_end(env, pose):
@@ -191,7 +216,11 @@ def test_a_needle_torn_through_the_tissue_does_not_count(way):
     torn = sliding(env.stitch.inserted(), way)
     info = drag(env, [*torn, *sliding(torn[-1], (0.0, 0.0, 0.020))])
     info = drag(env, to_the_end(env, shifted(torn[-1], (0.0, 0.0, 0.020))))
-    assert near(env, info) and hole_crossing.is_out(env.simulation, env.stitch.pair) and not info["is_success"]
+    assert (
+        near(env, info)
+        and hole_crossing.is_out(env.simulation, env.stitch.pair)
+        and not info["is_success"]
+    )
 
 
 def test_a_needle_drawn_back_does_not_count():
@@ -226,13 +255,15 @@ def test_the_closed_form_is_the_naive_test():
     assert found.min() > 50
 
 
-# -- grasps -----------------------------------------------------------------------------------------------------------
+# -- grasps ----------------------------------------------------------------------------------------
 
 GRASPS = {"grasp": (names.PSM2, None), "handoff": (names.PSM1, HANDOFF_ANGLE)}
 
 
 def jaws_at_the_grasp(task, jaw, measured, needle_shift=(0.0, 0.0, 0.0)):
-    """Measure with the jaws at the grasp's pose; needle, free in the air, `needle_shift` away in its own frame."""
+    """Measure with the jaws at the grasp's pose; needle, free in the air, `needle_shift` away in
+    its own frame.
+    """
     env = start(task)
     simulation, (arm, angle) = env.simulation, GRASPS[task]
     pose = env.stitch.inserted() if task == "handoff" else poses.square(simulation.needle())
@@ -267,7 +298,7 @@ def test_jaws_closed_on_nothing_are_no_grasp(task, away):
     assert not info["is_success"]
 
 
-# -- laws -------------------------------------------------------------------------------------------------------------
+# -- laws ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -278,7 +309,9 @@ def moved_world(monkeypatch):
         def moved(hole):
             return holes.Hole(tuple(np.add(hole.centre, shift)), hole.tilt)
 
-        pairs = tuple(holes.HolePair(moved(pair.entry), moved(pair.exit)) for pair in holes.PAIRS["simple"])
+        pairs = tuple(
+            holes.HolePair(moved(pair.entry), moved(pair.exit)) for pair in holes.PAIRS["simple"]
+        )
         monkeypatch.setitem(holes.PAIRS, "simple", pairs)
         build_scene.cache_clear()
 
@@ -293,14 +326,18 @@ def carry_over(source, target, shift):
     for arm in names.ARMS:
         tip = poses.square(one.tip(arm))
         tip[:3, 3] += shift
-        other.pose_arm(arm, other.to_base(arm, poses.flat(tip)), one.commands[arm].jaw, one.jaw(arm))
+        other.pose_arm(
+            arm, other.to_base(arm, poses.flat(tip)), one.commands[arm].jaw, one.jaw(arm)
+        )
     put(target, shifted(poses.square(one.needle()), shift))
     other.memory = dataclasses.replace(one.memory)
 
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_success_does_not_change_when_the_world_is_moved(task, moved_world):
-    """Holes, tools and needle 3 mm and -6 mm away: every measure of the first and the last state is the same."""
+    """Holes, tools and needle 3 mm and -6 mm away: every measure of the first and the last state is
+    the same.
+    """
     shift = np.array([0.003, -0.006, 0.0])
     here = make(task)
     here.reset(seed=1)
@@ -313,13 +350,17 @@ def test_success_does_not_change_when_the_world_is_moved(task, moved_world):
     measured = []
     for state in states:
         here.set_state_vector(state)
-        carry_over(here, here, np.zeros(3))  # as in the moved world: the same joints from the inverse kinematics
+        carry_over(
+            here, here, np.zeros(3)
+        )  # as in the moved world: the same joints from the inverse kinematics
         measured.append(here.measure())
     assert [info["is_success"] for info in measured] == [False, True]
     moved_world(shift)
     there = make(task)
     there.reset(seed=1)
-    assert np.allclose(there.stitch.pair.entry.centre - np.array(here.stitch.pair.entry.centre), shift)
+    assert np.allclose(
+        there.stitch.pair.entry.centre - np.array(here.stitch.pair.entry.centre), shift
+    )
     for state, expected in zip(states, measured, strict=True):
         here.set_state_vector(state)
         carry_over(here, there, shift)
@@ -356,7 +397,9 @@ def told_to_go_far(data, body):
 
 @pytest.mark.parametrize("after", [0, 5])
 @pytest.mark.parametrize("task", ["grasp", "handoff", "suture"])
-@pytest.mark.parametrize("attack", [huge, not_a_number, blown_away, torn, told_nonsense, told_to_go_far])
+@pytest.mark.parametrize(
+    "attack", [huge, not_a_number, blown_away, torn, told_nonsense, told_to_go_far]
+)
 def test_divergence_is_an_error_and_never_a_success(task, attack, after, monkeypatch, tmp_path):
     """MuJoCo resets itself silently, even in the first step of an episode."""
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings into the working folder

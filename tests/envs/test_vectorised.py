@@ -1,4 +1,6 @@
-"""Vectorised: make_vec, sync, async and with our own workers, gives what single envs give, infos included."""
+"""Vectorised: make_vec, sync, async and with our own workers, gives what single envs give, infos
+included.
+"""
 
 import gymnasium
 import numpy as np
@@ -39,7 +41,10 @@ def make_vec(task, mode, count=2, **arguments):
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     ("task", "arguments"),
-    [("insert", {}), ("suture", {"randomisation": {"friction": 0.2, "kinematic_error": 0.5, "latency": 1}})],
+    [
+        ("insert", {}),
+        ("suture", {"randomisation": {"friction": 0.2, "kinematic_error": 0.5, "latency": 1}}),
+    ],
 )
 def test_a_vector_env_gives_the_trajectories_of_single_envs(mode, task, arguments):
     env_id = names.ENV_IDS[task]
@@ -66,7 +71,7 @@ def test_a_vector_env_gives_the_trajectories_of_single_envs(mode, task, argument
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_pictures_of_workers_are_those_of_single_envs(mode):
+def test_images_of_workers_are_those_of_single_envs(mode):
     arguments = {"obs_type": "pixels_agent_pos", "cameras": ("front",), "image_size": 48}
     vector = make_vec("place", mode, **arguments)
     try:
@@ -74,8 +79,12 @@ def test_pictures_of_workers_are_those_of_single_envs(mode):
         observation = vector.step(actions()[0])[0]
         expected = [alone(names.ENV_IDS["place"], index, **arguments)[1][0] for index in range(2)]
         for index in range(2):
-            np.testing.assert_array_equal(observation["agent_pos"][index], expected[index]["agent_pos"])
-            np.testing.assert_array_equal(observation["pixels"]["front"][index], expected[index]["pixels"]["front"])
+            np.testing.assert_array_equal(
+                observation["agent_pos"][index], expected[index]["agent_pos"]
+            )
+            np.testing.assert_array_equal(
+                observation["pixels"]["front"][index], expected[index]["pixels"]["front"]
+            )
     finally:
         vector.close()
 
@@ -99,16 +108,24 @@ def test_importing_registers_every_id():
 
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
 def test_shares_of_envs_are_one_sync_vector(autoreset):
-    """Three envs on two workers, over ends of episodes: the same as in this process, infos and masks included."""
+    """Three envs on two workers, over ends of episodes: the same as in this process, infos and
+    masks included.
+    """
     arguments = {"max_steps": 3, "autoreset_mode": autoreset, "randomisation": {"friction": 0.2}}
-    ours, plain = (gymnasium.make_vec(names.ENV_IDS["place"], 3, workers=workers, **arguments) for workers in (2, 0))
+    ours, plain = (
+        gymnasium.make_vec(names.ENV_IDS["place"], 3, workers=workers, **arguments)
+        for workers in (2, 0)
+    )
     try:
         pairs = [(ours.reset(seed=5), plain.reset(seed=5))]
         for batch in np.random.default_rng(1).uniform(-1, 1, (8, 3, 7)).astype(np.float32):
             pairs.append((ours.step(batch), plain.step(batch)))
         mask = np.array([True, False, False])
         pairs.append(
-            (ours.reset(options={"reset_mask": mask}, seed=9), plain.reset(options={"reset_mask": mask}, seed=9))
+            (
+                ours.reset(options={"reset_mask": mask}, seed=9),
+                plain.reset(options={"reset_mask": mask}, seed=9),
+            )
         )
         for one, other in pairs:
             assert_same(one, other)
@@ -137,7 +154,9 @@ def assert_same(one, other):
 
 
 def test_a_workers_error_and_its_death_are_told():
-    """The error is the one of a single env; a killed worker is named; after both the vector env is closed."""
+    """The error is the one of a single env; a killed worker is named; after both the vector env is
+    closed.
+    """
     vector = make_vec("place", "workers")
     vector.reset(seed=0)
     with pytest.raises(InputError, match="7 finite numbers"):
@@ -151,7 +170,9 @@ def test_a_workers_error_and_its_death_are_told():
         vector.reset(seed=0)
 
 
-@pytest.mark.parametrize("wrong", [{"workers": -1}, {"num_envs": 0}, {"workers": 2, "obs_type": "image"}])
+@pytest.mark.parametrize(
+    "wrong", [{"workers": -1}, {"num_envs": 0}, {"workers": 2, "obs_type": "image"}]
+)
 def test_wrong_arguments_are_refused(wrong):
     with pytest.raises(InputError):
         make_vector(**{"task": "place", "num_envs": 2, "workers": 1} | wrong)

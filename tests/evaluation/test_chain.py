@@ -44,7 +44,9 @@ class Env:
 
 
 def agent(classes: list[int], **changes: object) -> ChainAgent:
-    """Return a chain whose high-level policy says `classes` one after another, and whose policies say their index."""
+    """Return a chain whose high-level policy says `classes` one after another, and whose policies
+    say their index.
+    """
     made = ChainAgent("chain", Chain("order", **{**EXPERTS, **changes}))
     said = iter(classes)
     made._high = SimpleNamespace(answer=lambda envs, _: np.eye(5)[[next(said) for _ in envs]])
@@ -80,7 +82,9 @@ def test_a_grasp_may_end_sooner_than_the_env_ends_it_and_nothing_else_may() -> N
     assert acted == [0] * 5 + [1] * 10 + [2] * 2 and env.begun == [1]
     learned = agent([0] * 9, grasp_hold=3)
     object.__setattr__(learned.chain, "termination", "learned")
-    assert roll(learned, Env(10), 8) == [0] * 8, "a learned termination asks the high-level policy alone"
+    assert roll(learned, Env(10), 8) == [0] * 8, (
+        "a learned termination asks the high-level policy alone"
+    )
     for wrong in (0, 16):
         with pytest.raises(InputError, match="grasp_hold is"):
             Chain("order", **EXPERTS, grasp_hold=wrong)
@@ -109,7 +113,9 @@ def test_learned_termination_waits_for_the_high_level_policy() -> None:
     actor, env = agent([0] * 4 + [1] * 3 + [0] + [1] * 20), Env(2)
     object.__setattr__(actor.chain, "termination", "learned")
     acted = roll(actor, env, 8 + PATIENCE + 2)
-    assert acted == [0] * (8 + PATIENCE - 1) + [1] * 3, "the env's own success must not end a subtask"
+    assert acted == [0] * (8 + PATIENCE - 1) + [1] * 3, (
+        "the env's own success must not end a subtask"
+    )
 
 
 def test_experts_in_their_order_sew_and_count_their_stages() -> None:
@@ -137,9 +143,16 @@ def test_trained_policies_are_chained_in_any_batch(tmp_path: Path) -> None:
     hlp = checkpoint(tmp_path / "hlp", "suture", "hlp")
     low = {subtask: checkpoint(tmp_path / subtask, subtask) for subtask in names.SUBTASKS}
     for termination in hierarchical.TERMINATIONS:
-        made = hierarchical.subject(Chain(hlp, **low, termination=termination, steps=4, max_steps=12))
+        made = hierarchical.subject(
+            Chain(hlp, **low, termination=termination, steps=4, max_steps=12)
+        )
         rows = [
-            [e.row for e in evaluate(made.make_agent, made.config, [900_000, 900_001], batch=batch, workers=1)]
+            [
+                e.row
+                for e in evaluate(
+                    made.make_agent, made.config, [900_000, 900_001], batch=batch, workers=1
+                )
+            ]
             for batch in (1, 2)
         ]
         assert repr(rows[0]) == repr(rows[1]) and rows[0][0].steps == 12  # NaN is unequal to itself
@@ -160,7 +173,9 @@ def test_policies_of_a_chain_share_features() -> None:
         one.share(shared)
         for slot in range(3):
             one.begin(slot, None, 0)
-    observations = [{"pixels": {"back": np.full((4, 4, 3), value, np.uint8)}} for value in (1, 2, 3)]
+    observations = [
+        {"pixels": {"back": np.full((4, 4, 3), value, np.uint8)}} for value in (1, 2, 3)
+    ]
     envs = [SimpleNamespace(agent_pos=lambda: np.zeros(7, np.float32))] * 3
     assert agents[0].act([0, 2], envs[:2], observations[::2])[:, 0].tolist() == [1, 3]
     assert agents[1].act([0, 1, 2], envs, observations)[:, 0].tolist() == [1, 2, 3]
@@ -168,7 +183,10 @@ def test_policies_of_a_chain_share_features() -> None:
 
 
 def test_wrong_chains_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    grasp, hlp = checkpoint(tmp_path / "grasp", "grasp"), checkpoint(tmp_path / "hlp", "suture", "hlp")
+    grasp, hlp = (
+        checkpoint(tmp_path / "grasp", "grasp"),
+        checkpoint(tmp_path / "hlp", "suture", "hlp"),
+    )
     with pytest.raises(InputError, match="not for 'place'"):
         hierarchical.subject(Chain("order", **{**EXPERTS, "place": grasp}))
     with pytest.raises(InputError, match="takes an 'hlp'"):

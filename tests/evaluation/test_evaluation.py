@@ -1,4 +1,6 @@
-"""Evaluation: rows do not depend on batch or workers; errors are failures; the summary has its keys."""
+"""Evaluation: rows do not depend on batch or workers; errors are failures; the summary has its
+keys.
+"""
 
 import functools
 import json
@@ -22,7 +24,9 @@ SHORT = TaskConfig("grasp", max_steps=12)
 
 
 class FakeEnv:
-    """Counts steps; seed s succeeds after s steps, 97 cannot start, 98 diverges, 99 raises in a step."""
+    """Counts steps; seed s succeeds after s steps, 97 cannot start, 98 diverges, 99 raises in a
+    step.
+    """
 
     def __init__(self, config):
         self.config, self.closed = config, False
@@ -77,7 +81,11 @@ class FakeGauge:
 
     def look(self, info):
         self.entry_error = 5e-4
-        self.slip, self.turn, self.tissue_force = 1e-4 * self.env.count, np.pi / 180, 0.1 * self.env.count
+        self.slip, self.turn, self.tissue_force = (
+            1e-4 * self.env.count,
+            np.pi / 180,
+            0.1 * self.env.count,
+        )
 
 
 @pytest.fixture
@@ -103,12 +111,16 @@ def test_rows_are_in_the_order_of_seeds_for_any_batch(fake_envs):
     assert [row.seed for row in wanted] == seeds
     for batch in (2, 4, 20):
         # A distance that was never measured is not a number on both sides, so the text is compared.
-        assert repr(rows_of(evaluate(ZeroAgent, SHORT, seeds, batch=batch, workers=1))) == repr(wanted)
+        assert repr(rows_of(evaluate(ZeroAgent, SHORT, seeds, batch=batch, workers=1))) == repr(
+            wanted
+        )
     assert all(env.closed for env in fake_envs)
 
 
 def test_errors_are_failures_and_counted(fake_envs):
-    rows = {row.seed: row for row in rows_of(evaluate(ZeroAgent, SHORT, [3, 97, 98, 99], workers=1))}
+    rows = {
+        row.seed: row for row in rows_of(evaluate(ZeroAgent, SHORT, [3, 97, 98, 99], workers=1))
+    }
     assert rows[3].success
     for seed in (97, 98, 99):
         assert not rows[seed].success
@@ -116,7 +128,11 @@ def test_errors_are_failures_and_counted(fake_envs):
     # A start that cannot be made is no divergence of the physics.
     assert [rows[seed].failure for seed in (97, 98, 99)] == ["error", "physics", "physics"]
     result = summary(list(rows.values()))
-    assert (result["successes"], result["errors"], result["failures"]) == (1, 3, {"physics": 2, "error": 1})
+    assert (result["successes"], result["errors"], result["failures"]) == (
+        1,
+        3,
+        {"physics": 2, "error": 1},
+    )
 
 
 def test_an_action_that_is_not_finite_is_an_error(fake_envs):
@@ -136,7 +152,11 @@ def test_an_action_that_is_not_finite_is_an_error(fake_envs):
 
 def test_an_episode_ends_at_success_or_at_the_limit(fake_envs):
     rows = {row.seed: row for row in rows_of(evaluate(ZeroAgent, SHORT, [5, 40], workers=1))}
-    assert (rows[5].success, rows[5].steps, rows[5].trajectory_length_mm) == (True, 5, pytest.approx(5.0))
+    assert (rows[5].success, rows[5].steps, rows[5].trajectory_length_mm) == (
+        True,
+        5,
+        pytest.approx(5.0),
+    )
     assert (rows[40].success, rows[40].steps) == (False, SHORT.max_steps)
     assert rows[5].d_trans_mm == pytest.approx(2.0)
     assert rows[5].d_angle_deg == pytest.approx(90.0)
@@ -151,7 +171,14 @@ def test_film_keeps_first_and_last_state(fake_envs):
 
 def test_progress_ends_at_the_total(fake_envs):
     calls = []
-    evaluate(ZeroAgent, SHORT, [3, 4, 40], batch=2, workers=1, progress=lambda *numbers: calls.append(numbers))
+    evaluate(
+        ZeroAgent,
+        SHORT,
+        [3, 4, 40],
+        batch=2,
+        workers=1,
+        progress=lambda *numbers: calls.append(numbers),
+    )
     assert calls[-1] == (3 * SHORT.max_steps, 3 * SHORT.max_steps)
     assert [done for done, _ in calls] == sorted(done for done, _ in calls)
 
@@ -189,7 +216,10 @@ def test_rows_and_summary_hold_what_was_measured(fake_envs, tmp_path):
 
 
 def test_kinds_of_failure():
-    assert [failure_kind("x", diverged, True, True, True) for diverged in (True, False)] == ["physics", "error"]
+    assert [failure_kind("x", diverged, True, True, True) for diverged in (True, False)] == [
+        "physics",
+        "error",
+    ]
     assert failure_kind("", False, touched=False, wrong_hole=False, held=False) == "missed"
     assert failure_kind("", False, touched=True, wrong_hole=True, held=False) == "wrong_hole"
     assert failure_kind("", False, touched=True, wrong_hole=False, held=False) == "dropped"
@@ -239,7 +269,7 @@ def pixel_agent():
     return PolicyAgent("probe", SimpleNamespace(act=act), encoder, ("front", "back"), 96)
 
 
-def test_a_policy_with_pictures_gives_the_same_rows_for_any_batch():
+def test_a_policy_with_images_gives_the_same_rows_for_any_batch():
     seeds, config = range(names.TEST_SEED, names.TEST_SEED + 3), TaskConfig("grasp", max_steps=5)
     one = evaluate(pixel_agent, config, seeds, batch=1, workers=1)
     many = evaluate(pixel_agent, config, seeds, batch=3, workers=1)
@@ -250,7 +280,12 @@ def test_a_policy_with_pictures_gives_the_same_rows_for_any_batch():
 def test_expert_solves_held_out_starts():
     subject = policy_spec.baseline_subject("expert", TaskConfig("grasp"))
     rows = rows_of(
-        evaluate(subject.make_agent, subject.config, range(names.TEST_SEED, names.TEST_SEED + 3), workers=1)
+        evaluate(
+            subject.make_agent,
+            subject.config,
+            range(names.TEST_SEED, names.TEST_SEED + 3),
+            workers=1,
+        )
     )
     assert all(row.success for row in rows), rows
 

@@ -1,6 +1,8 @@
-"""The LeRobot plug-in: stock commands on our env and dataset, `surgicai_bc`, and our evaluation of the same.
+"""The LeRobot plug-in: stock commands on our env and dataset, `surgicai_bc`, and our evaluation of
+the same.
 
-LeRobot's commands run in this process through their own `main`: importing them takes most of the time here.
+LeRobot's commands run in this process through their own `main`: importing them takes most of the
+time here.
 """
 
 import importlib.metadata
@@ -43,7 +45,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dataset(folder: Path) -> Path:
     """Three demonstrations in two views with depth, which only some policies can take."""
     record(TaskConfig(TASK), episodes=3, out=folder / "demos", workers=0)
-    render_demos(folder / "demos", folder / "dataset", views=("front", "back"), size=SIZE, depth=True, workers=0)
+    render_demos(
+        folder / "demos",
+        folder / "dataset",
+        views=("front", "back"),
+        size=SIZE,
+        depth=True,
+        workers=0,
+    )
     return folder / "dataset"
 
 
@@ -87,7 +96,9 @@ def trained(dataset: Path, folder: Path) -> Path:
 
 
 def skilled(dataset: Path, out: Path, steps: int = 400) -> Path:
-    """Train a `surgicai_bc` that sees the tip alone on all frames at once, and save it as LeRobot does."""
+    """Train a `surgicai_bc` that sees the tip alone on all frames at once, and save it as LeRobot
+    does.
+    """
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.policies.factory import make_policy, make_pre_post_processors
 
@@ -112,18 +123,23 @@ def skilled(dataset: Path, out: Path, steps: int = 400) -> Path:
     return out
 
 
-# -- registration and env --------------------------------------------------------------------------------------------
+# -- registration and env --------------------------------------------------------------------------
 
 
 def test_lerobot_finds_the_distribution_by_its_name() -> None:
-    assert importlib.metadata.distribution("lerobot_env_surgicai").metadata["Name"] == "lerobot_env_surgicai"
+    assert (
+        importlib.metadata.distribution("lerobot_env_surgicai").metadata["Name"]
+        == "lerobot_env_surgicai"
+    )
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.envs.configs import EnvConfig
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
     assert EnvConfig.get_choice_class("surgicai").__module__.startswith("lerobot_env_surgicai")
-    assert PreTrainedConfig.get_choice_class("surgicai_bc").__module__.startswith("lerobot_env_surgicai")
+    assert PreTrainedConfig.get_choice_class("surgicai_bc").__module__.startswith(
+        "lerobot_env_surgicai"
+    )
 
 
 def test_env_has_every_field_of_the_task_config_and_follows_a_dataset(dataset: Path) -> None:
@@ -135,7 +151,12 @@ def test_env_has_every_field_of_the_task_config_and_follows_a_dataset(dataset: P
     assert {field.name for field in dataclasses.fields(TaskConfig)} <= own
     assert SurgicaiEnv().task_config() == TaskConfig()
     env = SurgicaiEnv(dataset=str(dataset), max_steps=7)
-    assert (env.task, env.views, env.image_size, env.max_steps) == (TASK, ("front", "back"), SIZE, 7)
+    assert (env.task, env.views, env.image_size, env.max_steps) == (
+        TASK,
+        ("front", "back"),
+        SIZE,
+        7,
+    )
     assert not [key for key in env.features if "/" in key or "depth" in key]
     with pytest.raises(UnknownName):
         SurgicaiEnv(cameras=["side"])
@@ -157,7 +178,9 @@ def test_env_shows_what_the_dataset_holds_and_waits_after_its_end(dataset: Path)
     seen = preprocess_observation(observation)
     assert set(seen) == {names.STATE, names.image_key("front"), names.image_key("back")}
     first = open_dataset(dataset).frames("back", 0, 1)
-    np.testing.assert_array_equal((seen[names.image_key("back")] * 255).round().byte().permute(0, 2, 3, 1), first)
+    np.testing.assert_array_equal(
+        (seen[names.image_key("back")] * 255).round().byte().permute(0, 2, 3, 1), first
+    )
     assert "is_success" in info
     action = np.zeros((1, 7), np.float32)
     env.step(action)
@@ -182,7 +205,7 @@ def test_envs_run_in_processes_of_their_own(dataset: Path) -> None:
     env.close()
 
 
-# -- surgicai_bc -----------------------------------------------------------------------------------------------------
+# -- surgicai_bc -----------------------------------------------------------------------------------
 
 
 def test_defaults_are_the_recipe_paper() -> None:
@@ -198,7 +221,11 @@ def test_checkpoint_names_the_encoder_and_holds_none_of_it(trained: Path) -> Non
     config = json.loads((trained / CHECKPOINT / "config.json").read_text())
     assert config["encoder"] == "imagenet-lite"
     assert len(config["encoder_sha256"]) == len(config["encoder_identity"]) == 64
-    assert set(config["input_features"]) == {names.STATE, names.image_key("front"), names.image_key("back")}
+    assert set(config["input_features"]) == {
+        names.STATE,
+        names.image_key("front"),
+        names.image_key("back"),
+    }
     tensors = load_file(trained / CHECKPOINT / "model.safetensors")
     assert all(key.startswith("network.") for key in tensors)
     assert (trained / CHECKPOINT / "model.safetensors").stat().st_size < 5e6
@@ -213,9 +240,12 @@ def load(folder: Path) -> Any:
 
 def frames(count: int) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
-    pictures = torch.randint(0, 256, (count, 3, SIZE, SIZE), generator=generator) / 255
-    state, action = torch.randn(count, 7, generator=generator), torch.rand(count, 7, generator=generator)
-    return {names.image_key("front"): pictures, names.image_key("back"): 1 - pictures, names.STATE: state,
+    images = torch.randint(0, 256, (count, 3, SIZE, SIZE), generator=generator) / 255
+    state, action = (
+        torch.randn(count, 7, generator=generator),
+        torch.rand(count, 7, generator=generator),
+    )
+    return {names.image_key("front"): images, names.image_key("back"): 1 - images, names.STATE: state,
             names.ACTION: action}  # fmt: skip
 
 
@@ -250,31 +280,31 @@ def test_training_moves_the_network_and_never_the_encoder(trained: Path) -> None
     np.testing.assert_array_equal(encoder(np.full((1, SIZE, SIZE, 3), 90, np.uint8)), feature)
 
 
-def test_training_encodes_a_picture_once_and_forgets_beyond_its_limit() -> None:
-    from lerobot_env_surgicai.pictures import Remembered
+def test_training_encodes_a_image_once_and_forgets_beyond_its_limit() -> None:
+    from lerobot_env_surgicai.images import Remembered
 
     encoded: list[int] = []
 
-    def encoder(pictures: np.ndarray) -> np.ndarray:
-        encoded.append(len(pictures))
-        return pictures.reshape(len(pictures), -1)[:, :4].astype(np.float16).astype(np.float32) / 3
+    def encoder(images: np.ndarray) -> np.ndarray:
+        encoded.append(len(images))
+        return images.reshape(len(images), -1)[:, :4].astype(np.float16).astype(np.float32) / 3
 
-    pictures = np.random.default_rng(0).integers(0, 256, (6, 8, 8, 3), np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (6, 8, 8, 3), np.uint8)
     memory = Remembered(encoder)
     batches = [[0, 1, 2], [2, 1, 3], [3, 3, 0], [4, 4, 5]]
-    wanted = [encoder(pictures[rows]).astype(np.float16).astype(np.float32) for rows in batches]
+    wanted = [encoder(images[rows]).astype(np.float16).astype(np.float32) for rows in batches]
     encoded.clear()
     for rows, features in zip(batches, wanted, strict=True):
-        np.testing.assert_array_equal(memory(pictures[rows]), features)
-    assert encoded == [3, 1, 2], "each picture once, each batch's new ones together"
-    changed_one = pictures[:1].copy()
+        np.testing.assert_array_equal(memory(images[rows]), features)
+    assert encoded == [3, 1, 2], "each image once, each batch's new ones together"
+    changed_one = images[:1].copy()
     changed_one[0, 7, 7, 2] ^= 1
     memory(changed_one)
-    assert encoded[-1] == 1, "a picture that differs in one bit is another"
+    assert encoded[-1] == 1, "an image that differs in one bit is another"
     small = Remembered(encoder, limit=8)
     encoded.clear()
     for _ in range(2):
-        small(pictures[:3])
+        small(images[:3])
     assert encoded == [3, 2]
 
 
@@ -299,19 +329,24 @@ def test_another_encoder_and_damaged_weights_are_refused(trained: Path, tmp_path
         load(cut)
 
 
-def test_pictures_of_another_size_and_missing_views_are_refused(trained: Path) -> None:
+def test_images_of_another_size_and_missing_views_are_refused(trained: Path) -> None:
     from lerobot.configs import FeatureType, PolicyFeature
 
     from lerobot_env_surgicai import SurgicaiBcConfig
 
     policy = load(trained / CHECKPOINT)
-    larger = {key: value.repeat(1, 1, 2, 2) if value.ndim == 4 else value for key, value in frames(1).items()}
+    larger = {
+        key: value.repeat(1, 1, 2, 2) if value.ndim == 4 else value
+        for key, value in frames(1).items()
+    }
     with pytest.raises(InputError, match=f"--env.image_size={SIZE}"):
         policy.select_action(larger)
     state = {names.STATE: PolicyFeature(FeatureType.STATE, (7,))}
     action = {names.ACTION: PolicyFeature(FeatureType.ACTION, (7,))}
     with pytest.raises(InputError, match="front"):
-        SurgicaiBcConfig(input_features=state, output_features=action, device="cpu").validate_features()
+        SurgicaiBcConfig(
+            input_features=state, output_features=action, device="cpu"
+        ).validate_features()
     with pytest.raises(InputError, match=r"images\.back"):
         SurgicaiBcConfig(
             views=["back"], input_features=state, output_features=action, device="cpu"
@@ -326,7 +361,9 @@ def test_a_constant_input_is_not_blown_up() -> None:
 
     state = {names.STATE: PolicyFeature(FeatureType.STATE, (7,))}
     action = {names.ACTION: PolicyFeature(FeatureType.ACTION, (7,))}
-    config = SurgicaiBcConfig(encoder=None, input_features=state, output_features=action, device="cpu")
+    config = SurgicaiBcConfig(
+        encoder=None, input_features=state, output_features=action, device="cpu"
+    )
     statistics = {names.STATE: {"mean": torch.zeros(7), "std": torch.zeros(7)}}
     before, after = make_pre_post_processors(config, dataset_stats=statistics)
     near = before({names.STATE: torch.full((1, 7), 1e-4)})[names.STATE]
@@ -334,7 +371,7 @@ def test_a_constant_input_is_not_blown_up() -> None:
     assert torch.equal(after(torch.full((1, 7), 0.5)), torch.full((1, 7), 0.5))
 
 
-# -- the same checkpoint in lerobot-eval and in evaluate -------------------------------------------------------------
+# -- the same checkpoint in lerobot-eval and in evaluate -------------------------------------------
 
 
 def test_lerobot_eval_and_evaluate_count_the_same_successes(dataset: Path, tmp_path: Path) -> None:
@@ -355,18 +392,26 @@ def test_lerobot_eval_and_evaluate_count_the_same_successes(dataset: Path, tmp_p
     before, after = make_pre_post_processors(config, pretrained_path=str(folder))
     env_before, env_after = make_env_pre_post_processors(env_config, config)
     env = make_env(env_config, n_envs=2)["surgicai"][0]
-    theirs = eval_policy(env, policy, env_before, env_after, before, after, n_episodes=episodes, start_seed=0)
+    theirs = eval_policy(
+        env, policy, env_before, env_after, before, after, n_episodes=episodes, start_seed=0
+    )
     env.close()
     subject = lerobot_agent.subject(lerobot_agent.find(folder), task=TASK)
-    ours = evaluate(subject.make_agent, TaskConfig(TASK, max_steps=steps), range(episodes), batch=3, workers=1)
-    assert [episode.row.success for episode in ours] == [row["success"] for row in theirs["per_episode"]]
+    ours = evaluate(
+        subject.make_agent, TaskConfig(TASK, max_steps=steps), range(episodes), batch=3, workers=1
+    )
+    assert [episode.row.success for episode in ours] == [
+        row["success"] for row in theirs["per_episode"]
+    ]
     # A sparse reward is -1 a step and 0 on success: the sums tell the steps.
     lengths = [-row["sum_reward"] + row["success"] for row in theirs["per_episode"]]
     assert [episode.row.steps for episode in ours] == lengths
     assert any(episode.row.success for episode in ours)
 
 
-def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(trained: Path, dataset: Path, command) -> None:
+def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(
+    trained: Path, dataset: Path, command
+) -> None:
     """Dense rewards tell two trajectories apart in the last bit."""
     from surgicai_vision import envs
     from surgicai_vision.evaluation import lerobot_agent
@@ -377,7 +422,9 @@ def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(trained: Pat
         f"--env.max_steps={STEPS}", "--env.reward=dense", "--eval.n_episodes=2", "--eval.batch_size=2",
         "--eval.use_async_envs=false", "--policy.device=cpu", f"--output_dir={trained / 'eval'}", "--seed=1000",
     )  # fmt: skip
-    metrics = json.loads((trained / "eval" / "eval_info.json").read_text())["per_task"][0]["metrics"]
+    metrics = json.loads((trained / "eval" / "eval_info.json").read_text())["per_task"][0][
+        "metrics"
+    ]
     subject = lerobot_agent.subject(lerobot_agent.find(trained))
     assert subject.config == TaskConfig(TASK, max_steps=STEPS)
     rows = evaluate(subject.make_agent, subject.config, [1000, 1001], workers=1)
@@ -396,7 +443,7 @@ def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(trained: Pat
         assert total == pytest.approx(wanted, rel=1e-9)
 
 
-# -- LeRobot's own policies ------------------------------------------------------------------------------------------
+# -- LeRobot's own policies ------------------------------------------------------------------------
 
 
 def test_act_trains_beside_depth_and_is_evaluated(dataset: Path, tmp_path: Path, command) -> None:
@@ -405,9 +452,16 @@ def test_act_trains_beside_depth_and_is_evaluated(dataset: Path, tmp_path: Path,
 
     inputs = {names.image_key("back"): {"type": "VISUAL", "shape": [3, SIZE, SIZE]}}
     inputs[names.STATE] = {"type": "STATE", "shape": [7]}
-    settings = ["pretrained_backbone_weights=null", f"input_features={json.dumps(inputs)}", *TINY["act"]]
+    settings = [
+        "pretrained_backbone_weights=null",
+        f"input_features={json.dumps(inputs)}",
+        *TINY["act"],
+    ]
     out = tmp_path / "act"
-    command("lerobot_train", *training(dataset, out, "act", *(f"--policy.{setting}" for setting in settings)))
+    command(
+        "lerobot_train",
+        *training(dataset, out, "act", *(f"--policy.{setting}" for setting in settings)),
+    )
     found = lerobot_agent.find(out)
     assert found == out / CHECKPOINT
     # A checkpoint of pretrained weights asks for them by name; they are in the checkpoint already.
@@ -415,12 +469,18 @@ def test_act_trains_beside_depth_and_is_evaluated(dataset: Path, tmp_path: Path,
     for place in (found, tmp_path / "named"):
         subject = lerobot_agent.subject(place)
         assert subject.name == "act-back"
-        rows = [evaluate(subject.make_agent, subject.config, [1, 2, 3], batch=batch, workers=1) for batch in (1, 3)]
+        rows = [
+            evaluate(subject.make_agent, subject.config, [1, 2, 3], batch=batch, workers=1)
+            for batch in (1, 3)
+        ]
         assert said(rows[0]) == said(rows[1])
     low = dict.fromkeys(names.SUBTASKS, "zero") | {open_dataset(dataset).task: str(out)}
     made = hierarchical.subject(hierarchical.Chain("order", **low, steps=4, max_steps=10))
     assert made.about["views"] == ["back"] and made.config.task == "suture"
-    rows = [evaluate(lambda: chosen(made, dataset), made.config, [1, 2], batch=batch, workers=1) for batch in (1, 2)]
+    rows = [
+        evaluate(lambda: chosen(made, dataset), made.config, [1, 2], batch=batch, workers=1)
+        for batch in (1, 2)
+    ]
     assert said(rows[0]) == said(rows[1])
     assert rows[0][0].row.steps == 10 and rows[0][0].row.trajectory_length_mm > 0
     with pytest.raises(InputError, match="not for 'pullout'"):
@@ -430,7 +490,9 @@ def test_act_trains_beside_depth_and_is_evaluated(dataset: Path, tmp_path: Path,
 def chosen(made, dataset: Path):
     """The agent of a chain whose high-level policy always says the dataset's subtask."""
     agent, subtask = made.make_agent(), names.SUBTASKS.index(open_dataset(dataset).task)
-    agent._high = SimpleNamespace(answer=lambda envs, _: np.eye(len(names.SUBTASKS))[[subtask] * len(envs)])
+    agent._high = SimpleNamespace(
+        answer=lambda envs, _: np.eye(len(names.SUBTASKS))[[subtask] * len(envs)]
+    )
     return agent
 
 
@@ -439,29 +501,48 @@ def said(episodes: list) -> list[str]:
     return [repr(episode.row) for episode in episodes]
 
 
-def test_diffusion_trains_on_frozen_features_and_is_evaluated(dataset: Path, tmp_path: Path, command) -> None:
+def test_diffusion_trains_on_frozen_features_and_is_evaluated(
+    dataset: Path, tmp_path: Path, command
+) -> None:
     from surgicai_vision.dataset import check_dataset
     from surgicai_vision.evaluation import lerobot_agent
     from surgicai_vision.evaluation.rollout import evaluate
     from surgicai_vision.features import encoders
 
     opened, encoder = open_dataset(dataset), encoders.load_encoder("imagenet-lite")
-    rows = np.random.default_rng(0).random((opened.length, encoder.dim), dtype=np.float32)  # two steps learn nothing
-    about = {"encoder": "imagenet-lite", "views": ["back"], "weights_sha256": encoder.weights_sha256}
+    rows = np.random.default_rng(0).random(
+        (opened.length, encoder.dim), dtype=np.float32
+    )  # two steps learn nothing
+    about = {
+        "encoder": "imagenet-lite",
+        "views": ["back"],
+        "weights_sha256": encoder.weights_sha256,
+    }
     export_features(opened, [rows], about, tmp_path / "features")
     assert check_dataset(tmp_path / "features").ok
     with pytest.raises(OutputExists):
         export_features(opened, [rows], about, tmp_path / "features")
     with pytest.raises(InputError, match="8 features"):
         export_features(opened, [rows[:8]], about, tmp_path / "other")
-    settings = [f"--policy.{setting}" for setting in ("pretrained_backbone_weights=null", *TINY["diffusion"])]
-    out, evaluated = tmp_path / "diffusion", ("--env_eval_freq=2", "--eval.n_episodes=1", "--eval.batch_size=1")
-    command("lerobot_train", *training(tmp_path / "features", out, "diffusion", *settings, *evaluated))
+    settings = [
+        f"--policy.{setting}"
+        for setting in ("pretrained_backbone_weights=null", *TINY["diffusion"])
+    ]
+    out, evaluated = (
+        tmp_path / "diffusion",
+        ("--env_eval_freq=2", "--eval.n_episodes=1", "--eval.batch_size=1"),
+    )
+    command(
+        "lerobot_train", *training(tmp_path / "features", out, "diffusion", *settings, *evaluated)
+    )
     config = json.loads((out / CHECKPOINT / "config.json").read_text())
     assert set(config["input_features"]) == {names.STATE, names.ENVIRONMENT_STATE}
     subject = lerobot_agent.subject(lerobot_agent.find(out))
     assert subject.name == "diffusion-imagenet-lite-back"
-    rows = [evaluate(subject.make_agent, subject.config, [1, 2, 3], batch=batch, workers=1) for batch in (1, 3)]
+    rows = [
+        evaluate(subject.make_agent, subject.config, [1, 2, 3], batch=batch, workers=1)
+        for batch in (1, 3)
+    ]
     assert said(rows[0]) == said(rows[1])
 
 
@@ -482,7 +563,7 @@ def test_what_evaluate_cannot_use_is_refused_in_one_line(trained: Path, tmp_path
         lerobot_agent.subject(changed(source, tmp_path / "typeless", type=None))
 
 
-# -- LeRobot's tools on our dataset ----------------------------------------------------------------------------------
+# -- LeRobot's tools on our dataset ----------------------------------------------------------------
 
 
 def test_lerobot_edits_our_dataset(dataset: Path, folder: Path, tmp_path: Path, command) -> None:
@@ -494,13 +575,21 @@ def test_lerobot_edits_our_dataset(dataset: Path, folder: Path, tmp_path: Path, 
         "--operation.type=delete_episodes", "--operation.episode_indices=[1]",
     )  # fmt: skip
     splits = '{"train": 0.5, "val": 0.5}'
-    command(edit, *given, f"--new_root={tmp_path}", "--operation.type=split", f"--operation.splits={splits}")
+    command(
+        edit,
+        *given,
+        f"--new_root={tmp_path}",
+        "--operation.type=split",
+        f"--operation.splits={splits}",
+    )
     command(
         edit, "--new_repo_id=local/whole", f"--new_root={tmp_path / 'whole'}", "--operation.type=merge",
         "--operation.repo_ids=['local/toy_train','local/toy_val']",
         f"--operation.roots=['{tmp_path / 'train'}','{tmp_path / 'val'}']",
     )  # fmt: skip
-    infos = {path.name: json.loads((path / "meta/info.json").read_text()) for path in tmp_path.iterdir()}
+    infos = {
+        path.name: json.loads((path / "meta/info.json").read_text()) for path in tmp_path.iterdir()
+    }
     assert infos["less"]["total_episodes"] == 2
     parts = infos["train"]["total_frames"] + infos["val"]["total_frames"]
     assert infos["whole"]["total_frames"] == parts > 0

@@ -1,4 +1,6 @@
-"""Robustness: strength 0 is the plain evaluation, strengths are paired, each axis changes what it says and no more."""
+"""Robustness: strength 0 is the plain evaluation, strengths are paired, each axis changes what it
+says and no more.
+"""
 
 import json
 from contextlib import contextmanager
@@ -35,7 +37,9 @@ def seeing(image_size=48):
         weights = np.random.default_rng(0).normal(size=(features.shape[1], 7)) / features.shape[1]
         return np.tanh(features @ weights / 30).astype(np.float32)
 
-    return PolicyAgent("seeing", SimpleNamespace(act=act), encode, ("front", "wrist_psm2"), image_size)
+    return PolicyAgent(
+        "seeing", SimpleNamespace(act=act), encode, ("front", "wrist_psm2"), image_size
+    )
 
 
 def subject(config=SHORT):
@@ -69,7 +73,9 @@ def test_an_axis_changes_what_a_seeing_policy_does_and_not_where_it_starts(axis)
     for one, other in ((half, plain), (full, half)):
         for mine, theirs in zip(one, other, strict=True):
             assert repr(mine.row) != repr(theirs.row)
-    needles = [[needle_at_start(episode) for episode in episodes] for episodes in (plain, half, full)]
+    needles = [
+        [needle_at_start(episode) for episode in episodes] for episodes in (plain, half, full)
+    ]
     np.testing.assert_allclose(needles[1], needles[0], atol=1e-6)
     np.testing.assert_allclose(needles[2], needles[0], atol=1e-6)
 
@@ -95,44 +101,51 @@ def test_an_episode_keeps_its_direction_and_grows_with_the_strength(axis):
 
 
 def test_latency_is_in_whole_steps():
-    steps = [shifted(subject(), "latency", strength).config.randomisation.latency for strength in (0, 0.25, 0.5, 1)]
+    steps = [
+        shifted(subject(), "latency", strength).config.randomisation.latency
+        for strength in (0, 0.25, 0.5, 1)
+    ]
     assert steps == [0, 1, 3, 5]
 
 
 def test_a_shift_comes_on_top_of_the_tasks_own_randomisation_up_to_what_is_possible():
     config = TaskConfig("grasp", randomisation=RandomisationConfig(light=0.3, friction=0.1))
-    light = [shifted(subject(config), "light", s).config.randomisation.light for s in (0.0, 0.5, 1.0)]
+    light = [
+        shifted(subject(config), "light", s).config.randomisation.light for s in (0.0, 0.5, 1.0)
+    ]
     assert light == pytest.approx([0.3, 0.7, 0.9])
     assert shifted(subject(config), "blur", 1.0).config == config
 
 
 @pytest.mark.parametrize("kind", CORRUPTIONS)
 def test_a_corruption_grows_with_its_strength_from_nothing(kind):
-    picture = np.random.default_rng(0).integers(60, 200, (64, 64, 3)).astype(np.uint8)
-    before = picture.copy()
-    changed = [CORRUPTIONS[kind](picture, s, Moment(1, 2, 0)) for s in (0.0, 0.25, 0.5, 1.0)]
-    np.testing.assert_array_equal(picture, before)
-    np.testing.assert_array_equal(changed[0], picture)
-    off = [np.abs(one.astype(float) - picture).mean() for one in changed]
+    image = np.random.default_rng(0).integers(60, 200, (64, 64, 3)).astype(np.uint8)
+    before = image.copy()
+    changed = [CORRUPTIONS[kind](image, s, Moment(1, 2, 0)) for s in (0.0, 0.25, 0.5, 1.0)]
+    np.testing.assert_array_equal(image, before)
+    np.testing.assert_array_equal(changed[0], image)
+    off = [np.abs(one.astype(float) - image).mean() for one in changed]
     assert off == sorted(off) and off[1] > 0.3
-    assert all(one.shape == picture.shape and one.dtype == np.uint8 for one in changed)
-    np.testing.assert_array_equal(CORRUPTIONS[kind](picture, 1.0, Moment(1, 2, 0)), changed[3])
+    assert all(one.shape == image.shape and one.dtype == np.uint8 for one in changed)
+    np.testing.assert_array_equal(CORRUPTIONS[kind](image, 1.0, Moment(1, 2, 0)), changed[3])
 
 
 def test_noise_is_new_each_step_and_view_and_smoke_drifts():
-    picture = np.full((64, 64, 3), 90, np.uint8)
+    image = np.full((64, 64, 3), 90, np.uint8)
     for kind in ("noise", "smoke"):
         moments = [Moment(1, 0, 0), Moment(1, 40, 0), Moment(1, 0, 1), Moment(2, 0, 0)]
-        looks = [CORRUPTIONS[kind](picture, 0.5, moment) for moment in moments]
+        looks = [CORRUPTIONS[kind](image, 0.5, moment) for moment in moments]
         assert all(not np.array_equal(looks[0], other) for other in looks[1:])
-    still, later = (CORRUPTIONS["smoke"](picture, 0.5, Moment(1, step, 0)) for step in (0, 40))
+    still, later = (CORRUPTIONS["smoke"](image, 0.5, Moment(1, step, 0)) for step in (0, 40))
     np.testing.assert_array_equal(np.roll(still, round(40 * 64 / 200), axis=1), later)
 
 
 def test_noise_and_smoke_are_as_strong_as_said():
     grey = np.full((200, 200, 3), 128, np.uint8)
     assert CORRUPTIONS["noise"](grey, 0.5, Moment(0, 0, 0)).std() == pytest.approx(32.0, rel=0.02)
-    hidden = CORRUPTIONS["smoke"](np.zeros_like(grey), 1.0, Moment(0, 0, 0)) / np.array([196, 198, 202])
+    hidden = CORRUPTIONS["smoke"](np.zeros_like(grey), 1.0, Moment(0, 0, 0)) / np.array(
+        [196, 198, 202]
+    )
     assert 0.39 < hidden.min() < hidden.max() < 0.91
 
 
@@ -142,7 +155,7 @@ def test_rows_do_not_depend_on_the_batch(axis):
     assert rows_of(played(chosen, 1)) == rows_of(played(chosen, 2))
 
 
-def test_a_corruption_leaves_the_env_and_everything_but_pictures_alone():
+def test_a_corruption_leaves_the_env_and_everything_but_images_alone():
     seen = []
     agent = SimpleNamespace(
         name="x", cameras=("front",), image_size=8, begin=lambda *_: None,
@@ -174,7 +187,18 @@ class Pretend:
         film = Film(np.zeros(1, np.int64), np.zeros((1, 2)))
         rows = [
             EpisodeRow(
-                "grasp", "seeing", seed, 4 * shift["strength"] <= index, 1, 1.0, 1.0, 1.0, True, "", "friction", ""
+                "grasp",
+                "seeing",
+                seed,
+                4 * shift["strength"] <= index,
+                1,
+                1.0,
+                1.0,
+                1.0,
+                True,
+                "",
+                "friction",
+                "",
             )
             for index, seed in enumerate(seeds)
         ]
@@ -205,7 +229,13 @@ def test_curves_count_compare_and_are_stored(tmp_path, pretend):
     assert (rows[0]["p"], rows[2]["p"], rows[2]["p_holm"]) == (None, p, min(1.0, 4 * p))
     assert pq.read_table(tmp_path / CURVES).to_pylist() == rows
     # The plain evaluation is made once, and kept for each axis under its own name.
-    assert pretend.calls == [("light", 0.0), ("light", 0.5), ("light", 1.0), ("blur", 0.5), ("blur", 1.0)]
+    assert pretend.calls == [
+        ("light", 0.0),
+        ("light", 0.5),
+        ("light", 1.0),
+        ("blur", 0.5),
+        ("blur", 1.0),
+    ]
     stored = json.loads((tmp_path / "blur" / "0" / MARKER).read_text())
     assert stored["about"]["shift"] == {"axis": "blur", "strength": 0.0}
     assert repr(read_rows(tmp_path / "blur" / "0")) == repr(read_rows(tmp_path / "light" / "0"))
@@ -223,11 +253,11 @@ def test_running_again_does_only_what_is_missing(tmp_path, pretend):
         robustness(subject(), range(5), tmp_path, silent, ("light",))
 
 
-def test_without_pictures_only_the_arm_can_shift(tmp_path):
+def test_without_images_only_the_arm_can_shift(tmp_path):
     blind = policy_spec.baseline_subject("expert", SHORT)
     assert axes_of(blind) == ("latency", "kinematic_error")
     assert axes_of(subject()) == tuple(AXES)
-    with pytest.raises(InputError, match="sees no pictures"):
+    with pytest.raises(InputError, match="sees no images"):
         robustness(blind, SEEDS, tmp_path, silent, ("blur",))
 
 
@@ -240,7 +270,18 @@ def test_wrong_axes_and_strengths_are_refused(tmp_path):
 
 
 def test_the_verb_measures_the_expert_and_continues(tmp_path, capsys):
-    make = ["robustness", "expert", "--axis", "latency", "--strength", "0,1", "--episodes", "1", "--workers", "1"]
+    make = [
+        "robustness",
+        "expert",
+        "--axis",
+        "latency",
+        "--strength",
+        "0,1",
+        "--episodes",
+        "1",
+        "--workers",
+        "1",
+    ]
     make += ["--out", str(tmp_path / "out"), "--json"]
     assert main(make) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -256,7 +297,7 @@ def test_the_verb_measures_the_expert_and_continues(tmp_path, capsys):
         (["--axis", "lihgt"], "light"),
         (["--strength", "0,x"], "expected a number"),
         (["--strength", "0,2"], "from 0 to 1"),
-        (["--axis", "blur"], "sees no pictures"),
+        (["--axis", "blur"], "sees no images"),
         (["--axis", "light,light"], "twice"),
     ],
 )

@@ -1,4 +1,6 @@
-"""Intervals and tests against SciPy's own and other formulas, on random tables; nominal coverage, simulated."""
+"""Intervals and tests against SciPy's own and other formulas, on random tables; nominal coverage,
+simulated.
+"""
 
 import itertools
 
@@ -27,7 +29,9 @@ def test_interval_equals_scipy_on_random_tables():
         trials, level = int(rng.integers(1, 150)), float(rng.choice([0.8, 0.9, 0.95, 0.99]))
         successes = int(rng.integers(0, trials + 1))
         expected = binomtest(successes, trials).proportion_ci(level, method="exact")
-        assert clopper_pearson(successes, trials, level) == pytest.approx((expected.low, expected.high), abs=1e-9)
+        assert clopper_pearson(successes, trials, level) == pytest.approx(
+            (expected.low, expected.high), abs=1e-9
+        )
 
 
 @pytest.mark.parametrize("trials", [1, 2, 20, 10_000])
@@ -92,7 +96,9 @@ def holm_by_closure(p_values):
 def test_holm_equals_its_definition_on_random_tables():
     rng = np.random.default_rng(2)
     for _ in range(TABLES):
-        p_values = (rng.random(int(rng.integers(1, 12))) ** 3).round(int(rng.integers(1, 12))).tolist()
+        p_values = (
+            (rng.random(int(rng.integers(1, 12))) ** 3).round(int(rng.integers(1, 12))).tolist()
+        )
         assert holm(p_values) == pytest.approx(holm_by_definition(p_values), abs=1e-9)
     for _ in range(50):
         p_values = (rng.random(int(rng.integers(1, 7))) ** 3).tolist()
@@ -128,7 +134,9 @@ def test_bootstrap_of_one_seed_is_the_exact_interval():
 
 
 def korn_graubard(groups):
-    """The interval of success counts with the bootstrap's error in closed form: infinitely many resamples."""
+    """The interval of success counts with the bootstrap's error in closed form: infinitely many
+    resamples.
+    """
     p, seeds = np.mean([np.mean(g) for g in groups]), len(groups)
     rates, sizes = np.array([np.mean(g) for g in groups]), np.array([len(g) for g in groups])
     variance = rates.var() / seeds + np.mean(rates * (1 - rates) / sizes) / seeds
@@ -140,7 +148,9 @@ def korn_graubard(groups):
     return low, 1.0 if k == worth else beta.ppf(0.975, k + 1, worth - k)
 
 
-@pytest.mark.parametrize("rates", [(0.2, 0.5, 0.9), (0.5,) * 5, (0.0, 0.0, 0.1, 0.0, 0.0), (1.0,) * 5])
+@pytest.mark.parametrize(
+    "rates", [(0.2, 0.5, 0.9), (0.5,) * 5, (0.0, 0.0, 0.1, 0.0, 0.0), (1.0,) * 5]
+)
 def test_bootstrap_equals_its_limit(rates):
     groups = [[1.0] * round(20 * rate) + [0.0] * (20 - round(20 * rate)) for rate in rates]
     found = hierarchical_bootstrap(groups, np.random.default_rng(0), resamples=40_000)

@@ -1,4 +1,6 @@
-"""Survival: the expert in the place of the policy that fails lets a chain go on; everything is paired and stored."""
+"""Survival: the expert in the place of the policy that fails lets a chain go on; everything is
+paired and stored.
+"""
 
 import json
 
@@ -23,7 +25,9 @@ def chain_file(tmp_path):
 
 
 def test_variants_are_the_chain_and_each_learned_subtask():
-    config = Chain("order", grasp="expert", place="zero", insert="expert", handoff="random", pullout="expert")
+    config = Chain(
+        "order", grasp="expert", place="zero", insert="expert", handoff="random", pullout="expert"
+    )
     variants = variants_of(config)
     assert list(variants) == [AS_IT_IS, "place", "handoff"]
     assert [subject.about["swap"] for subject in variants.values()] == [None, "place", "handoff"]
@@ -31,7 +35,9 @@ def test_variants_are_the_chain_and_each_learned_subtask():
     assert len({subject.config for subject in variants.values()}) == 1
     assert variants["place"].about["chain"]["place"] == "expert"
     assert variants["place"].about["chain"]["handoff"] == "random"
-    assert variants["place"].make_agent().name == variants[AS_IT_IS].name == swapped(config, None).name
+    assert (
+        variants["place"].make_agent().name == variants[AS_IT_IS].name == swapped(config, None).name
+    )
 
 
 def test_a_swapped_expert_lets_the_chain_go_on_to_the_next_weak_link(chain_file, tmp_path, capsys):
@@ -40,7 +46,8 @@ def test_a_swapped_expert_lets_the_chain_go_on_to_the_next_weak_link(chain_file,
     assert main(command) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     found = {
-        swap: [row["k"] for row in result["survival"] if row["swap"] == swap] for swap in ("", "place", "handoff")
+        swap: [row["k"] for row in result["survival"] if row["swap"] == swap]
+        for swap in ("", "place", "handoff")
     }
     assert found == {"": [2, 0, 0, 0, 0], "place": [2, 2, 2, 0, 0], "handoff": [2, 0, 0, 0, 0]}
     assert [row["subtask"] for row in result["survival"][:5]] == list(names.SUBTASKS)
@@ -49,7 +56,9 @@ def test_a_swapped_expert_lets_the_chain_go_on_to_the_next_weak_link(chain_file,
     stored = json.loads((out / "place" / MARKER).read_text())
     assert stored["about"]["swap"] == "place"
     assert [stage["k"] for stage in stored["summary"]["survival"]] == found["place"]
-    assert [row["seed"] for row in read_rows(out / "place")] == [row["seed"] for row in read_rows(out / AS_IT_IS)]
+    assert [row["seed"] for row in read_rows(out / "place")] == [
+        row["seed"] for row in read_rows(out / AS_IT_IS)
+    ]
 
     assert main(command) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1]) == result
@@ -58,7 +67,20 @@ def test_a_swapped_expert_lets_the_chain_go_on_to_the_next_weak_link(chain_file,
 
 
 def test_one_subtask_can_be_swapped_alone(chain_file, tmp_path, capsys):
-    assert main(["evaluate", str(chain_file), "--swap", "place", "--out", str(tmp_path / "out"), *STARTS]) == 0
+    assert (
+        main(
+            [
+                "evaluate",
+                str(chain_file),
+                "--swap",
+                "place",
+                "--out",
+                str(tmp_path / "out"),
+                *STARTS,
+            ]
+        )
+        == 0
+    )
     *told, last = capsys.readouterr().out.splitlines()
     result = json.loads(last)
     assert "failed: 2 time; reached grasp 2, place 2, insert 2, handoff 0, pullout 0" in told[0]
@@ -68,7 +90,10 @@ def test_one_subtask_can_be_swapped_alone(chain_file, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("command", "wanted"),
-    [(["expert", "--swap", "place"], "is for a chain.yaml"), (["x.yaml", "--swap", "plaec"], "place")],
+    [
+        (["expert", "--swap", "place"], "is for a chain.yaml"),
+        (["x.yaml", "--swap", "plaec"], "place"),
+    ],
 )
 def test_wrong_swaps_end_with_one_line(command, wanted, tmp_path, capsys):
     assert main(["evaluate", *command, "--out", str(tmp_path / "out")]) == 2

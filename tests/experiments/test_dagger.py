@@ -1,4 +1,6 @@
-"""DAgger: a learner drives, the expert labels, and the same seed gives the same episodes whatever the workers."""
+"""DAgger: a learner drives, the expert labels, and the same seed gives the same episodes whatever
+the workers.
+"""
 
 import json
 from pathlib import Path
@@ -34,8 +36,10 @@ class Backwards:
 
 @pytest.fixture(scope="module")
 def learner(tmp_path_factory):
-    """An untrained policy that sees no picture."""
-    return learner_of(Path(checkpoint(tmp_path_factory.mktemp("learner") / "policy", "place")), CONFIG)
+    """An untrained policy that sees no image."""
+    return learner_of(
+        Path(checkpoint(tmp_path_factory.mktemp("learner") / "policy", "place")), CONFIG
+    )
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +79,9 @@ def test_labels_are_the_experts_at_the_learners_states(driven, learner):
 
 
 def test_workers_and_repetition_change_nothing(driven, learner, tmp_path):
-    again = record(CONFIG, episodes=3, seed=1000, out=tmp_path / "again", learner=learner, workers=2)
+    again = record(
+        CONFIG, episodes=3, seed=1000, out=tmp_path / "again", learner=learner, workers=2
+    )
     assert [path.read_bytes() for path in again] == [path.read_bytes() for path in driven]
     request = read_marker(tmp_path / "again")["request"]
     assert request["learner"] == learner.digest
@@ -93,7 +99,7 @@ def test_a_learner_of_another_task_and_a_folder_without_one_are_refused(learner,
 def test_both_rounds_become_one_dataset(driven, tmp_path):
     first = record(CONFIG, episodes=2, out=tmp_path / "first")
     folders = [tmp_path / "first", driven[0].parent]
-    summary = render_demos(folders, tmp_path / "both", views=("front",), size=16, every=5)
+    summary = render_demos(folders, tmp_path / "both", views=("front",), size=16, frame_stride=5)
     assert summary.episodes == 5
     dataset = open_dataset(tmp_path / "both")
     lengths = [stop - start for start, stop in dataset.bounds()]
@@ -102,4 +108,6 @@ def test_both_rounds_become_one_dataset(driven, tmp_path):
     assert [request["seed"] for request in meta["demos_requests"]] == [0, 1000]
     other = record(TaskConfig("insert"), episodes=1, out=tmp_path / "insert")
     with pytest.raises(BadFile, match="another task or scene"):
-        render_demos([tmp_path / "first", other[0].parent], tmp_path / "mixed", views=("front",), size=16)
+        render_demos(
+            [tmp_path / "first", other[0].parent], tmp_path / "mixed", views=("front",), size=16
+        )

@@ -1,4 +1,6 @@
-"""Levers, banks of starts and randomisation in a grid: one thing replaced at a time, and evaluated where it says."""
+"""Ablations, banks of starts and randomisation in a grid: one thing replaced at a time, and
+evaluated where it says.
+"""
 
 import json
 from dataclasses import fields, replace
@@ -14,7 +16,7 @@ from surgicai_vision.core.config import RandomisationConfig, read_changes
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.experiments.run import Cell
 from surgicai_vision.experiments.sweep import Grid, plan, run_sweep
-from surgicai_vision.experiments.sweep.grid import BANKS, Lever
+from surgicai_vision.experiments.sweep.grid import BANKS, Ablation
 from surgicai_vision.experiments.sweep.plan import Jobs
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import read_checkpoint
@@ -24,7 +26,7 @@ task: grasp
 encoder: random-conv
 view: ["front,back"]
 recipe: best
-every: 5
+frame_stride: 5
 demonstrations: 4
 proprioception: true
 """
@@ -36,43 +38,54 @@ def write(path, *lines):
 
 
 @pytest.fixture
-def levered(tmp_path):
-    """A cell that sees, one that does not, and five levers."""
-    levers = [
-        "lever:",
+def ablated(tmp_path):
+    """A cell that sees, one that does not, and five ablations."""
+    ablations = [
+        "ablation:",
         "  - view: front",
         "  - {view: [front, wrist_psm2]}",
         "  - change: clock=false,proprioception=false",
         "  - {demonstrations: 2}",
         "  - {pool: spatial}",
     ]
-    return read_grid(write(tmp_path / "grid.yaml", *levers))
+    return read_grid(write(tmp_path / "grid.yaml", *ablations))
 
 
-def test_a_lever_replaces_one_thing_in_the_cells_that_see(levered):
-    whole, blind, *rest = levered.cells
-    assert blind.encoder is None and len(rest) == len(levered.lever) == 5
-    for cell, lever in zip(rest, levered.lever, strict=True):
-        changed = {item.name for item in fields(Cell) if getattr(cell, item.name) != getattr(whole, item.name)}
-        assert changed == set(lever.replaced) and len(changed) == 1
-    assert levered.views == ("front", "back", "wrist_psm2"), "what some lever sees is rendered"
-    assert len({levered.key(cell) for cell in levered.cells}) == 7
+def test_a_lever_replaces_one_thing_in_the_cells_that_see(ablated):
+    whole, blind, *rest = ablated.cells
+    assert blind.encoder is None and len(rest) == len(ablated.ablation) == 5
+    for cell, ablation in zip(rest, ablated.ablation, strict=True):
+        changed = {
+            item.name
+            for item in fields(Cell)
+            if getattr(cell, item.name) != getattr(whole, item.name)
+        }
+        assert changed == set(ablation.replaced) and len(changed) == 1
+    assert ablated.views == ("front", "back", "wrist_psm2"), "what some ablation sees is rendered"
+    assert len({ablated.key(cell) for cell in ablated.cells}) == 7
     assert rest[2].name.endswith("best+clock=false+proprioception=false")
 
 
-def test_levers_share_the_features_they_have_in_common(levered, tmp_path):
-    jobs = Jobs(levered, tmp_path)
-    made = {job.key() for cell in levered.cells for job in jobs.features(cell)}
+def test_levers_share_the_features_they_have_in_common(ablated, tmp_path):
+    jobs = Jobs(ablated, tmp_path)
+    made = {job.key() for cell in ablated.cells for job in jobs.features(cell)}
     assert len(made) == 3 + 2, "three views of the whole, and two of the other pool"
-    assert jobs.features(levered.cells[0])[0].arguments["cell"]["change"] == ["every=5"], "thinned as the recipe says"
+    assert jobs.features(ablated.cells[0])[0].arguments["cell"]["change"] == ["frame_stride=5"], (
+        "thinned as the recipe says"
+    )
 
 
-def test_a_change_reaches_the_recipe(levered):
-    recipes = [policies.load_recipe("bc", cell.recipe, cell.changes) for cell in levered.cells]
+def test_a_change_reaches_the_recipe(ablated):
+    recipes = [policies.load_recipe("bc", cell.recipe, cell.changes) for cell in ablated.cells]
     assert (recipes[0].clock, recipes[0].proprioception) == (True, True)
     assert (recipes[4].clock, recipes[4].proprioception) == (False, False)
     assert recipes[4] == replace(recipes[0], clock=False, proprioception=False)
-    assert read_changes(("a=1", "b=[1, 2]", "c=x", "d=false")) == {"a": 1, "b": [1, 2], "c": "x", "d": False}
+    assert read_changes(("a=1", "b=[1, 2]", "c=x", "d=false")) == {
+        "a": 1,
+        "b": [1, 2],
+        "c": "x",
+        "d": False,
+    }
     for wrong in (("clock",), ("=1",), ("a=1", "a=2"), ("a=[",)):
         with pytest.raises(InputError, match="change"):
             read_changes(wrong)
@@ -83,11 +96,11 @@ def test_a_change_reaches_the_recipe(levered):
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        ("lever: [{}]", "replaces nothing"),
-        ("lever: [{demonstrations: 5}]", "allowed: 1 to 4"),
-        ("lever: [{encoder: rondom-conv}]", "Did you mean 'random-conv'"),
-        ("lever: [{recipe: best}]", "2 of them different"),
-        ("lever: [{seed: 3}]", "Unknown key"),
+        ("ablation: [{}]", "replaces nothing"),
+        ("ablation: [{demonstrations: 5}]", "allowed: 1 to 4"),
+        ("ablation: [{encoder: rondom-conv}]", "Did you mean 'random-conv'"),
+        ("ablation: [{recipe: best}]", "2 of them different"),
+        ("ablation: [{seed: 3}]", "Unknown key"),
         ("starts: vlidation", "Did you mean 'validation'"),
         ("randomisation: {phantom_shift: 50}", "phantom_shift is 50"),
     ],
@@ -99,12 +112,14 @@ def test_a_wrong_lever_bank_or_randomisation_is_refused(tmp_path, line, told):
 
 def test_banks_are_the_starts_of_their_names():
     assert dict(BANKS) == {"test": names.TEST_SEED, "validation": names.VALIDATION_SEED}
-    assert Lever(pool="spatial").replaced == {"pool": "spatial"}
+    assert Ablation(pool="spatial").replaced == {"pool": "spatial"}
 
 
 def test_a_randomised_grid_demonstrates_and_evaluates_in_that_world(tmp_path):
     axes = RandomisationConfig(phantom_shift=4.0)
-    grid = Grid(("place",), (), (), proprioception=True, demonstrations=(2,), epochs=1, episodes=2, size=32)
+    grid = Grid(
+        ("place",), (), (), proprioception=True, demonstrations=(2,), epochs=1, episodes=2, size=32
+    )
     moving = replace(grid, randomisation=axes, starts="validation")
     out = tmp_path / "out"
     result = run_sweep(moving, out, QuietConsole().stage, 0)
@@ -118,4 +133,6 @@ def test_a_randomised_grid_demonstrates_and_evaluates_in_that_world(tmp_path):
         assert stored["about"]["task_config"]["randomisation"]["phantom_shift"] == 4.0
     meta = json.loads((out / "data/place/dataset/meta/surgicai.json").read_text())
     assert np.isclose(meta["task_config"]["randomisation"]["phantom_shift"], 4.0)
-    assert {grid.key(cell) for cell in grid.cells}.isdisjoint(moving.key(cell) for cell in moving.cells)
+    assert {grid.key(cell) for cell in grid.cells}.isdisjoint(
+        moving.key(cell) for cell in moving.cells
+    )

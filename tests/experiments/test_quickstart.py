@@ -20,7 +20,7 @@ TINY = {
 }
 GRID = {
     "task": ["grasp"],
-    "encoder": ["r3m"],  # its weights are nowhere here; the cells that run need no pictures
+    "encoder": ["r3m"],  # its weights are nowhere here; the cells that run need no images
     "view": ["back"],
     "seed": [0, 1],
     "proprioception": True,
@@ -50,27 +50,43 @@ def run(folder, monkeypatch, capsys, *arguments):
 def times(folder):
     """Modification times of every file below `folder`, but for the page and the run's own times."""
     paths = [os.path.join(root, name) for root, _, found in os.walk(folder) for name in found]
-    return {path: os.stat(path).st_mtime_ns for path in paths if not path.endswith(("report.html", "run.json"))}
+    return {
+        path: os.stat(path).st_mtime_ns
+        for path in paths
+        if not path.endswith(("report.html", "run.json"))
+    }
 
 
 def test_quickstart_runs_and_runs_again_without_work(folder, monkeypatch, capsys):
-    code, first = run(folder, monkeypatch, capsys, "quickstart", "--config", "tiny.yaml", "--out", "out")
+    code, first = run(
+        folder, monkeypatch, capsys, "quickstart", "--config", "tiny.yaml", "--out", "out"
+    )
     assert code == 0
-    assert [result["policy"] for result in first["results"]] == ["imagenet-lite-back", "proprioception", "expert"]
+    assert [result["policy"] for result in first["results"]] == [
+        "imagenet-lite-back",
+        "proprioception",
+        "expert",
+    ]
     assert all(result["episodes"] == 2 and result["errors"] == 0 for result in first["results"])
     page = (folder / first["report"]).read_text()
     assert page.count("<img") >= 3, "at least the views"
     before = times(folder / "out")
-    code, second = run(folder, monkeypatch, capsys, "quickstart", "--config", "tiny.yaml", "--out", "out")
+    code, second = run(
+        folder, monkeypatch, capsys, "quickstart", "--config", "tiny.yaml", "--out", "out"
+    )
     assert code == 0
     assert second["results"] == first["results"]
     assert times(folder / "out") == before
 
 
 def test_a_checkpoint_of_it_is_evaluated_to_the_same_result(folder, monkeypatch, capsys):
-    stored = json.loads((folder / "out/evaluations/imagenet-lite-back/evaluation.json").read_text())["summary"]
+    stored = json.loads(
+        (folder / "out/evaluations/imagenet-lite-back/evaluation.json").read_text()
+    )["summary"]
     policy = "out/policies/imagenet-lite-back"
-    _, again = run(folder, monkeypatch, capsys, "evaluate", policy, "--episodes", "2", "--workers", "2")
+    _, again = run(
+        folder, monkeypatch, capsys, "evaluate", policy, "--episodes", "2", "--workers", "2"
+    )
     assert {key: again[key] for key in stored} == stored
 
 
@@ -96,7 +112,9 @@ def test_sweep_runs_reports_and_resumes(folder, monkeypatch, capsys):
     code, second = run(folder, monkeypatch, capsys, "sweep", "grid.yaml", "--out", "sweep")
     assert (second["done"], second["cached"], second["digest"]) == (0, 2, first["digest"])
     after = times(folder / "sweep")
-    assert {path for path in after if after[path] != before.get(path)} == {str(folder / "sweep/episodes.parquet")}
+    assert {path for path in after if after[path] != before.get(path)} == {
+        str(folder / "sweep/episodes.parquet")
+    }
     code, _ = run(folder, monkeypatch, capsys, "report", "sweep")
     assert code == 0
     page = (folder / "sweep/report.html").read_text()

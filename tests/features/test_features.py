@@ -24,7 +24,9 @@ class FakeDataset:
     def frames(self, view: str, start: int, stop: int) -> np.ndarray:
         self.reads += stop - start
         values = np.arange(start, stop) + 100 * self.views.index(view)
-        return np.broadcast_to(values[:, None, None, None], (stop - start, 4, 4, 3)).astype(np.uint8)
+        return np.broadcast_to(values[:, None, None, None], (stop - start, 4, 4, 3)).astype(
+            np.uint8
+        )
 
 
 class FakeEncoder:
@@ -32,7 +34,9 @@ class FakeEncoder:
 
     card, pool, dim, shape = CARD, "global", 3, (3,)
 
-    def __init__(self, fingerprint: str = "encoder", fail_after: int | None = None, value: float = 0.0):
+    def __init__(
+        self, fingerprint: str = "encoder", fail_after: int | None = None, value: float = 0.0
+    ):
         self.fingerprint, self.weights_sha256, self.seen = fingerprint, fingerprint, 0
         self.fail_after, self.value = fail_after, value
 
@@ -73,7 +77,9 @@ def test_interrupted_encoding_resumes(tmp_path: Path) -> None:
         encode(FakeDataset(), "front", FakeEncoder(fail_after=10), tmp_path)
     assert [entry.manifest for entry in list_cache(tmp_path)] == [None]
     encoder, steps = FakeEncoder(), []
-    entry = encode(FakeDataset(), "front", encoder, tmp_path, lambda done, total: steps.append((done, total)))
+    entry = encode(
+        FakeDataset(), "front", encoder, tmp_path, lambda done, total: steps.append((done, total))
+    )
     assert encoder.seen == 13 and steps[0] == (10, 23) and steps[-1] == (23, 23)
     np.testing.assert_array_equal(entry.rows, expected())
 
@@ -134,7 +140,9 @@ def test_list_and_prune(tmp_path: Path) -> None:
     assert left.manifest is not None and left.manifest["dataset"] == "data" and left.size > 0
 
 
-def test_cache_root_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cache_root_follows_the_environment(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path))
     assert module.default_cache_root() == tmp_path
     monkeypatch.delenv("SURGICAI_VISION_CACHE")

@@ -1,4 +1,6 @@
-"""The linear probe: what it finds in features that hold the pose, what in noise, and what it refuses."""
+"""The linear probe: what it finds in features that hold the pose, what in noise, and what it
+refuses.
+"""
 
 import json
 from dataclasses import dataclass, field
@@ -31,7 +33,7 @@ def poses(episodes: int, frames: int, seed: int = 0) -> np.ndarray:
 
 @dataclass
 class Dataset:
-    """Episodes of a needle's poses, shown in one-pixel pictures."""
+    """Episodes of a needle's poses, shown in one-pixel images."""
 
     pose: np.ndarray = field(default_factory=lambda: poses(20, 6))
     episodes: int = 20
@@ -49,7 +51,9 @@ class Dataset:
 
     def frames(self, view: str, start: int, stop: int) -> np.ndarray:
         place = (self.pose[start:stop, :3] - HOME) / 0.04 + 0.5
-        return np.broadcast_to((255 * place).astype(np.uint8)[:, None, None], (stop - start, 32, 32, 3))
+        return np.broadcast_to(
+            (255 * place).astype(np.uint8)[:, None, None], (stop - start, 32, 32, 3)
+        )
 
 
 def features(rows: np.ndarray, dataset: Dataset, view: str = "front") -> Features:
@@ -71,7 +75,9 @@ def test_features_that_hold_the_pose_are_read_and_noise_is_not() -> None:
 
 
 def test_an_episodes_identity_does_not_help() -> None:
-    """Features that only say which episode it is fit the episodes known and fail on those held out."""
+    """Features that only say which episode it is fit the episodes known and fail on those held
+    out.
+    """
     dataset = Dataset()
     identity = np.eye(20)[dataset.episode_index]
     found = probe(dataset, [features(identity, dataset)])
@@ -93,15 +99,21 @@ def test_dual_ridge_is_ridge_in_closed_form() -> None:
     mean, centre = fitted.mean(0), target.mean(0)
     centred = fitted - mean
     strength = penalty * np.trace(centred @ centred.T)
-    weights = np.linalg.solve(centred.T @ centred + strength * np.eye(8), centred.T @ (target - centre))
+    weights = np.linalg.solve(
+        centred.T @ centred + strength * np.eye(8), centred.T @ (target - centre)
+    )
     ridge = _Ridge(fitted @ fitted.T, asked @ fitted.T)
-    np.testing.assert_allclose(ridge.answer(target, penalty), (asked - mean) @ weights + centre, atol=1e-9)
+    np.testing.assert_allclose(
+        ridge.answer(target, penalty), (asked - mean) @ weights + centre, atol=1e-9
+    )
 
 
 def test_tip_is_where_the_needle_ends() -> None:
     pose = poses(1, 1)
     tip, _ = _targets(pose)
-    np.testing.assert_allclose(tip[0], pose[0, :3] + rotations.quaternion_to_matrix(pose[0, 3:]) @ point(TIP_ANGLE))
+    np.testing.assert_allclose(
+        tip[0], pose[0, :3] + rotations.quaternion_to_matrix(pose[0, 3:]) @ point(TIP_ANGLE)
+    )
 
 
 def test_frames_are_spread_over_every_episode() -> None:
@@ -146,8 +158,12 @@ def test_verb_writes_a_row_a_view_set(
     assert main(["probe", "--encoder", "tiny", "--view", "front,back", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
     assert [row["view"] for row in rows] == ["front", "back", "front+back"]
-    stored = json.loads((tmp_path / "outputs" / "probes" / "grasp-tiny-front+back" / "probe.json").read_text())
-    assert stored == rows and all(row["n"] == 20 and row["tip_mm"] < 0.5 * row["tip_mm_chance"] for row in rows)
+    stored = json.loads(
+        (tmp_path / "outputs" / "probes" / "grasp-tiny-front+back" / "probe.json").read_text()
+    )
+    assert stored == rows and all(
+        row["n"] == 20 and row["tip_mm"] < 0.5 * row["tip_mm_chance"] for row in rows
+    )
     assert main(["probe", "--encoder", "tini"]) == 2
     assert "tiny" in capsys.readouterr().err
     assert main(["probe", "--encoder", "tiny", "--view", "wrist"]) == 2

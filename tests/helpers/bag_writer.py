@@ -45,7 +45,8 @@ TOPICS = MappingProxyType(
 class Motion:
     """What stood where in each state of a demonstration, every 20 ms.
 
-    Tips (T, 4, 4) in the arm's base, jaws and joints by arm, needles (T, 4, 4) in world, phases (T,).
+    Tips (T, 4, 4) in the arm's base, jaws and joints by arm, needles (T, 4, 4) in world, phases
+    (T,).
     """
 
     tip: dict
@@ -83,7 +84,9 @@ def watched(env, demo):
 
 
 def streams(motion, jaw_scale=2.0, labels=True):
-    """Return role → (times since the start [ns], values); the jaw as dVRK has it, twice a finger's angle."""
+    """Return role → (times since the start [ns], values); the jaw as dVRK has it, twice a finger's
+    angle.
+    """
     times = (np.arange(len(motion)) * 20_000_000).astype(np.int64)
     found = {}
     for arm in names.ARMS:
@@ -96,7 +99,9 @@ def streams(motion, jaw_scale=2.0, labels=True):
     return found
 
 
-def write_bag(path, form, found, topics=TOPICS, types=TYPES, late=0, frame="PSM_base", stamped=True, packed=""):
+def write_bag(
+    path, form, found, topics=TOPICS, types=TYPES, late=0, frame="PSM_base", stamped=True, packed=""
+):
     """Write streams as a bag.
 
     Args:
@@ -144,11 +149,15 @@ def _message(store, kind, value, stamp, frame, ros1):
     if kind.startswith("std_msgs"):
         return types[kind](data=value)
     time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
-    header = types["std_msgs/msg/Header"](stamp=time, frame_id=frame, **({"seq": 0} if ros1 else {}))
+    header = types["std_msgs/msg/Header"](
+        stamp=time, frame_id=frame, **({"seq": 0} if ros1 else {})
+    )
     if kind == "sensor_msgs/msg/JointState":
         values = np.atleast_1d(np.asarray(value, dtype=np.float64))
         none = np.zeros(0)
-        return types[kind](header=header, name=["j"] * len(values), position=values, velocity=none, effort=none)
+        return types[kind](
+            header=header, name=["j"] * len(values), position=values, velocity=none, effort=none
+        )
     place, (w, x, y, z) = value[:3, 3].tolist(), _quaternion(value)
     turn = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
     if kind == "geometry_msgs/msg/TransformStamped":
@@ -156,7 +165,9 @@ def _message(store, kind, value, stamp, frame, ros1):
         transform = types["geometry_msgs/msg/Transform"](translation=shift, rotation=turn)
         return types[kind](header=header, child_frame_id="tip", transform=transform)
     point = types["geometry_msgs/msg/Point"](*place)
-    return types[kind](header=header, pose=types["geometry_msgs/msg/Pose"](position=point, orientation=turn))
+    return types[kind](
+        header=header, pose=types["geometry_msgs/msg/Pose"](position=point, orientation=turn)
+    )
 
 
 def _quaternion(pose):

@@ -1,4 +1,6 @@
-"""A headless Chromium that tests steer through its debugging pipe; nothing but the standard library."""
+"""A headless Chromium that tests steer through its debugging pipe; nothing but the standard
+library.
+"""
 
 import json
 import os
@@ -7,7 +9,9 @@ import shutil
 import subprocess
 import time
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMIUM = (
+    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+)
 
 
 class Browser:
@@ -23,7 +27,8 @@ class Browser:
             f"--user-data-dir={profile}",
         ]
         options += [f"--window-size={width},{height}", "--no-first-run", "about:blank"]
-        shell = f'exec "$0" "$@" 3<&{to_browser[0]} 4>&{from_browser[1]}'  # the browser reads there and writes here
+        # the browser reads there and writes here
+        shell = f'exec "$0" "$@" 3<&{to_browser[0]} 4>&{from_browser[1]}'
         self._process = subprocess.Popen(
             ["bash", "-c", shell, CHROMIUM, *options],
             pass_fds=(to_browser[0], from_browser[1]),
@@ -36,8 +41,12 @@ class Browser:
         self.complaints = []
 
     def __enter__(self):
-        page = next(row for row in self.call("Target.getTargets")["targetInfos"] if row["type"] == "page")
-        self._session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
+        page = next(
+            row for row in self.call("Target.getTargets")["targetInfos"] if row["type"] == "page"
+        )
+        self._session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)[
+            "sessionId"
+        ]
         for domain in ("Runtime", "Log", "Page"):
             self.call(f"{domain}.enable")
         return self
@@ -50,14 +59,20 @@ class Browser:
 
     def open(self, address):
         self.call("Page.navigate", url=address)
-        assert self.until(f"location.href === {json.dumps(address)} && document.readyState === 'complete'")
+        assert self.until(
+            f"location.href === {json.dumps(address)} && document.readyState === 'complete'"
+        )
 
     def key(self, code, down):
-        self.call("Input.dispatchKeyEvent", type="keyDown" if down else "keyUp", code=code, key=code)
+        self.call(
+            "Input.dispatchKeyEvent", type="keyDown" if down else "keyUp", code=code, key=code
+        )
 
     def value(self, expression):
         """Return what an expression of the page is."""
-        answer = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        answer = self.call(
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+        )
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 

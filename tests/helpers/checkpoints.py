@@ -10,7 +10,7 @@ from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
 
 
 def checkpoint(folder: Path, task: str, policy: str = "bc") -> str:
-    """Write an untrained policy that sees no picture."""
+    """Write an untrained policy that sees no image."""
     plugin = {"bc": BC, "hlp": HLP}[policy]
     written = Checkpoint(
         task=TaskConfig(task), policy=policy, recipe=to_mapping(Recipe()), recipe_name="paper", views=(),

@@ -8,7 +8,9 @@ from surgicai_vision.demos.expert import Expert
 
 
 def make(task, *, obs_type="state", **fields):
-    return envs.make(TaskConfig(task, **fields), obs_type=obs_type, cameras=("back",), image_size=32)
+    return envs.make(
+        TaskConfig(task, **fields), obs_type=obs_type, cameras=("back",), image_size=32
+    )
 
 
 def flat(observation):
@@ -16,7 +18,11 @@ def flat(observation):
     if not isinstance(observation, dict):
         return {"": observation}
     parts = {key: flat(value) for key, value in observation.items()}
-    return {f"{key}.{rest}".rstrip("."): part for key, rests in parts.items() for rest, part in rests.items()}
+    return {
+        f"{key}.{rest}".rstrip("."): part
+        for key, rests in parts.items()
+        for rest, part in rests.items()
+    }
 
 
 def same(one, other):

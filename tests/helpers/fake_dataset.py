@@ -14,7 +14,9 @@ DIM = 12
 
 @dataclass
 class FakeDataset:
-    """A dataset in memory: the action is a smooth function of the state, plus one of the features."""
+    """A dataset in memory: the action is a smooth function of the state, plus one of the
+    features.
+    """
 
     episodes: int = 5
     steps: int = 40
@@ -38,7 +40,9 @@ class FakeDataset:
 
 
 def features_of(fake: FakeDataset, view: str = "back", **changes: object) -> Features:
-    card = dict.fromkeys(("input_size", "input_range", "mean", "std", "interpolation", "channel_order"), 0)
+    card = dict.fromkeys(
+        ("input_size", "input_range", "mean", "std", "interpolation", "channel_order"), 0
+    )
     manifest = {
         "dataset": fake.fingerprint,
         "view": view,

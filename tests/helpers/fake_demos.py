@@ -12,7 +12,9 @@ def render_with_fake_env(monkeypatch, config):
     """Let `render_demos` see the stand-in environment, without GL."""
     monkeypatch.setattr(render, "_env", lambda _, *rest: FakeEnv(config, *rest))
     monkeypatch.setattr(render, "_renderer", lambda: "none")
-    monkeypatch.setattr(render, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()})
+    monkeypatch.setattr(
+        render, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()}
+    )
 
 
 def write_demos(folder, config, seeds):

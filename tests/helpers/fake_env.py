@@ -1,7 +1,7 @@
 """A small stand-in for the suturing environment: numpy only, the same interface, no GL.
 
-The state is [goal, position, step, command]; each picture is a function of it. Used where a test is about
-files and processes, not about pictures.
+The state is [goal, position, step, command]; each image is a function of it. Used where a test is
+about files and processes, not about images.
 """
 
 from types import SimpleNamespace
@@ -12,9 +12,22 @@ from surgicai_vision.core.config import TaskConfig
 
 
 class FakeEnv:
-    def __init__(self, config=None, cameras=("front", "back"), image_size=32, depth=False, segmentation=False, **_):
+    def __init__(
+        self,
+        config=None,
+        cameras=("front", "back"),
+        image_size=32,
+        depth=False,
+        segmentation=False,
+        **_,
+    ):
         self.config = config or TaskConfig(max_steps=12)
-        self.cameras, self.size, self.depth, self.segmentation = cameras, image_size, depth, segmentation
+        self.cameras, self.size, self.depth, self.segmentation = (
+            cameras,
+            image_size,
+            depth,
+            segmentation,
+        )
         self.scene = SimpleNamespace(hash="f" * 64)
         self.model = self.data = None
         self.phase = 0
@@ -28,7 +41,13 @@ class FakeEnv:
         self.state = self.state + np.array([0.0, 0.1 * float(action[0]), 1.0, float(action[6])])
         success = abs(self.state[0] - self.state[1]) < 0.06
         info = {"is_success": success, "contact": success, "physics_error": False}
-        return self.observe(), 0.0 if success else -1.0, success, self.state[2] >= self.config.max_steps, info
+        return (
+            self.observe(),
+            0.0 if success else -1.0,
+            success,
+            self.state[2] >= self.config.max_steps,
+            info,
+        )
 
     def get_state(self):
         return self.state.copy()
@@ -53,7 +72,9 @@ class FakeEnv:
         views = {}
         for number, camera in enumerate(self.cameras):
             red = 40 + 10 * self.state[2] + x
-            views[camera] = np.stack([red, 90 * number + y, x * 0 + 100 * self.state[0]], -1).astype(np.uint8)
+            views[camera] = np.stack(
+                [red, 90 * number + y, x * 0 + 100 * self.state[0]], -1
+            ).astype(np.uint8)
         observation = {"pixels": views, "agent_pos": self.agent_pos()}
         if self.depth:
             depth = (0.1 + 0.001 * y + 0.01 * self.state[1]).astype(np.float32)[..., None]

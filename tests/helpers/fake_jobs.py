@@ -50,4 +50,6 @@ def environment(folder):
 def where(folder):
     import ray
 
-    (folder / "result.txt").write_text(f"{ray.util.get_node_ip_address()} {os.environ['LP_NUM_THREADS']}")
+    (folder / "result.txt").write_text(
+        f"{ray.util.get_node_ip_address()} {os.environ['LP_NUM_THREADS']}"
+    )

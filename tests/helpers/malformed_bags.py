@@ -36,7 +36,14 @@ def message(sec=1, place=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0, 1.0), frame=b"bas
     return struct.pack("<IIII", 0, sec, 0, count) + frame + struct.pack("<7d", *place, *turn)
 
 
-def ros1_bag(path, rows, kind="geometry_msgs/msg/PoseStamped", text="", topic="/PSM1/measured_cp", packed=False):
+def ros1_bag(
+    path,
+    rows,
+    kind="geometry_msgs/msg/PoseStamped",
+    text="",
+    topic="/PSM1/measured_cp",
+    packed=False,
+):
     """Return a bag of raw messages under any type name and definition."""
     writer = RosWriter(path)
     if packed:
@@ -114,7 +121,9 @@ def ros1_bags(folder, trace):
         cases[f"type {kind!r}"] = ros1_bag(folder / f"type{index}.bag", [message()], kind)
     for index, (name, text) in enumerate(evil_definitions(trace).items()):
         path = folder / f"evil{index}.bag"
-        cases[name] = ros1_bag(path, [message()], "ambf_msgs/msg/RigidBodyState", text, "/needle/measured_cp")
+        cases[name] = ros1_bag(
+            path, [message()], "ambf_msgs/msg/RigidBodyState", text, "/needle/measured_cp"
+        )
     cases["topic"] = ros1_bag(folder / "topic.bag", [message()], topic="/\x1b[2J\n" + "x" * 5000)
     cases["stamps years apart"] = ros1_bag(folder / "stamps.bag", [message(1), message(2**31)])
     cases["one message"] = ros1_bag(folder / "one.bag", [message()])
@@ -147,7 +156,9 @@ def mcaps(folder):
             cases[f"ones {index}"] = whole[:length] + b"\xff" * 4 + whole[place:]
             cases[f"rubbish {index}"] = whole[: length - 12] + b"\xa5" * 60 + whole[length + 48 :]
     cases["profile"] = whole.replace(b"ros2", b"ros9", 1)
-    cases["type"] = whole.replace(b"geometry_msgs/msg/PoseStamped", b"geometry_msgs/msg/PoseStampeX")
+    cases["type"] = whole.replace(
+        b"geometry_msgs/msg/PoseStamped", b"geometry_msgs/msg/PoseStampeX"
+    )
     cases["summary"] = whole[:-28] + struct.pack("<Q", 2**63) + whole[-20:]
     cases["footer alone"] = whole[:8] + whole[-37:]
     return cases
@@ -166,7 +177,9 @@ def databases(folder, trace):
         ],
         "trigger": ["CREATE TRIGGER t AFTER INSERT ON messages BEGIN DELETE FROM messages; END"],
         "virtual table": ["CREATE VIRTUAL TABLE v USING fts5(a)"],
-        "generated": ["CREATE TABLE g (a INTEGER, b BLOB GENERATED ALWAYS AS (zeroblob(1000000000)))"],
+        "generated": [
+            "CREATE TABLE g (a INTEGER, b BLOB GENERATED ALWAYS AS (zeroblob(1000000000)))"
+        ],
         "no messages": ["DELETE FROM messages"],
         "no topics": ["DROP TABLE topics"],
         "text for bytes": ["UPDATE messages SET data = 'hello'"],
@@ -174,7 +187,9 @@ def databases(folder, trace):
         "short bytes": ["UPDATE messages SET data = x'0001'"],
         "zero bytes": ["UPDATE messages SET data = zeroblob(50000000)"],
         "types": ["UPDATE topics SET type = 'os/msg/system'"],
-        "qos": ["UPDATE topics SET offered_qos_profiles = '!!python/object/apply:os.system [true]'"],
+        "qos": [
+            "UPDATE topics SET offered_qos_profiles = '!!python/object/apply:os.system [true]'"
+        ],
     }
     cases = {}
     for name, statements in changes.items():
@@ -193,7 +208,9 @@ def databases(folder, trace):
         "other files": text.replace("good.db3", "../../../../etc/passwd"),
         "other storage": text.replace("sqlite3", "os.system"),
         "future": text.replace("version: 9", "version: 99"),
-        "packed": text.replace("compression_mode: ''", "compression_mode: FILE\n  compression_format: zstd"),
+        "packed": text.replace(
+            "compression_mode: ''", "compression_mode: FILE\n  compression_format: zstd"
+        ),
         "other packing": text.replace("compression_mode: ''", "compression_mode: MESSAGE"),
         "no cdr": text.replace("serialization_format: cdr", "serialization_format: pickle"),
         "binary": "\x00\x01",

@@ -1,4 +1,4 @@
-"""Pictures for the tests of encoders."""
+"""Images for the tests of encoders."""
 
 from pathlib import Path
 
@@ -6,19 +6,21 @@ import numpy as np
 
 
 def hopper() -> np.ndarray:
-    """The photograph of Grace Hopper that matplotlib ships, its upper square, (1, 224, 224, 3) uint8 RGB."""
+    """The photograph of Grace Hopper that matplotlib ships, its upper square, (1, 224, 224, 3)
+    uint8 RGB.
+    """
     import cv2
     import matplotlib.cbook
 
-    picture = cv2.imread(str(matplotlib.cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)))
-    assert picture is not None
-    return cv2.resize(picture[:512, :512, ::-1], (224, 224), interpolation=cv2.INTER_AREA)[None]
+    image = cv2.imread(str(matplotlib.cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)))
+    assert image is not None
+    return cv2.resize(image[:512, :512, ::-1], (224, 224), interpolation=cv2.INTER_AREA)[None]
 
 
 def photograph(name: str) -> np.ndarray:
-    """A photograph of tests/pictures, (1, 224, 224, 3) uint8 RGB."""
+    """A photograph of tests/images, (1, 224, 224, 3) uint8 RGB."""
     import cv2
 
-    picture = cv2.imread(str(Path(__file__).parent / "images" / f"{name}.jpg"))
-    assert picture is not None and picture.shape == (224, 224, 3)
-    return np.ascontiguousarray(picture[None, ..., ::-1])
+    image = cv2.imread(str(Path(__file__).parent / "images" / f"{name}.jpg"))
+    assert image is not None and image.shape == (224, 224, 3)
+    return np.ascontiguousarray(image[None, ..., ::-1])

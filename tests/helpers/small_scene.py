@@ -9,7 +9,9 @@ SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 
 
 def small_spec() -> mujoco.MjSpec:
-    """Return a wall 123.4 mm in front of the camera "front", a free needle ball, and an arm of nested bodies."""
+    """Return a wall 123.4 mm in front of the camera "front", a free needle ball, and an arm of
+    nested bodies.
+    """
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.stat.extent, spec.stat.center = 0.1, [0.0, 0.0, 0.0]
@@ -27,5 +29,7 @@ def small_spec() -> mujoco.MjSpec:
         finger.add_geom(type=SPHERE, size=[BALL_RADIUS, 0, 0])
     spec.worldbody.add_geom(type=SPHERE, size=[BALL_RADIUS, 0, 0], pos=[0.0, -0.02, -0.08])
     spec.worldbody.add_camera(name="front", fovy=50.0)
-    spec.worldbody.add_camera(name="back", pos=[0.05, 0.03, 0.02], xyaxes=[0.8, 0.0, -0.6, 0.1, 1.0, 0.0], fovy=60.0)
+    spec.worldbody.add_camera(
+        name="back", pos=[0.05, 0.03, 0.02], xyaxes=[0.8, 0.0, -0.6, 0.1, 1.0, 0.0], fovy=60.0
+    )
     return spec

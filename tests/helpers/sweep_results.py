@@ -1,4 +1,6 @@
-"""A sweep's folder as sweeps leave it, with generated episodes: every kind of thing a report has to show."""
+"""A sweep's folder as sweeps leave it, with generated episodes: every kind of thing a report has to
+show.
+"""
 
 import itertools
 
@@ -47,7 +49,11 @@ def evaluation(folder, task, policy, rate, generator, about, episodes=20):
         hard = np.random.default_rng(index).uniform()
         won = generator.uniform() < np.clip(rate + 0.5 * (0.5 - hard), 0.0, 1.0)
         made.append(episode(task, policy, names.TEST_SEED + index, bool(won), generator))
-    common = {"task_config": to_mapping(TaskConfig(task)), "command": COMMAND, "provenance": MACHINE}
+    common = {
+        "task_config": to_mapping(TaskConfig(task)),
+        "command": COMMAND,
+        "provenance": MACHINE,
+    }
     return write_evaluation(folder, made, {**common, **about})
 
 
@@ -68,12 +74,16 @@ def store_cell(out, key, described, rate, generator, **about):
     folder = out / "cells" / key
     more = {"views": view, "encoder": encoder or name, "checkpoint": checkpoint(described["seed"]),
             "folder": f"outputs/sweeps/table/cells/{key}/policy"}  # fmt: skip
-    summary = evaluation(folder / "evaluation", described["task"], name, rate, generator, {**more, **about})
+    summary = evaluation(
+        folder / "evaluation", described["task"], name, rate, generator, {**more, **about}
+    )
     files.write_json(folder / "cell.json", {"cell": described, "summary": summary})
 
 
 def write_sweep(out, tasks=TASKS, seeds=(0, 1), encoders=ENCODERS, views=VIEWS):
-    """Write a sweep's folder: done cells, failed ones, ones not run, references, probes; return `out`."""
+    """Write a sweep's folder: done cells, failed ones, ones not run, references, probes; return
+    `out`.
+    """
     generator = np.random.default_rng(7)
     out.mkdir(parents=True, exist_ok=True)
     not_run = []
@@ -84,7 +94,9 @@ def write_sweep(out, tasks=TASKS, seeds=(0, 1), encoders=ENCODERS, views=VIEWS):
             if (task, encoder, view, seed) == ("handoff", "imagenet", ("back",), 1):
                 (out / "cells" / key).mkdir(parents=True)
                 error = "Traceback\n  in train\nRuntimeError: the disk is full"
-                files.write_json(out / "cells" / key / "failed.json", {"cell": described, "error": error})
+                files.write_json(
+                    out / "cells" / key / "failed.json", {"cell": described, "error": error}
+                )
                 continue
             better = 0.25 if task == "handoff" else 0.0
             store_cell(out, key, described, rate + better + 0.1 * (view == ("back",)), generator)
@@ -94,7 +106,9 @@ def write_sweep(out, tasks=TASKS, seeds=(0, 1), encoders=ENCODERS, views=VIEWS):
     for task in tasks:
         store_cell(out, f"blind{task}", cell(task, None, (), 0), 0.05, generator)
         evaluation(out / "references" / f"expert-{task}", task, "expert", 1.5, generator, {})
-    files.write_json(out / "sweep.json", {"task": list(tasks), "demonstrations": 50, "seed": list(seeds)})
+    files.write_json(
+        out / "sweep.json", {"task": list(tasks), "demonstrations": 50, "seed": list(seeds)}
+    )
     run = {
         "title": "table",
         "command": COMMAND,
@@ -128,7 +142,9 @@ def add_curves(out):
     for swap in (None, "grasp", "insert"):
         stages = generator.integers(0, 6, size=20)
         made = [
-            episode("suture", "chain", names.TEST_SEED + at, bool(stage == 5), generator, int(stage))
+            episode(
+                "suture", "chain", names.TEST_SEED + at, bool(stage == 5), generator, int(stage)
+            )
             for at, stage in enumerate(stages)
         ]
         about = {"task_config": to_mapping(TaskConfig("suture")), "chain": {"hlp": "order"}, "encoder": "imagenet",

@@ -1,4 +1,6 @@
-"""Scripted people: they look at the env and press what a person would, through the real keyboard and gamepad."""
+"""Scripted people: they look at the env and press what a person would, through the real keyboard
+and gamepad.
+"""
 
 import numpy as np
 from fake_env import FakeEnv
@@ -41,7 +43,9 @@ class AtGamepad:
 
     def poll(self):
         motion, jaw = wish(self.session.env, self.steering, self.session.view)
-        motion /= self.steering.speed * max(1.0, np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:]))
+        motion /= self.steering.speed * max(
+            1.0, np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])
+        )
         left, up, depth, tilt, swing, roll = (deflection(value) for value in motion)
         buttons = np.zeros(16)
         buttons[7 if depth > 0 else 6] = abs(depth)
@@ -58,7 +62,9 @@ def deflection(speed):
 
 
 class AtKeyboard:
-    """Steers by keys alone, down or up; what one press was too much or too little, the next ones make good."""
+    """Steers by keys alone, down or up; what one press was too much or too little, the next ones
+    make good.
+    """
 
     def __init__(self, session, steering):
         self.session, self.steering = session, steering
@@ -78,7 +84,9 @@ class AtKeyboard:
             (self.keyboard.press if code in wanted else self.keyboard.release)(code)
         given = self.keyboard.poll()
         for start, vector in ((0, given.move), (3, given.turn)):
-            self.owed[start : start + 3] -= speed * np.array(vector) / max(1.0, np.linalg.norm(vector))
+            self.owed[start : start + 3] -= (
+                speed * np.array(vector) / max(1.0, np.linalg.norm(vector))
+            )
         return given
 
 

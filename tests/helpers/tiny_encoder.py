@@ -15,4 +15,6 @@ def build(card: EncoderCard, path: object) -> tuple[EncoderCard, torch.nn.Module
         return card, torch.nn.Sequential(*layers, torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten())
 
 
-TINY = Plugin(replace(CARD, name="tiny", input_size=32, dim=8), build, released=Released(action_noise=0.3))
+TINY = Plugin(
+    replace(CARD, name="tiny", input_size=32, dim=8), build, released=Released(action_noise=0.3)
+)

@@ -1,4 +1,6 @@
-"""The house: what the distribution owns, what its lock promises, what no file may name, and doctor."""
+"""The house: what the distribution owns, what its lock promises, what no file may name, and
+doctor.
+"""
 
 import importlib.metadata
 import os
@@ -13,7 +15,13 @@ from surgicai_vision.commands import doctor_checks
 
 PACKAGES = ("surgicai_vision", "encoders", "policies")
 # Spelt in pieces, so that this file passes its own test.
-REGISTRY_HOSTS = ("py" + "pi.org", "python" + "hosted.org", "npm" + "js.org", "npm" + "js.com", "deb." + "debian.org")
+REGISTRY_HOSTS = (
+    "py" + "pi.org",
+    "python" + "hosted.org",
+    "npm" + "js.org",
+    "npm" + "js.com",
+    "deb." + "debian.org",
+)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +51,11 @@ def test_doctor_finds_a_foreign_owner(monkeypatch: pytest.MonkeyPatch) -> None:
 def locked_packages(lock: Path) -> dict[str, str]:
     """Pinned line → the text of its hashes."""
     blocks = re.split(r"(?m)^(?=\S)", lock.read_text())
-    return {block.splitlines()[0]: block for block in blocks if block.strip() and not block.startswith("#")}
+    return {
+        block.splitlines()[0]: block
+        for block in blocks
+        if block.strip() and not block.startswith("#")
+    }
 
 
 @pytest.mark.parametrize("name", ["requirements.lock", "scripts/uv.txt"])
@@ -76,7 +88,9 @@ def test_no_file_names_a_package_registry(tracked: list[Path]) -> None:
 
 
 def test_uv_lock_and_outputs_stay_out_of_git(tracked: list[Path], root: Path) -> None:
-    assert not [path for path in tracked if path.name == "uv.lock" or (root / "outputs") in path.parents]
+    assert not [
+        path for path in tracked if path.name == "uv.lock" or (root / "outputs") in path.parents
+    ]
 
 
 def test_setup_refuses_a_python_that_exists_and_fails(root: Path, tmp_path: Path) -> None:
@@ -112,7 +126,14 @@ def test_gl_probe_says_which_library_is_missing(root: Path) -> None:
 
 def test_doctor_reports_every_line_with_advice_where_something_is_wrong() -> None:
     checks = doctor_checks.check()
-    assert {check.name for check in checks} >= {"Python", "packages", "import names", "GL", "GPU", "disk"}
+    assert {check.name for check in checks} >= {
+        "Python",
+        "packages",
+        "import names",
+        "GL",
+        "GPU",
+        "disk",
+    }
     for check in checks:
         assert check.status in ("ok", "warning", "fail")
         assert check.detail
@@ -135,7 +156,9 @@ def test_doctor_tells_a_missing_gl_from_a_broken_scene() -> None:
 def test_doctor_knows_which_encoders_work_offline() -> None:
     checks = {
         check.name: check
-        for check in doctor_checks.check_encoders(doctor_checks.finish_probe(doctor_checks.start_probe("encoders")))
+        for check in doctor_checks.check_encoders(
+            doctor_checks.finish_probe(doctor_checks.start_probe("encoders"))
+        )
     }
     assert checks["encoder imagenet-lite"].status == "ok"
     assert checks["encoder random"].status == "ok"
@@ -154,7 +177,9 @@ def test_doctor_survives_a_probe_that_dies() -> None:
 def test_doctor_finds_old_python_and_wrong_packages(tmp_path: Path) -> None:
     assert doctor_checks.check_python((3, 11)).status == "fail"
     lock = tmp_path / "requirements.lock"
-    lock.write_text("numpy==0.0.1 \\\n    --hash=sha256:00\nno-such-package==1 ; sys_platform == 'linux'\n")
+    lock.write_text(
+        "numpy==0.0.1 \\\n    --hash=sha256:00\nno-such-package==1 ; sys_platform == 'linux'\n"
+    )
     check = doctor_checks.check_packages(lock)
     assert check.status == "warning"
     assert "numpy is " in check.detail

@@ -1,4 +1,6 @@
-"""Wheel and sdist: built, the wheel installed where nothing else of ours is, and used from another folder."""
+"""Wheel and sdist: built, the wheel installed where nothing else of ours is, and used from another
+folder.
+"""
 
 import os
 import subprocess
@@ -37,9 +39,15 @@ def built(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, P
     return wheel, sdist
 
 
-def test_wheel_holds_the_three_packages_and_nothing_else(built: tuple[Path, Path], root: Path) -> None:
+def test_wheel_holds_the_three_packages_and_nothing_else(
+    built: tuple[Path, Path], root: Path
+) -> None:
     contents = zipfile.ZipFile(built[0]).namelist()
-    assert {name.split("/")[0].split("-")[0] for name in contents} == {"surgicai_vision", "encoders", "policies"}
+    assert {name.split("/")[0].split("-")[0] for name in contents} == {
+        "surgicai_vision",
+        "encoders",
+        "policies",
+    }
     sources = {
         f"{path.relative_to(root)}"
         for name in ("surgicai_vision", "encoders", "policies")
@@ -47,34 +55,52 @@ def test_wheel_holds_the_three_packages_and_nothing_else(built: tuple[Path, Path
         if path.suffix in (".py", ".js", ".css", ".j2")
     }
     assert sources <= set(contents)
-    configs = {f"surgicai_vision/{path.relative_to(root)}" for path in (root / "configs").rglob("*") if path.is_file()}
+    configs = {
+        f"surgicai_vision/{path.relative_to(root)}"
+        for path in (root / "configs").rglob("*")
+        if path.is_file()
+    }
     assert configs <= set(contents)
 
 
 def test_sdist_ships_neither_data_nor_tests(built: tuple[Path, Path]) -> None:
     with tarfile.open(built[1]) as archive:
         tops = {Path(name).parts[1] for name in archive.getnames() if len(Path(name).parts) > 1}
-    assert {"surgicai_vision", "encoders", "policies", "configs", "pyproject.toml", "README.md", "LICENSE"} <= tops
+    assert {
+        "surgicai_vision",
+        "encoders",
+        "policies",
+        "configs",
+        "pyproject.toml",
+        "README.md",
+        "LICENSE",
+    } <= tops
     assert not tops & {"data", "tests", "outputs", ".venv"}
 
 
 @pytest.fixture(scope="module")
-def installed(built: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
+def installed(
+    built: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, dict[str, str]]:
     """An empty environment with the wheel in it, and variables that lend it the dependencies.
 
-    PYTHONPATH lends only what lies in this environment's site-packages; its .pth files, and with them our
-    editable install, are not read from there.
+    PYTHONPATH lends only what lies in this environment's site-packages; its .pth files, and with
+    them our editable install, are not read from there.
     """
     folder = tmp_path_factory.mktemp("environment")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
     site = folder / "lib" / f"python3.{sys.version_info.minor}" / "site-packages"
     zipfile.ZipFile(built[0]).extractall(site)
-    environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "COV"))}
+    environment = {
+        key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "COV"))
+    }
     lent = f"{site}{os.pathsep}{sysconfig.get_path('purelib')}"
     return folder, {**environment, "PYTHONPATH": lent, "PYTHONSAFEPATH": "1"}
 
 
-def test_wheel_works_from_another_folder(installed: tuple[Path, dict[str, str]], tmp_path: Path) -> None:
+def test_wheel_works_from_another_folder(
+    installed: tuple[Path, dict[str, str]], tmp_path: Path
+) -> None:
     folder, environment = installed
     site = environment["PYTHONPATH"].split(os.pathsep)[0]
     command = [str(folder / "bin" / "python"), "-c", SMOKE, site]
@@ -82,7 +108,9 @@ def test_wheel_works_from_another_folder(installed: tuple[Path, dict[str, str]],
     assert result.returncode == 0, result.stderr
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["quickstart", "--help"], ["evaluate", "--help"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["--version"], ["quickstart", "--help"], ["evaluate", "--help"]]
+)
 def test_command_of_the_wheel_answers(
     installed: tuple[Path, dict[str, str]], tmp_path: Path, arguments: list[str]
 ) -> None:

@@ -1,4 +1,6 @@
-"""The report: every number and picture is there, the page stands alone, and what it says of a quickstart."""
+"""The report: every number and image is there, the page stands alone, and what it says of a
+quickstart.
+"""
 
 import contextlib
 import re
@@ -13,10 +15,21 @@ from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, SurgicaiError
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.rollout import Episode, EpisodeRow, Film
-from surgicai_vision.evaluation.storage import find_evaluations, read_film, read_rows, write_evaluation
+from surgicai_vision.evaluation.storage import (
+    find_evaluations,
+    read_film,
+    read_rows,
+    write_evaluation,
+)
 
 LIMIT = 3_000_000
-MACHINE = {"packages": {"mujoco": "4.0.0"}, "python": "3.12.1", "system": "Linux", "processor": "test", "cores": 2}
+MACHINE = {
+    "packages": {"mujoco": "4.0.0"},
+    "python": "3.12.1",
+    "system": "Linux",
+    "processor": "test",
+    "cores": 2,
+}
 
 
 def episode(policy, seed, success):
@@ -34,11 +47,24 @@ def episode(policy, seed, success):
 def store(folder, name, successes, views=None):
     """Store an evaluation of 20 episodes."""
     episodes = [episode(name, names.TEST_SEED + i, i < successes) for i in range(20)]
-    about = {"task_config": to_mapping(TaskConfig("grasp")), "command": "surgicai-vision evaluate", "provenance": {}}
+    about = {
+        "task_config": to_mapping(TaskConfig("grasp")),
+        "command": "surgicai-vision evaluate",
+        "provenance": {},
+    }
     if name not in report.REFERENCES:
         encoder = name.rsplit("-", 1)[0] if views else "proprioception"
-        checkpoint = {"weights_sha256": "0123456789abcdef" * 4, "seed": 0, "dataset": "fedcba9876543210" * 4}
-        about |= {"views": views or [], "encoder": encoder, "checkpoint": checkpoint, "folder": "policies/x"}
+        checkpoint = {
+            "weights_sha256": "0123456789abcdef" * 4,
+            "seed": 0,
+            "dataset": "fedcba9876543210" * 4,
+        }
+        about |= {
+            "views": views or [],
+            "encoder": encoder,
+            "checkpoint": checkpoint,
+            "folder": "policies/x",
+        }
     return write_evaluation(folder / "evaluations" / name, episodes, about)
 
 
@@ -63,16 +89,18 @@ def results(tmp_path):
 
 @contextlib.contextmanager
 def painted_stage(config, size, quality="high"):
-    """Paint pictures instead of rendering them."""
+    """Paint images instead of rendering them."""
 
-    def picture(state, view, modality="rgb"):
+    def image(state, view, modality="rgb"):
         ramp = np.linspace(40, 220, size).astype(np.uint8)
-        frame = np.stack(np.broadcast_arrays(ramp[:, None], ramp[None], np.uint8(state[0] % 255)), axis=-1)
+        frame = np.stack(
+            np.broadcast_arrays(ramp[:, None], ramp[None], np.uint8(state[0] % 255)), axis=-1
+        )
         frame = np.ascontiguousarray(frame)
         frame[:40, :40] = contact_sheet.PALETTE[names.PARTS.index("needle")]
         return frame
 
-    yield picture
+    yield image
 
 
 @pytest.fixture
@@ -105,7 +133,9 @@ class Page(HTMLParser):
 
 
 def assert_stands_alone(text):
-    """Nothing is loaded from anywhere, every tag is closed, every link of the page has its target."""
+    """Nothing is loaded from anywhere, every tag is closed, every link of the page has its
+    target.
+    """
     page = Page(text)
     assert page.open == []
     inside = {address[1:] for address in page.addresses if address.startswith("#")}
@@ -130,9 +160,18 @@ def test_page_holds_every_number(results, painted):
         "20 missed",
     ):
         assert expected in text, expected
-    for expected in ("25 demonstrations", "mujoco 4.0.0", "llvmpipe", "0123456789abcdef", "81 s: demos 20 s"):
+    for expected in (
+        "25 demonstrations",
+        "mujoco 4.0.0",
+        "llvmpipe",
+        "0123456789abcdef",
+        "81 s: demos 20 s",
+    ):
         assert expected in text, expected
-    assert "surgicai-vision evaluate policies/x --task grasp --episodes 20 --seed 900000 --json" in text
+    assert (
+        "surgicai-vision evaluate policies/x --task grasp --episodes 20 --seed 900000 --json"
+        in text
+    )
 
 
 def test_page_stands_alone(results, painted):
@@ -164,14 +203,19 @@ def test_without_gl_the_numbers_remain(results, monkeypatch):
 
     monkeypatch.setattr(contact_sheet, "stage", no_gl)
     text = report.write_report(results).read_text()
-    assert "No pictures: nothing renders" in text
+    assert "No images: nothing renders" in text
     assert "13/20" in text
 
 
 def test_names_from_outside_are_escaped(tmp_path, painted):
     evil = "</script><script>alert(1)</script>"
     episodes = [episode(evil, names.TEST_SEED, True)]
-    about = {"task_config": to_mapping(TaskConfig("grasp")), "encoder": evil, "views": ["front"], "command": evil}
+    about = {
+        "task_config": to_mapping(TaskConfig("grasp")),
+        "encoder": evil,
+        "views": ["front"],
+        "command": evil,
+    }
     write_evaluation(tmp_path / "evil", episodes, {**about, "provenance": {}})
     files.write_json(tmp_path / report.RUN_FILE, {"title": evil})
     text = report.write_report(tmp_path).read_text()

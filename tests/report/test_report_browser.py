@@ -1,4 +1,6 @@
-"""The report in headless Chromium: filtering, sorting, a cell's episodes, a phone's width, print."""
+"""The report in headless Chromium: filtering, sorting, a cell's episodes, a phone's width,
+print.
+"""
 
 import html
 import json
@@ -18,8 +20,12 @@ from surgicai_vision.report.groups import group
 from surgicai_vision.report.pairs import compare
 from surgicai_vision.report.reader import collect
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium here: apt-get install chromium")
+CHROMIUM = (
+    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+)
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no chromium here: apt-get install chromium"
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +45,14 @@ def groups(written):
 
 def browse(folder, page, *options):
     """Open a page in a headless browser; return its finished process."""
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0"]
+    command = [
+        CHROMIUM,
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--enable-logging=stderr",
+        "--v=0",
+    ]
     command += [f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=5000", *options]
     return subprocess.run([*command, page], capture_output=True, text=True, timeout=90, check=True)
 
@@ -140,12 +153,23 @@ def test_at_a_phones_width_nothing_but_marked_tables_is_wider(written, tmp_path)
         ' !n.closest(".scroll, dialog")).map(n => n.tagName + "." + n.className);'
         'document.body.dataset.said = d.documentElement.scrollWidth + ":" + wide.join(","); });</script>'
     )
-    done = browse(tmp_path, frame.as_uri(), "--dump-dom", "--hide-scrollbars", "--allow-file-access-from-files")
+    done = browse(
+        tmp_path,
+        frame.as_uri(),
+        "--dump-dom",
+        "--hide-scrollbars",
+        "--allow-file-access-from-files",
+    )
     assert re.search(r'data-said="([^"]*)"', done.stdout)[1] == "375:"
 
 
 def test_the_page_prints(written, tmp_path):
     out = tmp_path / "page.pdf"
-    browse(tmp_path, (written / "report.html").as_uri(), f"--print-to-pdf={out}", "--no-pdf-header-footer")
+    browse(
+        tmp_path,
+        (written / "report.html").as_uri(),
+        f"--print-to-pdf={out}",
+        "--no-pdf-header-footer",
+    )
     pages = len(re.findall(rb"/Type\s*/Page\b", out.read_bytes()))
     assert 3 <= pages <= 20

@@ -1,4 +1,6 @@
-"""Cameras of the scene: the published poses arrived, and the wrist cameras see what they are aimed at."""
+"""Cameras of the scene: the published poses arrived, and the wrist cameras see what they are aimed
+at.
+"""
 
 import math
 
@@ -54,7 +56,9 @@ def test_world_cameras_stand_where_the_table_says(start, name):
     model, data = start
     pose, table = extrinsics(model, data, name), WORLD_CAMERAS[name]
     assert np.allclose(pose[:3, 3], table.position, atol=1e-12)
-    assert np.allclose(pose[:3, 2], np.array(table.direction) / np.linalg.norm(table.direction), atol=1e-6)
+    assert np.allclose(
+        pose[:3, 2], np.array(table.direction) / np.linalg.norm(table.direction), atol=1e-6
+    )
     assert -pose[:3, 1] @ table.up > 0.99
     focal = intrinsics(model, name, 480, 640)[1, 1]
     assert math.isclose(2 * math.atan(240 / focal), table.fovy, rel_tol=1e-9)
@@ -75,7 +79,7 @@ def test_wrist_cameras_see_their_own_jaws(start, arm):
     grasp = np.array([*data.site(f"{arm}_grasp").xpos, 1.0])
     grasp_in_camera = (np.linalg.inv(extrinsics(model, data, camera)) @ grasp)[:3]
     pixel = (intrinsics(model, camera, *SIZE) @ grasp_in_camera / grasp_in_camera[2])[:2]
-    assert np.all(np.abs(pixel - 111.5) < 45)  # well inside the picture
+    assert np.all(np.abs(pixel - 111.5) < 45)  # well inside the image
     pads = [data.geom(f"{arm}_{side}_pad").xpos for side in ("left", "right")]
     with FrameRenderer(model, *SIZE) as renderer:
         parts = renderer.render(data, camera, "segmentation")[..., 0]
@@ -83,13 +87,17 @@ def test_wrist_cameras_see_their_own_jaws(start, arm):
     seen = 0
     for pad in pads:
         pad_in_camera = (np.linalg.inv(extrinsics(model, data, camera)) @ [*pad, 1.0])[:3]
-        u, v = np.rint((intrinsics(model, camera, *SIZE) @ pad_in_camera / pad_in_camera[2])[:2]).astype(int)
+        u, v = np.rint(
+            (intrinsics(model, camera, *SIZE) @ pad_in_camera / pad_in_camera[2])[:2]
+        ).astype(int)
         seen += parts[v, u] == part and abs(depth[v, u] - pad_in_camera[2]) < 0.003
     assert seen >= 1  # one finger may hide the other
 
 
 @pytest.mark.parametrize("camera", FOLLOWING_CAMERAS)
-def test_following_cameras_see_the_jaws_in_their_middle_from_where_the_fixed_one_stands(start, camera):
+def test_following_cameras_see_the_jaws_in_their_middle_from_where_the_fixed_one_stands(
+    start, camera
+):
     model, data = start
     base, arm = camera.split("_")
     for move in (0.0, 0.3):
@@ -100,7 +108,7 @@ def test_following_cameras_see_the_jaws_in_their_middle_from_where_the_fixed_one
         grasp = (np.linalg.inv(pose) @ [*data.site(f"{arm}_grasp").xpos, 1.0])[:3]
         np.testing.assert_allclose(grasp[:2], 0.0, atol=1e-9)
         assert grasp[2] > 0
-        assert -pose[2, 1] > 0.5  # the world's up is up in the picture
+        assert -pose[2, 1] > 0.5  # the world's up is up in the image
         data.joint(f"{arm}_outer_yaw").qpos -= move
     mujoco.mj_forward(model, data)
 

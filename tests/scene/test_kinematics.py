@@ -60,7 +60,9 @@ def test_insertion_moves_along_minus_z():
     assert np.allclose(moved, [0, 0, -0.1], atol=1e-12)
 
 
-@pytest.mark.parametrize(("arm", "expected"), [("psm1", (31.0, 76.3, 108.1)), ("psm2", (-40.9, 73.7, 107.0))])
+@pytest.mark.parametrize(
+    ("arm", "expected"), [("psm1", (31.0, 76.3, 108.1)), ("psm2", (-40.9, 73.7, 107.0))]
+)
 def test_start_tips_in_world(arm, expected):
     start = kinematics.start_in_base(arm)
     tip_in_world = (kinematics.base_in_world(arm) @ start)[:3, 3] * 1000
@@ -73,7 +75,8 @@ def test_start_tips_in_world(arm, expected):
 def test_round_trip_over_the_whole_joint_range(fraction, instrument):
     q = joints_of(fraction, instrument)
     length = INSTRUMENTS[instrument]
-    # With the wrist in the remote centre the first two joints are free; near it they are ill-conditioned.
+    # With the wrist in the remote centre the first two joints are free; near it they are
+    # ill-conditioned.
     assume(abs(q[2] + length.tool - length.rcc) > 1e-5)
     pose = forward(q, instrument)
     found = inverse(pose, instrument, near=q)

@@ -1,4 +1,4 @@
-"""Look: pictures show what physics has, and nothing that is only seen changes physics."""
+"""Look: images show what physics has, and nothing that is only seen changes physics."""
 
 import cv2
 import mujoco
@@ -20,7 +20,9 @@ def at_start(model: mujoco.MjModel, opening: float = 0.4) -> mujoco.MjData:
     """Both tools at their starts, the jaws open by `opening` [rad]."""
     data = mujoco.MjData(model)
     for arm in ARMS:
-        for name, value in zip(kinematics.DVRK_JOINTS, kinematics.inverse(kinematics.start_in_base(arm)), strict=True):
+        for name, value in zip(
+            kinematics.DVRK_JOINTS, kinematics.inverse(kinematics.start_in_base(arm)), strict=True
+        ):
             data.joint(f"{arm}_{name}").qpos = value
             data.actuator(f"{arm}_{name}").ctrl = value
         for side in ("left", "right"):
@@ -59,7 +61,9 @@ def test_physics_is_the_same_without_the_looks(model, monkeypatch):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_skin_lies_on_the_flanks_and_the_holes_are_open(layout):
-    """Depth of a ray through each hole's ink is that of the flank, and through its middle it is deeper."""
+    """Depth of a ray through each hole's ink is that of the flank, and through its middle it is
+    deeper.
+    """
     model = build_scene(SceneConfig(layout=layout)).model
     data = at_start(model)
     T_world_camera, matrix = extrinsics(model, data, "back"), intrinsics(model, "back", *SIZE)
@@ -93,16 +97,16 @@ def test_the_drawn_needle_is_the_physical_one(model):
 
 
 @pytest.mark.parametrize("camera", ["front", "back"])
-def test_pictures_are_bright_and_coloured_everywhere(model, camera):
+def test_images_are_bright_and_coloured_everywhere(model, camera):
     with FrameRenderer(model, 224, 224) as renderer:
         data = at_start(model)
-        picture = renderer.render(data, camera).astype(int)
+        image = renderer.render(data, camera).astype(int)
         parts = renderer.render(data, camera, "segmentation")[..., 0]
-    assert picture[parts == 0].max(axis=1).min() > 30  # no black background
-    needle_colour = picture[parts == PARTS.index("needle")].mean()
-    tissue_colour = picture[parts == PARTS.index("phantom")].mean()
+    assert image[parts == 0].max(axis=1).min() > 30  # no black background
+    needle_colour = image[parts == PARTS.index("needle")].mean()
+    tissue_colour = image[parts == PARTS.index("phantom")].mean()
     assert needle_colour > tissue_colour + 60
-    assert (picture == 255).all(axis=2).mean() < 0.01
+    assert (image == 255).all(axis=2).mean() < 0.01
 
 
 def test_jaws_are_seen_to_open(model):
@@ -134,7 +138,9 @@ def test_a_texture_changes_the_scene_hash(monkeypatch):
     assert build_spec(SceneConfig()).to_xml() != before
 
 
-@pytest.mark.parametrize("mesh", [block((1, 2, 3), (0.1, 0.2, 0.3)), rod((0, 0, 0), (0, 1, 1), 0.2)])
+@pytest.mark.parametrize(
+    "mesh", [block((1, 2, 3), (0.1, 0.2, 0.3)), rod((0, 0, 0), (0, 1, 1), 0.2)]
+)
 def test_solids_are_closed_and_face_outwards(mesh):
     points = np.array(mesh.points)
     centre = points.mean(axis=0)

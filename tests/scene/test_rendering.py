@@ -1,4 +1,4 @@
-"""Rendering: the laws of pictures, on a tiny scene whose answers are known."""
+"""Rendering: the laws of images, on a tiny scene whose answers are known."""
 
 import multiprocessing
 import os
@@ -51,7 +51,7 @@ def test_shapes_types_and_own_memory(renderer, data, modality):
 
 
 @pytest.mark.parametrize("modality", MODALITIES)
-def test_same_state_same_picture_another_state_other_pixels(renderer, model, data, modality):
+def test_same_state_same_image_another_state_other_pixels(renderer, model, data, modality):
     first = renderer.render(data, "front", modality)
     assert np.array_equal(first, renderer.render(data, "front", modality))
     data.qpos[0] += 0.005
@@ -62,7 +62,7 @@ def test_same_state_same_picture_another_state_other_pixels(renderer, model, dat
     assert np.array_equal(first, renderer.render(data, "front", modality))
 
 
-def test_several_modalities_in_one_call_are_the_same_pictures(renderer, data):
+def test_several_modalities_in_one_call_are_the_same_images(renderer, data):
     together = renderer.render_all(data, "front", MODALITIES)
     for modality in MODALITIES:
         assert np.array_equal(together[modality], renderer.render(data, "front", modality))
@@ -86,7 +86,9 @@ def test_segmentation_names_every_part(renderer, model, data):
 
 @pytest.mark.parametrize("camera", ["front", "back"])
 def test_camera_matrices_find_the_needle(renderer, model, data, camera):
-    rows, columns = np.nonzero(renderer.render(data, camera, "segmentation")[..., 0] == PARTS.index("needle"))
+    rows, columns = np.nonzero(
+        renderer.render(data, camera, "segmentation")[..., 0] == PARTS.index("needle")
+    )
     T_world_camera = extrinsics(model, data, camera)
     assert np.allclose(T_world_camera[:3, :3] @ T_world_camera[:3, :3].T, np.eye(3), atol=1e-12)
     needle_in_camera = (np.linalg.inv(T_world_camera) @ [*data.body("needle").xpos, 1.0])[:3]
@@ -105,7 +107,7 @@ def test_high_quality_differs_and_leaves_the_model_alone(model, data):
 
 
 def test_models_and_sizes_side_by_side(model, data):
-    """Closing or collecting one renderer leaves the pictures of the others alone."""
+    """Closing or collecting one renderer leaves the images of the others alone."""
     other = small_spec()
     other.body("phantom").pos[2] -= 0.05
     other_model = other.compile()
@@ -139,20 +141,22 @@ def test_wrong_arguments_are_refused_with_what_exists(model, data):
         renderer.render(data, "front")
 
 
-def _picture_in_child(queue, renderer, data):
+def _image_in_child(queue, renderer, data):
     with FrameRenderer(renderer.model, *SIZE) as own:
         queue.put((own.render(data, "front"), renderer.render(data, "front")))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # threads of numpy, which the child does not use
-def test_a_forked_child_draws_the_same_picture(model, data):
+@pytest.mark.filterwarnings(
+    "ignore:This process:DeprecationWarning"
+)  # threads of numpy, which the child does not use
+def test_a_forked_child_draws_the_same_image(model, data):
     """Gymnasium's vector environments fork, and the parent may have drawn before."""
     context = multiprocessing.get_context("fork")
     with FrameRenderer(model, *SIZE) as renderer:
         expected = renderer.render(data, "front")
         queue = context.Queue()
-        child = context.Process(target=_picture_in_child, args=(queue, renderer, data))
+        child = context.Process(target=_image_in_child, args=(queue, renderer, data))
         child.start()
         own, inherited = queue.get(timeout=60)
         child.join(timeout=60)
@@ -175,5 +179,7 @@ def test_a_process_that_closes_nothing_ends_cleanly():
         "renderers = [FrameRenderer(model, 32, 32), FrameRenderer(model, 64, 64, 'high')]\n"
         "print(sum(r.render(data, 'front').mean() > 0 for r in renderers))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "2\n", "")

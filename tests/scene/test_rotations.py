@@ -12,7 +12,9 @@ from surgicai_vision.scene import rotations
 
 angles = st.floats(-math.pi, math.pi)
 components = st.floats(-1.0, 1.0)
-rotvecs = st.tuples(components, components, components).map(lambda v: np.array(v) * math.pi / math.sqrt(3))
+rotvecs = st.tuples(components, components, components).map(
+    lambda v: np.array(v) * math.pi / math.sqrt(3)
+)
 matrices = rotvecs.map(rotations.rotvec_to_matrix)
 
 
@@ -44,8 +46,12 @@ def test_logarithm_inverts_exponential(matrix):
 def test_logarithm_at_the_ends(angle):
     axis = np.array([2.0, -3.0, 6.0]) / 7.0
     matrix = rotations.rotvec_to_matrix(axis * angle)
-    assert math.isclose(np.linalg.norm(rotations.matrix_to_rotvec(matrix)), angle, rel_tol=1e-12, abs_tol=1e-12)
-    assert math.isclose(rotations.geodesic_angle(np.eye(3), matrix), angle, rel_tol=1e-12, abs_tol=1e-12)
+    assert math.isclose(
+        np.linalg.norm(rotations.matrix_to_rotvec(matrix)), angle, rel_tol=1e-12, abs_tol=1e-12
+    )
+    assert math.isclose(
+        rotations.geodesic_angle(np.eye(3), matrix), angle, rel_tol=1e-12, abs_tol=1e-12
+    )
 
 
 @given(matrices)
@@ -63,11 +69,15 @@ def test_roll_pitch_yaw_round_trips(roll, pitch, yaw):
     assert same(matrix, Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix())
     found = rotations.matrix_to_rpy(matrix)
     assert -2 * math.pi < found[0] <= 0
-    assert same(rotations.rpy_to_matrix(*found), matrix, 3e-9)  # 1e-9: where the pitch counts as gimbal lock
+    assert same(
+        rotations.rpy_to_matrix(*found), matrix, 3e-9
+    )  # 1e-9: where the pitch counts as gimbal lock
 
 
 def test_roll_keeps_the_released_range():
-    assert same(rotations.matrix_to_rpy(rotations.rpy_to_matrix(-3.598, -0.05, 1.27)), (-3.598, -0.05, 1.27))
+    assert same(
+        rotations.matrix_to_rpy(rotations.rpy_to_matrix(-3.598, -0.05, 1.27)), (-3.598, -0.05, 1.27)
+    )
     assert rotations.matrix_to_rpy(np.eye(3))[0] == 0
 
 

@@ -1,4 +1,6 @@
-"""The compiled scene: the numbers that were declared arrived, and the laws of mechanics hold in it."""
+"""The compiled scene: the numbers that were declared arrived, and the laws of mechanics hold in
+it.
+"""
 
 import dataclasses
 import math
@@ -30,7 +32,7 @@ def warnings_of(data):
     return {mujoco.mjtWarning(index).name for index in WARNINGS if data.warning[index].number}
 
 
-# -- the arms ---------------------------------------------------------------------------------------------------------
+# -- the arms --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("instrument", sorted(INSTRUMENTS))
@@ -112,7 +114,7 @@ def test_zero_action_holds_still(task):
     assert poses.angle(simulation.needle(), held) < math.radians(1.0)
 
 
-# -- the needle -------------------------------------------------------------------------------------------------------
+# -- the needle ------------------------------------------------------------------------------------
 
 
 def test_the_needle_is_one_rigid_arc(simulation):
@@ -137,12 +139,25 @@ def test_the_needle_is_one_rigid_arc(simulation):
     local = (line - pose[:3, 3]) @ pose[:3, :3]
     angles = np.unwrap(np.arctan2(local[:, 1], -local[:, 0]))
     assert np.allclose(np.linalg.norm(local, axis=1), needle.RADIUS, rtol=0, atol=1e-9)
-    assert np.allclose(angles, np.linspace(0.0, math.radians(120.0), needle.SEGMENTS + 1), rtol=0, atol=1e-6)
-    assert np.allclose([start for start, _ in ends[1:]], [end for _, end in ends[:-1]], rtol=0, atol=1e-9)
+    assert np.allclose(
+        angles, np.linspace(0.0, math.radians(120.0), needle.SEGMENTS + 1), rtol=0, atol=1e-6
+    )
+    assert np.allclose(
+        [start for start, _ in ends[1:]], [end for _, end in ends[:-1]], rtol=0, atol=1e-9
+    )
     radii = model.geom_size[list(simulation.scene.needle_geoms), 0]
-    assert radii[0] == needle.BODY_RADIUS and (np.diff(radii) <= 0).all() and radii[-1] < 0.6 * radii[0]
+    assert (
+        radii[0] == needle.BODY_RADIUS
+        and (np.diff(radii) <= 0).all()
+        and radii[-1] < 0.6 * radii[0]
+    )
     for site, angle in (("needle_base", 0.0), ("needle_tip", needle.TIP_ANGLE)):
-        assert np.allclose(data.site(site).xpos, pose[:3, :3] @ needle.point(angle) + pose[:3, 3], rtol=0, atol=1e-9)
+        assert np.allclose(
+            data.site(site).xpos,
+            pose[:3, :3] @ needle.point(angle) + pose[:3, 3],
+            rtol=0,
+            atol=1e-9,
+        )
 
 
 def test_the_needle_falls_at_g(simulation):
@@ -174,7 +189,7 @@ def test_a_needle_that_falls_from_the_phantom_comes_to_rest_below_it(simulation,
     assert not warnings_of(data)
 
 
-# -- the holes --------------------------------------------------------------------------------------------------------
+# -- the holes -------------------------------------------------------------------------------------
 
 ENTRIES = ((-3.740, 44.189), (-4.316, 20.691), (-3.337, -2.032), (-4.394, -27.678))
 """x and y [mm] of the entries of SurgicAI's phantom."""
@@ -192,10 +207,14 @@ def test_the_holes_of_the_simple_layout_are_surgicais(number):
         assert np.allclose(normal, (outwards * math.sin(0.8053), 0.0, math.cos(0.8053)), atol=1e-12)
 
 
-@pytest.mark.parametrize(("layout", "clearance"), [("simple", 0.70), ("3dmed", 0.45), ("3dmed_straight", 1.20)])
+@pytest.mark.parametrize(
+    ("layout", "clearance"), [("simple", 0.70), ("3dmed", 0.45), ("3dmed_straight", 1.20)]
+)
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_the_circle_through_both_holes_clears_the_phantom(layout, clearance, number):
-    """From the tip in the entry until the base is out of the exit; `clearance` [mm] is that of the needle's skin."""
+    """From the tip in the entry until the base is out of the exit; `clearance` [mm] is that of the
+    needle's skin.
+    """
     scene = build_scene(SceneConfig(layout=layout, hole_pair=number))
     simulation, stitch = Simulation(scene), Stitch.of(scene.pair)
     model, data = simulation.model, simulation.data
@@ -205,13 +224,19 @@ def test_the_circle_through_both_holes_clears_the_phantom(layout, clearance, num
     for angle in np.linspace(needle.TIP_ANGLE, -2 * stitch.half - 0.1, 40):
         simulation.pose_needle(poses.flat(stitch.on_arc(angle)))
         mujoco.mj_fwdPosition(model, data)
-        near = min(mujoco.mj_geomDistance(model, data, a, b, 0.003, None) for a in scene.needle_geoms for b in tissue)
-        assert near * 1e3 > clearance, f"{near * 1e3:.2f} mm with the needle's {math.degrees(angle):.0f}° in the entry"
+        near = min(
+            mujoco.mj_geomDistance(model, data, a, b, 0.003, None)
+            for a in scene.needle_geoms
+            for b in tissue
+        )
+        assert near * 1e3 > clearance, (
+            f"{near * 1e3:.2f} mm with the needle's {math.degrees(angle):.0f}° in the entry"
+        )
         bodies = model.geom_bodyid[data.contact.geom]
         assert not ((bodies == model.body("needle").id).any(axis=1)).any()
 
 
-# -- configuration ----------------------------------------------------------------------------------------------------
+# -- configuration ---------------------------------------------------------------------------------
 
 
 def test_the_hash_is_that_of_the_configuration():
@@ -255,8 +280,12 @@ def test_named_lists_what_exists():
 def test_every_layout_and_thread_steps_without_warnings(layout, thread):
     simulation = Simulation(build_scene(SceneConfig(layout=layout, thread=thread)))
     model, data = simulation.model, simulation.data
-    assert sum(model.body(index).name.startswith("thread_") for index in range(model.nbody)) == thread
+    assert (
+        sum(model.body(index).name.startswith("thread_") for index in range(model.nbody)) == thread
+    )
     mujoco.mj_step(model, data, 100)
     assert not warnings_of(data)
     assert np.isfinite(data.qpos).all()
-    assert poses.distance(simulation.needle(), (*needle.HOME, *poses.IDENTITY[3:])) < 0.001  # it lies still
+    assert (
+        poses.distance(simulation.needle(), (*needle.HOME, *poses.IDENTITY[3:])) < 0.001
+    )  # it lies still

@@ -26,7 +26,7 @@ def test_the_needle_is_seen_at_the_end(task):
                 ended = terminated or truncated
             assert info["is_success"]
             for camera, seen in counts.items():
-                picture = renderer.render(env.data, camera, "segmentation")
-                seen.append(int((picture == PARTS.index("needle")).sum()))
+                image = renderer.render(env.data, camera, "segmentation")
+                seen.append(int((image == PARTS.index("needle")).sum()))
     for camera, seen in counts.items():
         assert min(seen) >= PIXELS, (camera, seen)

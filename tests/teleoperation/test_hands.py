@@ -15,7 +15,7 @@ from surgicai_vision.teleoperation.inputs import JAW, KEEP, Input, merged
 from surgicai_vision.teleoperation.keyboard import CODES, PRESSES, TABLE, Keyboard, key_table
 from surgicai_vision.teleoperation.window import standard
 
-# -- hands ------------------------------------------------------------------------------------------------------------
+# -- hands -----------------------------------------------------------------------------------------
 
 
 def test_keys_are_held_until_released():
@@ -95,7 +95,7 @@ def test_glfws_gamepads_are_put_in_the_browsers_order():
     assert (given.move[2], set(given.events)) == (1.0, {KEEP, inputs.START})
 
 
-# -- steering ---------------------------------------------------------------------------------------------------------
+# -- steering --------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,9 @@ def test_a_key_moves_the_tool_along_its_cameras_axis(grasp, view, axis):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_key_turns_the_tool_about_its_cameras_axis(grasp, axis):
     grasp.reset(seed=0)
-    action = Steering(grasp, speed=1.0).action(Input(turn=tuple(float(i == axis) for i in range(3))), "front")
+    action = Steering(grasp, speed=1.0).action(
+        Input(turn=tuple(float(i == axis) for i in range(3))), "front"
+    )
     base = np.array(grasp.simulation.bases["psm2"][3:]).reshape(3, 3)
     camera = extrinsics(grasp.model, grasp.data, "front")[:3, :3]
     np.testing.assert_allclose(camera.T @ base @ action[3:6], np.eye(3)[axis], atol=1e-6)
@@ -145,9 +147,15 @@ def test_in_the_tools_frame_deeper_is_out_between_the_jaws(grasp):
 def test_speed_fine_and_diagonals(grasp):
     grasp.reset(seed=0)
     lengths = {}
-    for name, given in {"one": right(), "two": Input((1, 1, 1)), "fine": Input((1, 0, 0), fine=True)}.items():
+    for name, given in {
+        "one": right(),
+        "two": Input((1, 1, 1)),
+        "fine": Input((1, 0, 0), fine=True),
+    }.items():
         lengths[name] = np.linalg.norm(Steering(grasp, speed=0.5).action(given, "front")[:3])
-    np.testing.assert_allclose([lengths["one"], lengths["two"], lengths["fine"]], [0.5, 0.5, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(
+        [lengths["one"], lengths["two"], lengths["fine"]], [0.5, 0.5, 0.1], rtol=1e-6
+    )
     for speed in (0, 1.1, float("nan")):
         with pytest.raises(InputError, match="speed is"):
             Steering(grasp, speed=speed)

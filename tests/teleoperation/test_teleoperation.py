@@ -1,4 +1,6 @@
-"""Teleoperation: scripted hands drive whole sessions; what they kept is demonstrations like any others."""
+"""Teleoperation: scripted hands drive whole sessions; what they kept is demonstrations like any
+others.
+"""
 
 import json
 import os
@@ -23,7 +25,7 @@ from surgicai_vision.teleoperation.session import DRIVING, JUDGED, STOPPED, WAIT
 LONG = TaskConfig("grasp", max_steps=1500)
 
 
-# -- sessions ---------------------------------------------------------------------------------------------------------
+# -- sessions --------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -67,7 +69,7 @@ def test_keep_goes_on_to_the_next_start(begin, tmp_path):
     assert (status.state, status.kept, status.episode, status.seed) == (WAITING, 1, 1, 1)
     (path,) = list_demos(tmp_path / "demos")
     demo = read_demo(path)
-    assert (demo.source, demo.seed, demo.config) == ("teleoperate", 0, SHORT)
+    assert (demo.demonstrator, demo.seed, demo.config) == ("teleoperate", 0, SHORT)
     assert demo.success.tolist() == [False] * (len(demo) - 1) + [True]
 
 
@@ -78,7 +80,9 @@ def test_discard_does_the_same_start_again(begin, tmp_path):
     assert (status.state, status.seed, status.steps, status.discarded) == (WAITING, 0, 0, 1)
     status = ticks(session, REST, right(), right(), event(DISCARD))
     assert (status.state, status.seed, status.discarded) == (WAITING, 0, 2), "also in the middle"
-    assert ticks(session, event(DISCARD)).discarded == 2, "there is nothing to discard while waiting"
+    assert ticks(session, event(DISCARD)).discarded == 2, (
+        "there is nothing to discard while waiting"
+    )
     succeed(session)
     ticks(session, event(KEEP))
     assert read_demo(list_demos(tmp_path / "demos")[0]).seed == 0
@@ -88,7 +92,9 @@ def test_a_start_is_given_up(begin, tmp_path):
     session = begin()
     assert ticks(session, event(KEEP)).seed == 1, "at once while waiting"
     status = ticks(session, REST, right(), event(KEEP))
-    assert (status.state, status.success, status.seed) == (JUDGED, False, 1), "never without a word while driving"
+    assert (status.state, status.success, status.seed) == (JUDGED, False, 1), (
+        "never without a word while driving"
+    )
     assert ticks(session, event(KEEP)).seed == 2
     assert [row["seed"] for row in read_marker(tmp_path / "demos")["skipped"]] == [0, 1]
     assert not list((tmp_path / "demos").glob("episode*"))
@@ -121,7 +127,9 @@ def test_successes_are_kept_without_asking_on_request_and_counted(begin):
     assert ticks(session, right(), event(KEEP)).kept == 2, "after the end nothing happens"
 
 
-@pytest.mark.parametrize(("before", "kept", "discarded"), [("waiting", 0, 0), ("driving", 0, 1), ("judged", 1, 0)])
+@pytest.mark.parametrize(
+    ("before", "kept", "discarded"), [("waiting", 0, 0), ("driving", 0, 1), ("judged", 1, 0)]
+)
 def test_escape_stops_and_loses_no_success(begin, before, kept, discarded):
     session = begin()
     if before == "driving":
@@ -155,12 +163,17 @@ def test_the_next_view_leads(begin):
 def test_an_episode_that_diverged_is_never_kept(begin):
     session = begin(keep_failures=True)
     step = session.env.step
-    session.env.step = lambda action: (*step(action)[:2], True, False, {**step(action)[4], "physics_error": True})
+    session.env.step = lambda action: (
+        *step(action)[:2],
+        True,
+        False,
+        {**step(action)[4], "physics_error": True},
+    )
     assert "physics error" in ticks(session, REST, right()).message
     assert ticks(session, event(KEEP)).kept == 0
 
 
-# -- recordings -------------------------------------------------------------------------------------------------------
+# -- recordings ------------------------------------------------------------------------------------
 
 
 def keep_one(session):
@@ -195,7 +208,10 @@ def test_an_episode_whose_entry_a_kill_prevented_counts(begin, tmp_path):
 
 def test_a_folder_is_one_sessions_at_a_time(begin, tmp_path):
     keep_one(begin())
-    with pytest.raises(SurgicaiError, match="another session"), open_recordings(tmp_path / "demos", SHORT, "f" * 64):
+    with (
+        pytest.raises(SurgicaiError, match="another session"),
+        open_recordings(tmp_path / "demos", SHORT, "f" * 64),
+    ):
         pass
 
 
@@ -203,9 +219,17 @@ def test_another_task_scene_or_seed_is_refused(tmp_path):
     with open_recordings(tmp_path / "demos", SHORT, "f" * 64) as recordings:
         recordings.skip(0, "given up")
     for config, scene, seed in ((LONG, "f", None), (SHORT, "e", None), (SHORT, "f", 3)):
-        with pytest.raises(OutputExists), open_recordings(tmp_path / "demos", config, scene * 64, seed):
+        with (
+            pytest.raises(OutputExists),
+            open_recordings(tmp_path / "demos", config, scene * 64, seed),
+        ):
             pass
-    write_marker(tmp_path / "demos", "grasp", "teleoperate", request=read_marker(tmp_path / "demos")["request"])
+    write_marker(
+        tmp_path / "demos",
+        "grasp",
+        "teleoperate",
+        request=read_marker(tmp_path / "demos")["request"],
+    )
     with (
         pytest.raises(BadFile, match="does not say which seeds"),
         open_recordings(tmp_path / "demos", SHORT, "f" * 64),
@@ -226,7 +250,7 @@ def test_a_session_without_a_result_leaves_no_folder(tmp_path):
     assert not (tmp_path / "demos").exists()
 
 
-# -- the loop ---------------------------------------------------------------------------------------------------------
+# -- the loop --------------------------------------------------------------------------------------
 
 
 class Clock:
@@ -244,7 +268,7 @@ class Clock:
 
 
 class Canvas:
-    """A screen that wants every picture; each costs `cost` seconds."""
+    """A screen that wants every image; each costs `cost` seconds."""
 
     closed = False
 
@@ -254,7 +278,7 @@ class Canvas:
     def wants(self):
         return True
 
-    def show(self, pictures, status):
+    def show(self, images, status):
         self.shown.append(status)
 
     def look(self):
@@ -270,14 +294,14 @@ def run_loop(session, cost, inputs, pace=1.0):
     return clock.now, canvas.shown, heard
 
 
-@pytest.mark.parametrize(("cost", "pictures"), [(0.001, 102), (0.03, 68), (0.09, 22)])
-def test_a_slow_screen_loses_pictures_and_no_ticks(begin, cost, pictures):
+@pytest.mark.parametrize(("cost", "images"), [(0.001, 102), (0.03, 68), (0.09, 22)])
+def test_a_slow_screen_loses_images_and_no_ticks(begin, cost, images):
     config = TaskConfig("grasp", max_steps=1000)
     inputs = [REST, event(START), *[right(1e-6)] * 99, event(STOP)]
     session = begin(config, keep_failures=True)
     seconds, shown, _ = run_loop(session, cost, inputs)
     assert shown[-1].steps == 100, "a step a tick, whatever is drawn"
-    assert len(shown) == pytest.approx(pictures, abs=3)
+    assert len(shown) == pytest.approx(images, abs=3)
     assert seconds == pytest.approx(102 / 50, abs=0.15), "in real time all the same"
 
 
@@ -288,7 +312,9 @@ def test_pace_slows_the_clock_and_not_the_world(begin):
 
 
 def test_what_happened_is_heard_once(begin):
-    _, _, heard = run_loop(begin(), 0.0, [REST, *[right()] * 9, event(KEEP), REST, REST, event(STOP)])
+    _, _, heard = run_loop(
+        begin(), 0.0, [REST, *[right()] * 9, event(KEEP), REST, REST, event(STOP)]
+    )
     messages = [status.message for status in heard]
     assert len(messages) == len(set(messages))
     assert any(message.startswith("Kept as episode 0") for message in messages)
@@ -302,7 +328,7 @@ def test_a_closed_screen_ends_the_loop(begin):
     assert not session.over
 
 
-# -- the command ------------------------------------------------------------------------------------------------------
+# -- the command -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -336,7 +362,7 @@ def test_help_and_documentation_have_the_key_table(root, capsys):
         assert f"| {keys} | {row.gamepad} | {row.meaning} |" in text
 
 
-# -- the process ------------------------------------------------------------------------------------------------------
+# -- the process -----------------------------------------------------------------------------------
 
 ENDLESS = """
 import sys
@@ -357,7 +383,13 @@ with open_recordings(Path(sys.argv[2]), SHORT, "f" * 64) as recordings:
 
 def test_a_killed_process_leaves_whole_episodes_and_the_next_goes_on(begin, root, tmp_path):
     for enough in (3, 6):
-        command = [sys.executable, "-c", ENDLESS, str(root / "tests" / "helpers"), str(tmp_path / "demos")]
+        command = [
+            sys.executable,
+            "-c",
+            ENDLESS,
+            str(root / "tests" / "helpers"),
+            str(tmp_path / "demos"),
+        ]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         for line in process.stdout:
@@ -373,4 +405,6 @@ def test_a_killed_process_leaves_whole_episodes_and_the_next_goes_on(begin, root
     session = begin()
     assert session.status().episode == len(demos)
     assert session.status().seed > max(seeds)
-    assert json.loads((tmp_path / "demos" / "demos.json").read_text())["source"] == "teleoperate"
+    assert (
+        json.loads((tmp_path / "demos" / "demos.json").read_text())["demonstrator"] == "teleoperate"
+    )

@@ -1,4 +1,6 @@
-"""Teleoperation of the real env by scripted people: what was kept is what happened, and renders as it is."""
+"""Teleoperation of the real env by scripted people: what was kept is what happened, and renders as
+it is.
+"""
 
 import itertools
 
@@ -29,13 +31,19 @@ def play(folder, who, config=LONG, frame="camera", speed=0.5, episodes=1, answer
         while not session.over:
             state = session.status().state
             session.tick(
-                event(next(answers)) if state == JUDGED else hands.poll() if state == DRIVING else event(START)
+                event(next(answers))
+                if state == JUDGED
+                else hands.poll()
+                if state == DRIVING
+                else event(START)
             )
     env.close()
     return session
 
 
-@pytest.mark.parametrize(("who", "frame", "speed"), [(AtKeyboard, "camera", 0.5), (AtGamepad, "tool", 1.0)])
+@pytest.mark.parametrize(
+    ("who", "frame", "speed"), [(AtKeyboard, "camera", 0.5), (AtGamepad, "tool", 1.0)]
+)
 def test_hands_grasp_and_the_recording_is_what_happened(tmp_path, who, frame, speed):
     session = play(tmp_path / "demos", who, frame=frame, speed=speed, answers=[DISCARD, KEEP])
     assert (session.kept, session.discarded) == (1, 1)
@@ -68,12 +76,17 @@ def test_kept_episodes_go_through_render_demos_as_they_are(tmp_path):
 
 
 def test_a_whole_suture_is_driven_with_one_gamepad_and_changes_arms(tmp_path):
-    assert play(tmp_path / "demos", AtGamepad, TaskConfig("suture", max_steps=2000), speed=1.0).kept == 1
+    assert (
+        play(tmp_path / "demos", AtGamepad, TaskConfig("suture", max_steps=2000), speed=1.0).kept
+        == 1
+    )
     demo = read_demo(list_demos(tmp_path / "demos")[0])
     assert np.unique(demo.phase).tolist() == [0, 1, 2, 3, 4]
     assert demo.success[-1]
 
 
 def test_randomised_and_delayed_envs_are_driven_too(tmp_path):
-    config = TaskConfig("grasp", max_steps=600, randomisation=RandomisationConfig(needle_thickness=0.1, latency=2))
+    config = TaskConfig(
+        "grasp", max_steps=600, randomisation=RandomisationConfig(needle_thickness=0.1, latency=2)
+    )
     assert play(tmp_path / "demos", AtGamepad, config, speed=1.0).kept == 1

@@ -1,4 +1,6 @@
-"""The web view: who may ask and who not, keys that arrive, pictures that change, and a real browser."""
+"""The web view: who may ask and who not, keys that arrive, images that change, and a real
+browser.
+"""
 
 import http.client
 import itertools
@@ -47,7 +49,7 @@ def said(number, held=(), pressed=(), client="a", axes=(), buttons=()):
     }
 
 
-# -- hands ------------------------------------------------------------------------------------------------------------
+# -- hands -----------------------------------------------------------------------------------------
 
 
 def test_keys_arrive_once_and_stay_while_they_are_heard_of():
@@ -113,7 +115,7 @@ def test_what_no_page_would_say_is_refused(message):
         Hands().receive(message)
 
 
-# -- the server -------------------------------------------------------------------------------------------------------
+# -- the server ------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -147,7 +149,13 @@ def test_the_page_stands_alone_and_names_every_key(web):
     assert "default-src 'self'" in headers["Content-Security-Policy"]
     assert "Grasp &lt;the&gt; needle." in text
     assert "://" not in text
-    for name in ("<kbd>W</kbd> <kbd>S</kbd>", "<kbd>Esc</kbd>", "<kbd>Shift</kbd>", "D-pad right", 'data-view="back"'):
+    for name in (
+        "<kbd>W</kbd> <kbd>S</kbd>",
+        "<kbd>Esc</kbd>",
+        "<kbd>Shift</kbd>",
+        "D-pad right",
+        'data-view="back"',
+    ):
         assert name in text, name
     for path, kind in (("page.js", "text/javascript"), ("page.css", "text/css")):
         status, headers, content = ask(web, path)
@@ -159,10 +167,14 @@ def test_the_page_stands_alone_and_names_every_key(web):
 @pytest.mark.parametrize("path", ["", "status", "page.js", "view/front.jpg", "input"])
 def test_without_the_token_there_is_nothing(web, token, path):
     assert ask(web, path, token=token)[0] == 404
-    assert ask(web, path, "POST", b"{}", token=token, **{"Content-Type": "application/json"})[0] == 404
+    assert (
+        ask(web, path, "POST", b"{}", token=token, **{"Content-Type": "application/json"})[0] == 404
+    )
 
 
-@pytest.mark.parametrize("path", ["../web.py", "view/../page.js", "page.html.j2", "view/front", "view/none.jpg", "x"])
+@pytest.mark.parametrize(
+    "path", ["../web.py", "view/../page.js", "page.html.j2", "view/front", "view/none.jpg", "x"]
+)
 def test_there_is_nothing_else_below_the_token(web, path):
     web.show({"front": np.zeros((8, 8, 3), np.uint8)}, status_of())
     assert ask(web, path)[0] == 404
@@ -189,7 +201,14 @@ def test_pages_of_other_sites_are_refused(web, headers, status):
 
 @pytest.mark.parametrize(
     ("body", "status"),
-    [(b"", 400), (b"{", 400), (b"[" * 3000, 400), (b"\xff\xfe", 400), (b"[]", 400), (b" " * (LONGEST + 1), 413)],
+    [
+        (b"", 400),
+        (b"{", 400),
+        (b"[" * 3000, 400),
+        (b"\xff\xfe", 400),
+        (b"[]", 400),
+        (b" " * (LONGEST + 1), 413),
+    ],
 )
 def test_broken_inputs_are_refused_and_the_server_lives(web, body, status):
     assert post(web, body) == status
@@ -206,7 +225,7 @@ def status_of(config=SHORT):
     return Session(Stand(config), Still(), Nowhere(), VIEWS).status()
 
 
-def test_pictures_are_jpegs_and_change(web):
+def test_images_are_jpegs_and_change(web):
     frames = [np.full((48, 48, 3), colour, np.uint8) for colour in ((200, 40, 40), (40, 40, 200))]
     assert ask(web, "view/front.jpg")[0] == 404, "nothing was shown yet"
     seen = []
@@ -220,20 +239,22 @@ def test_pictures_are_jpegs_and_change(web):
     assert seen[0] != seen[1]
 
 
-def test_a_page_waits_for_the_next_picture_and_asks_for_it(web):
-    picture = {"front": np.zeros((8, 8, 3), np.uint8)}
+def test_a_page_waits_for_the_next_image_and_asks_for_it(web):
+    image = {"front": np.zeros((8, 8, 3), np.uint8)}
     assert not web.wants(), "nobody looks: nothing is drawn"
-    web.show(picture, status_of())
+    web.show(image, status_of())
     first = json.loads(ask(web, "status?after=0")[2])
-    assert (first["number"], first["picture"], first["state"], first["seed"]) == (1, 1, WAITING, 3)
+    assert (first["number"], first["image"], first["state"], first["seed"]) == (1, 1, WAITING, 3)
     answers = []
-    thread = threading.Thread(target=lambda: answers.append(json.loads(ask(web, "status?after=1")[2])))
+    thread = threading.Thread(
+        target=lambda: answers.append(json.loads(ask(web, "status?after=1")[2]))
+    )
     thread.start()
     while not web.wants():
         time.sleep(0.001)
-    web.show(picture, status_of())
+    web.show(image, status_of())
     thread.join()
-    assert (answers[0]["number"], answers[0]["picture"]) == (2, 1), "the same picture keeps its number"
+    assert (answers[0]["number"], answers[0]["image"]) == (2, 1), "the same image keeps its number"
     assert not web.wants()
     assert json.loads(ask(web, "status?after=x")[2])["number"] == 2
 
@@ -263,7 +284,9 @@ def test_keys_that_came_by_http_grasp_the_needle(web, tmp_path):
             person.poll()
             held = list(person.keyboard._held) if session.status().state == DRIVING else []
             body = json.dumps(said(next(numbers), held, presses))
-            connection.request("POST", f"/{web.token}/input", body, {"Content-Type": "application/json"})
+            connection.request(
+                "POST", f"/{web.token}/input", body, {"Content-Type": "application/json"}
+            )
             assert connection.getresponse().read() == b""
             session.tick(web.poll())
         connection.close()
@@ -273,7 +296,17 @@ def test_keys_that_came_by_http_grasp_the_needle(web, tmp_path):
 
 
 def test_the_command_records_stops_and_sums_up(tmp_path):
-    command = [sys.executable, "-m", "surgicai_vision", "teleoperate", "--web", "--port", "0", "--size", "64"]
+    command = [
+        sys.executable,
+        "-m",
+        "surgicai_vision",
+        "teleoperate",
+        "--web",
+        "--port",
+        "0",
+        "--size",
+        "64",
+    ]
     command += ["--keep-failures", "--out", str(tmp_path / "demos"), "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
@@ -288,7 +321,9 @@ def test_the_command_records_stops_and_sums_up(tmp_path):
         (("Enter", DRIVING, 0), ("ArrowRight", WAITING, 1), ("Escape", "stopped", 1))
     ):
         body = json.dumps(said(number, pressed=[code]))
-        connection.request("POST", f"{address.path}input", body, {"Content-Type": "application/json"})
+        connection.request(
+            "POST", f"{address.path}input", body, {"Content-Type": "application/json"}
+        )
         assert connection.getresponse().read() == b""
         now = status()
         while now["state"] != state or (state == DRIVING and now["steps"] < 3):
@@ -306,7 +341,7 @@ def test_the_command_records_stops_and_sums_up(tmp_path):
     assert "Kept as episode 0" in error
 
 
-# -- a browser --------------------------------------------------------------------------------------------------------
+# -- a browser -------------------------------------------------------------------------------------
 
 
 class Painted:
@@ -323,11 +358,15 @@ class Painted:
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium here: apt-get install chromium")
 def test_a_browser_drives_keeps_discards_and_stops(web, tmp_path):
     config = TaskConfig("grasp", max_steps=2000)
-    grey = "document.querySelector('#lead canvas').getContext('2d').getImageData(9, 9, 1, 1).data[0]"
+    grey = (
+        "document.querySelector('#lead canvas').getContext('2d').getImageData(9, 9, 1, 1).data[0]"
+    )
     state = "document.getElementById('message').className"
     with open_recordings(tmp_path / "demos", config, "f" * 64) as recordings:
         session = Session(Stand(config), Still(), recordings, VIEWS)
-        loop = threading.Thread(target=drive, args=(session, web, web, Painted(session.env), Pacer()))
+        loop = threading.Thread(
+            target=drive, args=(session, web, web, Painted(session.env), Pacer())
+        )
         loop.start()
         try:
             with Browser(tmp_path / "profile") as browser:
@@ -337,16 +376,22 @@ def test_a_browser_drives_keeps_discards_and_stops(web, tmp_path):
                 before = browser.value(grey)
                 for answer, counts in (("ArrowLeft", "0 / 1"), ("ArrowRight", "1 / 1")):
                     browser.key("KeyD", True)
-                    assert browser.until(f"{state} === 'good'"), browser.value("document.body.innerText")
+                    assert browser.until(f"{state} === 'good'"), browser.value(
+                        "document.body.innerText"
+                    )
                     browser.key("KeyD", False)
-                    assert browser.until(f"{grey} > {before} + 20"), "the picture changed"
+                    assert browser.until(f"{grey} > {before} + 20"), "the image changed"
                     browser.key(answer, True)
                     browser.key(answer, False)
-                    assert browser.until(f"document.getElementById('counts').textContent === '{counts}'")
+                    assert browser.until(
+                        f"document.getElementById('counts').textContent === '{counts}'"
+                    )
                     assert browser.until(f"{state} === 'waiting'")
                 browser.key("KeyV", True)
                 browser.key("KeyV", False)
-                assert browser.until("document.querySelector('#lead figure').dataset.view === 'back'")
+                assert browser.until(
+                    "document.querySelector('#lead figure').dataset.view === 'back'"
+                )
                 browser.key("Escape", True)
                 assert browser.until(f"{state} === 'stopped'")
                 assert browser.complaints == []

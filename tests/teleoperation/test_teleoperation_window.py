@@ -1,4 +1,6 @@
-"""The window: on a display without hardware, with keys as an X server delivers them; and without any display."""
+"""The window: on a display without hardware, with keys as an X server delivers them; and without
+any display.
+"""
 
 import ctypes.util
 import os
@@ -73,9 +75,9 @@ with Window(("front", "back"), "test", SIZE) as window:
     until(window, lambda given: given.events == (KEEP,))
     key(0xFF53, 0)
     for view in ("back", "front"):
-        pictures = views.look()  # the renderer's context and the window's take turns
-        window.show(pictures, dataclasses.replace(STATUS, view=view))
-    np.save(sys.argv[3], np.stack([pictures["front"], pictures["back"]]))
+        images = views.look()  # the renderer's context and the window's take turns
+        window.show(images, dataclasses.replace(STATUS, view=view))
+    np.save(sys.argv[3], np.stack([images["front"], images["back"]]))
     assert window.wants() and not window.closed
     print("shown", flush=True)
     sys.stdin.readline()
@@ -95,8 +97,10 @@ def framebuffer(path):
     return rows[:, : 4 * width].reshape(height, width, 4)[..., 2::-1]
 
 
-@pytest.mark.skipif(XVFB is None or XTST is None, reason="no X server to try with: apt-get install xvfb libxtst6")
-def test_the_window_shows_the_pictures_and_takes_keys(root, tmp_path):
+@pytest.mark.skipif(
+    XVFB is None or XTST is None, reason="no X server to try with: apt-get install xvfb libxtst6"
+)
+def test_the_window_shows_the_images_and_takes_keys(root, tmp_path):
     ready, told = os.pipe()
     command = [
         XVFB,
@@ -116,9 +120,16 @@ def test_the_window_shows_the_pictures_and_takes_keys(root, tmp_path):
         with os.fdopen(ready) as number:
             display = number.readline().strip()
         assert display
-        pictures = tmp_path / "pictures.npy"
+        images = tmp_path / "images.npy"
         client = subprocess.Popen(
-            [sys.executable, "-c", CLIENT, str(root / "tests" / "teleoperation"), XTST, str(pictures)],
+            [
+                sys.executable,
+                "-c",
+                CLIENT,
+                str(root / "tests" / "teleoperation"),
+                XTST,
+                str(images),
+            ],
             env={**os.environ, "DISPLAY": f":{display}"},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -133,7 +144,7 @@ def test_the_window_shows_the_pictures_and_takes_keys(root, tmp_path):
     finally:
         server.terminate()
         server.wait()
-    front, back = np.load(pictures).astype(int)
+    front, back = np.load(images).astype(int)
     tag = name_tag("front")
     front[: tag.shape[0], : tag.shape[1]] = tag[:SIZE, :SIZE]
     assert np.abs(screen[:SIZE, :SIZE] - front).max() <= 1
@@ -143,8 +154,17 @@ def test_the_window_shows_the_pictures_and_takes_keys(root, tmp_path):
 
 
 def test_without_a_display_one_line_says_what_to_do(tmp_path):
-    environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    command = [sys.executable, "-m", "surgicai_vision", "teleoperate", "--out", str(tmp_path / "demos")]
+    environment = {
+        key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")
+    }
+    command = [
+        sys.executable,
+        "-m",
+        "surgicai_vision",
+        "teleoperate",
+        "--out",
+        str(tmp_path / "demos"),
+    ]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
@@ -156,13 +176,22 @@ def test_without_a_display_one_line_says_what_to_do(tmp_path):
 def test_the_lines_say_what_matters_and_fit():
     first, second = status_lines(STATUS)
     assert first == "driving: Recording."
-    for part in ("episode 3", "start 7", "1.8 s", "grasp", "psm2", "4.2 mm 6°", "kept 2, discarded 1", "fine"):
+    for part in (
+        "episode 3",
+        "start 7",
+        "1.8 s",
+        "grasp",
+        "psm2",
+        "4.2 mm 6°",
+        "kept 2, discarded 1",
+        "fine",
+    ):
         assert part in second, part
     for width in (NARROWEST, 900):
         bar = text_bar((first, second), (1, 2, 3), width)
         assert bar.shape == (BAR, width, 3)
         assert (bar[:, 0] == (1, 2, 3)).all()
-        assert (bar[:, -8:] == bar[0, -1]).all(), "text runs out of the picture"
+        assert (bar[:, -8:] == bar[0, -1]).all(), "text runs out of the image"
 
 
 def test_a_judgement_has_its_colour():

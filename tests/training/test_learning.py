@@ -40,7 +40,9 @@ class Dataset:
         self.episode_index = np.repeat(np.arange(4), 10)
 
     def frames(self, view: str, start: int, stop: int) -> np.ndarray:
-        return np.random.default_rng(len(view)).integers(0, 256, (self.length, 32, 32, 3), np.uint8)[start:stop]
+        return np.random.default_rng(len(view)).integers(
+            0, 256, (self.length, 32, 32, 3), np.uint8
+        )[start:stop]
 
     def columns(self) -> dict[str, np.ndarray]:
         noise = np.random.default_rng(1).normal(size=(self.length, 49)).astype(np.float32)
@@ -89,10 +91,14 @@ def test_open_names_pools_and_licences(capsys: pytest.CaptureFixture[str]) -> No
         encoders.check_encoder_name("tmm:resnet18")
     assert "--accept-licence" in fails(capsys, "encode", "--encoder", "vc1")
     assert "pytorch_model.bin" in fails(capsys, "train", "--encoder", "vc1", "--accept-licence")
-    assert "Did you mean 'spatial'" in fails(capsys, "encode", "--encoder", "random", "--pool", "spacial")
+    assert "Did you mean 'spatial'" in fails(
+        capsys, "encode", "--encoder", "random", "--pool", "spacial"
+    )
 
 
-def test_weights_are_given_for_all_or_for_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_are_given_for_all_or_for_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     of = encoders.weights_of
     assert of("r3m", None) is None
     assert of("r3m", "a.bin") == of("r3m", Path("a.bin")) == Path("a.bin")
@@ -119,7 +125,9 @@ def test_cache_lists_measures_and_prunes(capsys: pytest.CaptureFixture[str]) -> 
     assert run(capsys, "cache", "list")["entries"] == []
     run(capsys, "encode", "--encoder", "tiny")
     listed = run(capsys, "cache", "list")
-    assert [(row["encoder"], row["view"], row["length"]) for row in listed["entries"]].count(("tiny", "back", 40)) == 1
+    assert [(row["encoder"], row["view"], row["length"]) for row in listed["entries"]].count(
+        ("tiny", "back", 40)
+    ) == 1
     assert run(capsys, "cache", "size")["bytes"] == listed["bytes"] > 0
     assert run(capsys, "cache", "prune", "--keep", "the/dataset")["entries"] == []
     assert "either --keep DIR or --all" in fails(capsys, "cache", "prune")
@@ -139,7 +147,9 @@ def test_epochs_recipe_and_fine_tuning(capsys: pytest.CaptureFixture[str]) -> No
     assert read_checkpoint(early).epoch == 2
     tuned = run(capsys, *arguments, "--epochs", "1", "--start", str(early), "--out", "tuned")
     fresh = run(capsys, *arguments, "--epochs", "1", "--out", "fresh")
-    losses = [read_checkpoint(Path(result["checkpoint"])).train_losses[0] for result in (tuned, fresh)]
+    losses = [
+        read_checkpoint(Path(result["checkpoint"])).train_losses[0] for result in (tuned, fresh)
+    ]
     assert losses[0] < losses[1]
     other = ("train", "--encoder", "none", "--start", "tuned", "--out", "other")
     assert "to start from" in fails(capsys, *other)
@@ -149,7 +159,9 @@ def test_epochs_recipe_and_fine_tuning(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_controls_are_named_by_what_they_see(capsys: pytest.CaptureFixture[str]) -> None:
-    state = run(capsys, "train", "--task", "suture", "--encoder", "state", "--epochs", "1")["checkpoint"]
+    state = run(capsys, "train", "--task", "suture", "--encoder", "state", "--epochs", "1")[
+        "checkpoint"
+    ]
     assert state.startswith("outputs/train/suture-state")
     policy = policies.load_policy(state)
     assert policy.inputs.vector == names.PRIVILEGED_STATE and not policy.checkpoint.proprioception
@@ -165,7 +177,9 @@ def test_controls_are_named_by_what_they_see(capsys: pytest.CaptureFixture[str])
 def test_high_level_policy_learns_the_phase(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hlp, "HLP", replace(hlp.HLP, ahead=0))  # these episodes are too short for it
+    monkeypatch.setattr(
+        hlp, "HLP", replace(hlp.HLP, ahead=0)
+    )  # these episodes are too short for it
     arguments = ("train", "--task", "suture", "--policy", "hlp", "--encoder", "none")
     folder = run(capsys, *arguments, "--epochs", "60", "--recipe", "paper")["checkpoint"]
     policy, columns = policies.load_policy(folder), Dataset().columns()
@@ -177,12 +191,18 @@ def test_high_level_policy_learns_the_phase(
     assert "does not act" in fails(capsys, "evaluate", folder)
 
 
-def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     whole = Dataset()
     part = subtask_of(whole, "insert")  # type: ignore[arg-type]  # the stand-in has what is read
     rows = np.flatnonzero(whole.columns()[names.PHASE] == 2)
     assert part.length == len(rows) == 8 and part.episode_index.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert part.config == TaskConfig("insert") and part.task == "insert" and part.fingerprint != whole.fingerprint
+    assert (
+        part.config == TaskConfig("insert")
+        and part.task == "insert"
+        and part.fingerprint != whole.fingerprint
+    )
     np.testing.assert_array_equal(part.columns()[names.ACTION], whole.columns()[names.ACTION][rows])
     frames = whole.frames("back", 0, 40)[rows]
     for start, stop in ((0, 8), (1, 6), (3, 4), (2, 2)):
@@ -192,10 +212,24 @@ def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(capsys: pytest.Ca
     assert thinned(part, 2).length == 4
     whole.fps = 25  # rendered with every other frame: a part of it is not thinned once more
     sparse = subtask_of(whole, "insert")  # type: ignore[arg-type]
-    assert thinned(sparse, 2) is sparse and thinned(sparse, 4).length == 4 and thinned(sparse, 4).fps == 12
+    assert (
+        thinned(sparse, 2) is sparse
+        and thinned(sparse, 4).length == 4
+        and thinned(sparse, 4).fps == 12
+    )
     with pytest.raises(InputError, match="shows 'grasp'"):
         subtask_of(Dataset(task="grasp"), "insert")  # type: ignore[arg-type]
-    arguments = ("train", "--subtask", "insert", "--encoder", "tiny", "--view", "back", "--epochs", "1")
+    arguments = (
+        "train",
+        "--subtask",
+        "insert",
+        "--encoder",
+        "tiny",
+        "--view",
+        "back",
+        "--epochs",
+        "1",
+    )
     folder = run(capsys, *arguments)["checkpoint"]
     assert folder == "outputs/train/insert-of-suture-tiny-back-paper+1epochs-seed0"
     checkpoint = read_checkpoint(Path(folder))
@@ -214,14 +248,19 @@ def test_labels_of_phases_are_ahead_within_their_episode() -> None:
     assert target[10:20].tolist() == target[:10].tolist()
 
 
-def test_event_file_holds_the_losses(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_event_file_holds_the_losses(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     arguments = ("train", "--task", "suture", "--encoder", "none", "--epochs", "2", "--out", "a")
     run(capsys, *arguments)
     events = EventAccumulator("a-tensorboard").Reload()
     checkpoint = read_checkpoint(Path("a"))
-    for name, losses in (("train", checkpoint.train_losses), ("validation", checkpoint.validation_losses)):
+    for name, losses in (
+        ("train", checkpoint.train_losses),
+        ("validation", checkpoint.validation_losses),
+    ):
         drawn = events.Scalars(f"loss/{name}")
         assert [event.step for event in drawn] == [1, 2]
         np.testing.assert_allclose([event.value for event in drawn], losses, rtol=1e-6)
@@ -239,7 +278,8 @@ def test_wandb_needs_an_account_or_stays_offline(
 
     def init(**_: object) -> SimpleNamespace:
         return SimpleNamespace(
-            log=lambda losses, step: drawn.append((step, sorted(losses))), finish=lambda: drawn.append(("end",))
+            log=lambda losses, step: drawn.append((step, sorted(losses))),
+            finish=lambda: drawn.append(("end",)),
         )
 
     fake = ModuleType("wandb")
@@ -247,7 +287,19 @@ def test_wandb_needs_an_account_or_stays_offline(
     fake.setup = lambda: SimpleNamespace(settings=SimpleNamespace(mode="online"))  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "wandb", fake)
     monkeypatch.setattr(logs, "installed", lambda name: True)
-    arguments = ("train", "--task", "suture", "--encoder", "none", "--epochs", "2", "--log", "wandb", "--out", "a")
+    arguments = (
+        "train",
+        "--task",
+        "suture",
+        "--encoder",
+        "none",
+        "--epochs",
+        "2",
+        "--log",
+        "wandb",
+        "--out",
+        "a",
+    )
     assert "WANDB_MODE=offline" in fails(capsys, *arguments)
     assert not Path("a").exists()
     fake.setup = lambda: SimpleNamespace(settings=SimpleNamespace(mode="offline"))  # type: ignore[attr-defined]

@@ -28,7 +28,7 @@ QUIET = QuietConsole().stage
 
 
 @dataclass
-class Pictures:
+class Images:
     """A dataset of four episodes of coloured noise."""
 
     config: TaskConfig = field(default_factory=TaskConfig)
@@ -62,18 +62,23 @@ def test_all_are_off_by_default_and_on_in_the_released_recipe() -> None:
     assert policies.load_recipe("bc", "paper").deviations == Deviations()
     recipe = policies.load_recipe("bc", "released")
     assert recipe.deviations == Deviations(**dict.fromkeys(DEVIATIONS, True))
-    assert (recipe.hidden, recipe.learning_rate, recipe.epochs, recipe.split) == ((256,), 1e-4, 40, "transition")
+    assert (recipe.hidden, recipe.learning_rate, recipe.epochs, recipe.split) == (
+        (256,),
+        1e-4,
+        40,
+        "transition",
+    )
 
 
 def test_each_is_switched_alone() -> None:
-    cell = run.Cell("grasp", "random", ("back",), deviations=("bgr",))
+    cell = Cell("grasp", "random", ("back",), deviations=("bgr",))
     recipe = policies.load_recipe("bc", cell.recipe, cell.changes)
     assert recipe.deviations == Deviations(bgr=True)
     assert cell.name == "random-back-paper+bgr"
-    none = run.Cell("grasp", "random", ("back",), recipe="released", deviations=())
+    none = Cell("grasp", "random", ("back",), recipe="released", deviations=())
     assert policies.load_recipe("bc", none.recipe, none.changes).deviations == Deviations()
     with pytest.raises(UnknownName, match="bgr"):
-        run.Cell("grasp", "random", ("back",), deviations=("brg",))
+        Cell("grasp", "random", ("back",), deviations=("brg",))
 
 
 def colour(*rgb: int) -> np.ndarray:
@@ -85,13 +90,19 @@ def test_bgr_shows_blue_for_red(tiny: None) -> None:
     swapped = encoders.load_encoder("tiny", deviations=Deviations(bgr=True))
     np.testing.assert_array_equal(swapped(colour(200, 30, 10)), plain(colour(10, 30, 200)))
     assert not np.array_equal(swapped(colour(200, 30, 10)), plain(colour(200, 30, 10)))
-    assert swapped.fingerprint != plain.fingerprint and swapped.weights_sha256 == plain.weights_sha256
+    assert (
+        swapped.fingerprint != plain.fingerprint and swapped.weights_sha256 == plain.weights_sha256
+    )
 
 
 def seen(plugin: Plugin, deviations: Deviations, frames: np.ndarray) -> np.ndarray:
     """What a network is fed under `deviations`."""
     network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten())
-    return Encoder(changed(plugin, plugin.card, deviations), network, dtype=torch.float32).preprocess(frames).numpy()
+    return (
+        Encoder(changed(plugin, plugin.card, deviations), network, dtype=torch.float32)
+        .preprocess(frames)
+        .numpy()
+    )
 
 
 def test_r3m_normalises_twice() -> None:
@@ -100,7 +111,9 @@ def test_r3m_normalises_twice() -> None:
     once = (frames / 255 - mean) / std
     twice = (once / 255 - mean) / std
     for plugin in (R3M, R3M_18):
-        np.testing.assert_allclose(seen(plugin, Deviations(), frames).transpose(0, 2, 3, 1), once, atol=1e-5)
+        np.testing.assert_allclose(
+            seen(plugin, Deviations(), frames).transpose(0, 2, 3, 1), once, atol=1e-5
+        )
         got = seen(plugin, Deviations(preprocessing=True), frames).transpose(0, 2, 3, 1)
         np.testing.assert_allclose(got, twice, atol=1e-5)
 
@@ -113,7 +126,10 @@ def test_clip_gets_the_statistics_of_imagenet_and_imagenet_keeps_its_own() -> No
 
 
 def test_noise_is_that_of_the_encoder_on_translations_alone() -> None:
-    noises = {name: encoders.released_noise(name) for name in ("r3m", "clip", "imagenet", "random", "imagenet-lite")}
+    noises = {
+        name: encoders.released_noise(name)
+        for name in ("r3m", "clip", "imagenet", "random", "imagenet-lite")
+    }
     assert noises == {"r3m": 0.1, "clip": 0.4, "imagenet": 0.5, "random": 0.0, "imagenet-lite": 0.0}
     agent = NoisyAgent(ZeroAgent(), 0.4)
     agent.begin(0, None, 900_000)
@@ -125,15 +141,21 @@ def test_noise_is_that_of_the_encoder_on_translations_alone() -> None:
     np.testing.assert_array_equal(again.act([3], [None], [None])[0], actions[0])
 
 
-def test_three_evaluations_are_three_rounds_of_new_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_three_evaluations_are_three_rounds_of_new_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     taken: list[int] = []
 
-    def evaluate(make: object, config: TaskConfig, seeds: range, **_: object) -> list[SimpleNamespace]:
+    def evaluate(
+        make: object, config: TaskConfig, seeds: range, **_: object
+    ) -> list[SimpleNamespace]:
         taken.extend(seeds)
         return [SimpleNamespace(row=SimpleNamespace(success=seed % 2 == 0)) for seed in seeds]
 
     monkeypatch.setattr(run, "evaluate", evaluate)
-    monkeypatch.setattr(run, "write_evaluation", lambda out, episodes, about: {"stored": about["rounds"]})
+    monkeypatch.setattr(
+        run, "write_evaluation", lambda out, episodes, about: {"stored": about["rounds"]}
+    )
     subject = policy_spec.Subject("policy", TaskConfig(), ZeroAgent, rounds=3)
     result = run.evaluate_into(tmp_path, subject, range(10, 15))
     assert taken == list(range(10, 25))
@@ -145,7 +167,9 @@ def test_drift_moves_statistics_alone_and_needs_batch_norm() -> None:
     network = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.BatchNorm2d(4))
     before = {name: value.clone() for name, value in network.state_dict().items()}
     drifted(network, [torch.randn(4, 3, 8, 8) + 5.0])
-    moved = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+    moved = {
+        name for name, value in network.state_dict().items() if not torch.equal(value, before[name])
+    }
     assert moved == {"1.running_mean", "1.running_var", "1.num_batches_tracked"}
     with pytest.raises(InputError, match="no BatchNorm"):
         drifted(torch.nn.Linear(2, 2), [])
@@ -156,8 +180,8 @@ def test_a_drifted_encoder_comes_back_with_its_checkpoint(
 ) -> None:
     monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path / "cache"))
     switches = ("batch_norm_drift", "bgr", "action_noise", "three_evaluations")
-    cell = run.Cell("grasp", "tiny", ("back",), epochs=1, deviations=switches)
-    run.train_cell(cell, Pictures(), tmp_path / "policy", QUIET)
+    cell = Cell("grasp", "tiny", ("back",), epochs=1, deviations=switches)
+    train_cell(cell, Images(), tmp_path / "policy", QUIET)
     checkpoint = read_checkpoint(tmp_path / "policy")
     assert checkpoint.encoder is not None
     plain = encoders.load_encoder("tiny")
@@ -173,8 +197,8 @@ def test_a_drifted_encoder_comes_back_with_its_checkpoint(
 
 
 def test_a_paper_policy_is_evaluated_as_ever(tmp_path: Path) -> None:
-    cell = run.Cell("grasp", None, (), epochs=1)
-    run.train_cell(cell, Pictures(), tmp_path / "policy", QUIET)
+    cell = Cell("grasp", None, (), epochs=1)
+    train_cell(cell, Images(), tmp_path / "policy", QUIET)
     subject = policy_spec.checkpoint_subject(tmp_path / "policy")
     assert subject.rounds == 1 and type(subject.make_agent()) is PolicyAgent
     assert not (tmp_path / "policy" / ENCODER_STATISTICS).exists()

@@ -16,7 +16,13 @@ from policies.layers import MapConvolutions, SpatialSoftmax
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
 from surgicai_vision.dataset.stride import thinned
-from surgicai_vision.training.checkpoint import CARD, WEIGHTS, check_encoder, check_task, read_checkpoint
+from surgicai_vision.training.checkpoint import (
+    CARD,
+    WEIGHTS,
+    check_encoder,
+    check_task,
+    read_checkpoint,
+)
 from surgicai_vision.training.data import split
 from surgicai_vision.training.policies import load_policy, load_recipe, recipe_names
 from surgicai_vision.training.train import train
@@ -86,7 +92,9 @@ def test_statistics_are_those_of_the_training_frames(tmp_path: Path) -> None:
     train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "a")
     policy = load_policy(tmp_path / "a")
     rows, _, _ = split(dataset.episode_index, QUICK, 0)
-    inputs = np.concatenate([dataset.rows.astype(np.float32), dataset.columns()[names.STATE]], axis=1)[rows]
+    inputs = np.concatenate(
+        [dataset.rows.astype(np.float32), dataset.columns()[names.STATE]], axis=1
+    )[rows]
     np.testing.assert_allclose(policy.input_mean, inputs.mean(0), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(policy.input_std, inputs.std(0), rtol=1e-4)
 
@@ -96,10 +104,18 @@ def test_a_maps_statistics_are_its_channels(tmp_path: Path) -> None:
     entry = features_of(dataset, shape=[3, 2, 2])
     checkpoint = train(dataset, [entry], BC, QUICK, out=tmp_path / "map")
     index = np.asarray(dataset.episode_index)
-    rows = entry.rows[~np.isin(index, checkpoint.validation_episodes)].astype(np.float64).reshape(-1, 3, 4)
+    rows = (
+        entry.rows[~np.isin(index, checkpoint.validation_episodes)]
+        .astype(np.float64)
+        .reshape(-1, 3, 4)
+    )
     policy = load_policy(tmp_path / "map")
-    np.testing.assert_allclose(policy.input_mean[:12].view(3, 4), rows.mean((0, 2))[:, None].repeat(4, 1), rtol=1e-4)
-    np.testing.assert_allclose(policy.input_std[:12].view(3, 4), rows.std((0, 2))[:, None].repeat(4, 1), rtol=1e-4)
+    np.testing.assert_allclose(
+        policy.input_mean[:12].view(3, 4), rows.mean((0, 2))[:, None].repeat(4, 1), rtol=1e-4
+    )
+    np.testing.assert_allclose(
+        policy.input_std[:12].view(3, 4), rows.std((0, 2))[:, None].repeat(4, 1), rtol=1e-4
+    )
 
 
 def test_same_seed_same_weights_other_seed_others(tmp_path: Path) -> None:
@@ -118,7 +134,9 @@ def test_training_leaves_the_callers_random_state(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, {"schedule": "one_cycle", "weight_decay": 1e-3}])
-def test_broken_off_training_resumes_to_the_same_weights(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_broken_off_training_resumes_to_the_same_weights(
+    tmp_path: Path, changes: dict[str, Any]
+) -> None:
     recipe = replace(QUICK, **changes)
     dataset = FakeDataset()
 
@@ -132,7 +150,14 @@ def test_broken_off_training_resumes_to_the_same_weights(tmp_path: Path, changes
     with pytest.raises(BadFile, match="has not ended"):
         read_checkpoint(tmp_path / "broken")
     seen: list[int] = []
-    train(dataset, [features_of(dataset)], BC, recipe, out=tmp_path / "broken", progress=lambda d, t: seen.append(d))
+    train(
+        dataset,
+        [features_of(dataset)],
+        BC,
+        recipe,
+        out=tmp_path / "broken",
+        progress=lambda d, t: seen.append(d),
+    )
     assert seen[0] == 5 and seen[-1] == recipe.epochs
     assert tensors_of(tmp_path / "whole") == tensors_of(tmp_path / "broken")
     assert not (tmp_path / "broken" / "training_state.pt").exists()
@@ -141,7 +166,12 @@ def test_broken_off_training_resumes_to_the_same_weights(tmp_path: Path, changes
 def test_training_again_does_nothing_and_another_request_is_refused(tmp_path: Path) -> None:
     dataset = FakeDataset()
     first = train(dataset, [], BC, QUICK, out=tmp_path / "a")
-    assert train(dataset, [], BC, QUICK, out=tmp_path / "a", progress=lambda d, t: pytest.fail("trained")) == first
+    assert (
+        train(
+            dataset, [], BC, QUICK, out=tmp_path / "a", progress=lambda d, t: pytest.fail("trained")
+        )
+        == first
+    )
     with pytest.raises(OutputExists):
         train(dataset, [], BC, QUICK, seed=1, out=tmp_path / "a")
     (tmp_path / "foreign").mkdir()
@@ -175,14 +205,16 @@ def test_maps_and_tokens_pass_a_trained_layer(tmp_path: Path, shape: list[int], 
 def test_spatial_softmax_finds_the_bright_place() -> None:
     head = SpatialSoftmax(1, 5, 5)
     torch.nn.init.constant_(head.patterns.weight, 50.0)
-    picture = torch.zeros(1, 1, 5, 5)
-    picture[0, 0, 4, 0] = 1.0
-    np.testing.assert_allclose(head(picture.flatten(1)).detach()[0, :2], [-1, 1], atol=1e-5)
+    image = torch.zeros(1, 1, 5, 5)
+    image[0, 0, 4, 0] = 1.0
+    np.testing.assert_allclose(head(image.flatten(1)).detach()[0, :2], [-1, 1], atol=1e-5)
 
 
 def test_convolutions_read_where_an_arc_lies_after_little_training() -> None:
     torch.manual_seed(0)
-    head = torch.nn.Sequential(MapConvolutions(1, 28, 28), torch.nn.Linear(MapConvolutions.FEATURES, 2))
+    head = torch.nn.Sequential(
+        MapConvolutions(1, 28, 28), torch.nn.Linear(MapConvolutions.FEATURES, 2)
+    )
     places = torch.randint(4, 24, (600, 2))
     maps = torch.zeros(600, 28, 28)
     for index, (y, x) in enumerate(places.tolist()):
@@ -204,8 +236,8 @@ def test_recipes_name_how_maps_are_taken_in_and_how_many_frames() -> None:
     assert BC.make(best, ((40, 28, 28),)).network.heads[0].dim == MapConvolutions.FEATURES  # type: ignore[attr-defined]
     with pytest.raises(UnknownName, match="convolutions"):
         Recipe(map_head="convolution")
-    with pytest.raises(InputError, match="every is 0"):
-        Recipe(every=0)
+    with pytest.raises(InputError, match="frame_stride is 0"):
+        Recipe(frame_stride=0)
 
 
 def test_thinned_labels_of_a_policy_that_looks_ahead_stay_at_their_time(tmp_path: Path) -> None:
@@ -214,14 +246,18 @@ def test_thinned_labels_of_a_policy_that_looks_ahead_stay_at_their_time(tmp_path
 
     class Watched(BCPolicy):
         def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-            seen.append(torch.cat([observed[:, :1] * self.input_std[0] + self.input_mean[0], target[:, :1]], dim=1))
+            seen.append(
+                torch.cat(
+                    [observed[:, :1] * self.input_std[0] + self.input_mean[0], target[:, :1]], dim=1
+                )
+            )
             return super().loss(observed, target)
 
     dataset = FakeDataset(episodes=2, steps=40)
     number = np.tile(np.arange(40, dtype=np.float32), 2)[:, None].repeat(7, 1)
     dataset._columns = {names.STATE: number, names.ACTION: number / 100}
     plugin = replace(BC, make=lambda recipe, visual: Watched(recipe, visual), ahead=10)
-    recipe = replace(QUICK, every=2, validation=0.0, epochs=1)
+    recipe = replace(QUICK, frame_stride=2, validation=0.0, epochs=1)
     train(thinned(dataset, 2), [], plugin, recipe, out=tmp_path / "a")
     state, target = torch.cat(seen).T
     torch.testing.assert_close(target * 100, state.round().add(10).clamp(max=38), atol=1e-3, rtol=0)
@@ -257,7 +293,12 @@ def test_policy_refuses_wrong_observations(tmp_path: Path) -> None:
     policy = BC.make(QUICK, ((DIM,),))
     policy.eval()
     good, state = np.zeros((2, DIM), np.float32), np.zeros((2, 7), np.float32)
-    for features, pose in ((None, state), (good[:, 1:], state), (good, state[:1]), (good, state[:, 1:])):
+    for features, pose in (
+        (None, state),
+        (good[:, 1:], state),
+        (good, state[:1]),
+        (good, state[:, 1:]),
+    ):
         with pytest.raises(InputError):
             policy.act(features, pose)
     with pytest.raises(InputError, match="not finite"):

@@ -15,7 +15,9 @@ EXAMPLE = "surgicai-vision dataset check outputs/datasets/grasp --json"
 class Options:
     """Options of `dataset check`."""
 
-    dataset: str = option(dataclasses.MISSING, "a dataset of ours, or any LeRobot v3 dataset", metavar="DIR")
+    dataset: str = option(
+        dataclasses.MISSING, "a dataset of ours, or any LeRobot v3 dataset", metavar="DIR"
+    )
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
@@ -26,6 +28,10 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         report = check_dataset(Path(options.dataset), progress)
     for problem in report.problems:
         console.say(problem)
-    verdict = "whole" if report.ok else f"{len(report.problems)} problems; see `surgicai-vision dataset repair --help`"
+    verdict = (
+        "whole"
+        if report.ok
+        else f"{len(report.problems)} problems; see `surgicai-vision dataset repair --help`"
+    )
     console.say(f"{report.episodes} episodes, {report.frames} frames: {verdict}")
     return {**dataclasses.asdict(report), "ok": report.ok, "exit_code": 0 if report.ok else 1}

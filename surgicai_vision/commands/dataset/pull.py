@@ -17,16 +17,29 @@ class Options:
     """Options of `dataset pull`."""
 
     repo: str = option(dataclasses.MISSING, "a LeRobot v3 dataset on the Hub", metavar="USER/NAME")
-    out: str | None = option(None, "folder to make", metavar="DIR", default_text="outputs/datasets/NAME")
-    revision: str | None = option(None, "branch, tag or commit", metavar="REV", default_text="the main branch")
+    out: str | None = option(
+        None, "folder to make", metavar="DIR", default_text="outputs/datasets/NAME"
+    )
+    revision: str | None = option(
+        None, "branch, tag or commit", metavar="REV", default_text="the main branch"
+    )
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Fetch, check and say where it is."""
     from surgicai_vision.dataset.hub import pull_dataset
 
-    out = Path(options.out) if options.out else folders.dataset_folder(options.repo.partition("/")[2] or options.repo)
+    out = (
+        Path(options.out)
+        if options.out
+        else folders.dataset_folder(options.repo.partition("/")[2] or options.repo)
+    )
     with console.stage("checking") as progress:
         report = pull_dataset(options.repo, out, revision=options.revision, progress=progress)
     console.say(f"{report.episodes} episodes, {report.frames} frames: {out}")
-    return {"repo": options.repo, "dataset": str(out), "episodes": report.episodes, "frames": report.frames}
+    return {
+        "repo": options.repo,
+        "dataset": str(out),
+        "episodes": report.episodes,
+        "frames": report.frames,
+    }

@@ -9,7 +9,9 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import option
 from surgicai_vision.core.errors import InputError
 
-EXAMPLE = "surgicai-vision dataset push outputs/datasets/grasp --repo somebody/suturing-grasp --private"
+EXAMPLE = (
+    "surgicai-vision dataset push outputs/datasets/grasp --repo somebody/suturing-grasp --private"
+)
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     if options.repo is None:
         raise InputError("dataset push needs --repo USER/NAME.")
     if options.dry_run:
-        console.say(dataset_card(open_dataset(Path(options.dataset)), options.repo, options.licence))
+        console.say(
+            dataset_card(open_dataset(Path(options.dataset)), options.repo, options.licence)
+        )
         return {"repo": options.repo, "dry_run": True}
     with console.stage("checking", "frames") as progress:
         address = push_dataset(

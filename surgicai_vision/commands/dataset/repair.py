@@ -15,9 +15,14 @@ EXAMPLE = "surgicai-vision dataset repair recordings/broken --out recordings/men
 class Options:
     """Options of `dataset repair`."""
 
-    dataset: str = option(dataclasses.MISSING, "a LeRobot v3 dataset, ours or any other", metavar="DIR")
+    dataset: str = option(
+        dataclasses.MISSING, "a LeRobot v3 dataset, ours or any other", metavar="DIR"
+    )
     out: str | None = option(
-        None, "folder to make", metavar="DIR2", default_text="DIR itself; the original stays as DIR.broken"
+        None,
+        "folder to make",
+        metavar="DIR2",
+        default_text="DIR itself; the original stays as DIR.broken",
     )
 
 
@@ -26,7 +31,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     from surgicai_vision.dataset import repair_dataset
 
     with console.stage("verifying", "episodes") as progress:
-        repair = repair_dataset(Path(options.dataset), Path(options.out) if options.out else None, progress)
+        repair = repair_dataset(
+            Path(options.dataset), Path(options.out) if options.out else None, progress
+        )
     for problem in repair.problems:
         console.say(problem)
     if repair.original is None:

@@ -21,7 +21,11 @@ class Options:
 
     dataset: str = option(dataclasses.MISSING, "a dataset of ours", metavar="DIR")
     view: tuple[str, ...] | None = option(
-        None, "views, a comma list", check=many_of("view", names.CAMERAS), metavar="VIEW[,VIEW]", default_text="all"
+        None,
+        "views, a comma list",
+        check=many_of("view", names.CAMERAS),
+        metavar="VIEW[,VIEW]",
+        default_text="all",
     )
     video: str | None = option(
         None,
@@ -30,9 +34,14 @@ class Options:
         metavar="CODEC",
         default_text="as it is",
     )
-    workers: int = option(folders.CORES, "processes that encode videos", check=positive, metavar="N")
+    workers: int = option(
+        folders.CORES, "processes that encode videos", check=positive, metavar="N"
+    )
     out: str | None = option(
-        None, "dataset to make", metavar="DIR2", default_text="DIR with the views and the codec in its name"
+        None,
+        "dataset to make",
+        metavar="DIR2",
+        default_text="DIR with the views and the codec in its name",
     )
 
 
@@ -49,8 +58,15 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     out = Path(options.out) if options.out else path.with_name(f"{path.name}-{ending}")
     with console.stage("writing", "frames") as progress:
         summary = view_dataset(
-            path, out, views=options.view, video=options.video, workers=options.workers, progress=progress
+            path,
+            out,
+            views=options.view,
+            video=options.video,
+            workers=options.workers,
+            progress=progress,
         )
-    console.say(f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}")
+    console.say(
+        f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}"
+    )
     say_error(summary, console)
     return {**dataclasses.asdict(summary), "dataset": str(out)}

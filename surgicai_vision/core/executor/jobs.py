@@ -1,4 +1,6 @@
-"""Jobs: registered functions with JSON arguments, what their results are stored under, and how one is done."""
+"""Jobs: registered functions with JSON arguments, what their results are stored under, and how one
+is done.
+"""
 
 import functools
 import importlib
@@ -37,22 +39,41 @@ _NUMERIC = ("mujoco", "numpy", "torch", "timm", "lerobot")
 
 JOBS: Mapping[str, JobKind] = MappingProxyType(
     {
-        "record-episode": JobKind("surgicai_vision.demos.record:record_episode", ("scene", "envs", "demos")),
-        "drive-episode": JobKind("surgicai_vision.experiments.dagger:record_driven", _CELL, _NUMERIC),
+        "record-episode": JobKind(
+            "surgicai_vision.demos.record:record_episode", ("scene", "envs", "demos")
+        ),
+        "drive-episode": JobKind(
+            "surgicai_vision.experiments.dagger:record_driven", _CELL, _NUMERIC
+        ),
         "render-episode": JobKind(
             "surgicai_vision.dataset.render:render_episode", ("scene", "envs", "demos", "dataset")
         ),
-        "encode-video": JobKind("surgicai_vision.dataset.video_jobs:encode_block", ("dataset",), ("numpy", "av")),
-        "sweep-features": JobKind("surgicai_vision.experiments.sweep.jobs:encode_features", _LEARN, _NUMERIC),
-        "sweep-policy": JobKind("surgicai_vision.experiments.sweep.jobs:train_policy", _LEARN, _NUMERIC),
+        "encode-video": JobKind(
+            "surgicai_vision.dataset.video_jobs:encode_block", ("dataset",), ("numpy", "av")
+        ),
+        "sweep-features": JobKind(
+            "surgicai_vision.experiments.sweep.jobs:encode_features", _LEARN, _NUMERIC
+        ),
+        "sweep-policy": JobKind(
+            "surgicai_vision.experiments.sweep.jobs:train_policy", _LEARN, _NUMERIC
+        ),
         "sweep-cell": JobKind("surgicai_vision.experiments.sweep.jobs:run_cell", _CELL, _NUMERIC),
-        "sweep-probe": JobKind("surgicai_vision.experiments.sweep.jobs:run_probe", _LEARN, _NUMERIC),
-        "sweep-reference": JobKind("surgicai_vision.experiments.sweep.jobs:run_reference", _CELL, _NUMERIC),
+        "sweep-probe": JobKind(
+            "surgicai_vision.experiments.sweep.jobs:run_probe", _LEARN, _NUMERIC
+        ),
+        "sweep-reference": JobKind(
+            "surgicai_vision.experiments.sweep.jobs:run_reference", _CELL, _NUMERIC
+        ),
     }
 )
 
 WORKER_ENVIRONMENT: Mapping[str, str] = MappingProxyType(
-    {"LP_NUM_THREADS": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    {
+        "LP_NUM_THREADS": "0",
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "HF_HUB_OFFLINE": "1",
+    }
 )
 """One worker, one core: llvmpipe's and the BLAS's own threads would fight over it (measured: two
 single-threaded processes scale linearly)."""
@@ -67,7 +88,8 @@ class Job:
         arguments: JSON data, the function's keyword arguments.
         inputs: hashes of what the job reads besides its arguments.
         weight: what it counts for in the progress.
-        label: arguments named here are left out of the key (where a file lies does not change what it holds).
+        label: arguments named here are left out of the key (where a file lies does not change what
+            it holds).
     """
 
     name: str
@@ -94,8 +116,12 @@ def _version(package: str) -> str:
     return f"{package} {importlib.metadata.version(package)}"
 
 
-def work(function: str, arguments: dict[str, Any], destination: Path) -> tuple[int, str, str] | None:
-    """Do one job; return None, or (exit code, message, traceback) since not every exception can be pickled."""
+def work(
+    function: str, arguments: dict[str, Any], destination: Path
+) -> tuple[int, str, str] | None:
+    """Do one job; return None, or (exit code, message, traceback) since not every exception can be
+    pickled.
+    """
     if destination.is_dir():  # its worker was killed after the commit and before it could say so
         return None
     try:
@@ -112,7 +138,9 @@ def work(function: str, arguments: dict[str, Any], destination: Path) -> tuple[i
 
 
 def failure_of(failure: tuple[int, str, str] | None, job: Job) -> SurgicaiError | None:
-    """Return what a job reported as the error it stands for, its traceback in a note; None for a job done."""
+    """Return what a job reported as the error it stands for, its traceback in a note; None for a
+    job done.
+    """
     if failure is None:
         return None
     code, message, trace = failure
@@ -125,5 +153,7 @@ def failure_of(failure: tuple[int, str, str] | None, job: Job) -> SurgicaiError 
 
 def describe(job: Job) -> str:
     """Return a job in a few words for a message."""
-    text = ", ".join(f"{key}={value}" for key, value in job.arguments.items() if isinstance(value, (str, int)))
+    text = ", ".join(
+        f"{key}={value}" for key, value in job.arguments.items() if isinstance(value, (str, int))
+    )
     return f"{job.name}({text})"

@@ -1,7 +1,8 @@
 """The local engine: spawned processes on this machine, or none.
 
-Workers are spawned (a GL context cannot be shared by a fork) and each is on its own: one that dies (killed, out of
-memory) is replaced, its job is tried again, and the others go on. A worker whose parent died ends by itself.
+Workers are spawned (a GL context cannot be shared by a fork) and each is on its own: one that dies
+(killed, out of memory) is replaced, its job is tried again, and the others go on. A worker whose
+parent died ends by itself.
 """
 
 import multiprocessing
@@ -17,7 +18,14 @@ from pathlib import Path
 from typing import Any, final
 
 from surgicai_vision.core.errors import SurgicaiError
-from surgicai_vision.core.executor.jobs import WORKER_ENVIRONMENT, Job, JobKind, describe, failure_of, work
+from surgicai_vision.core.executor.jobs import (
+    WORKER_ENVIRONMENT,
+    Job,
+    JobKind,
+    describe,
+    failure_of,
+    work,
+)
 
 ATTEMPTS = 2
 """How often a job is started whose worker dies, where the caller does not say."""
@@ -26,12 +34,21 @@ LEAVE_S = 10
 
 
 def execute(
-    jobs: Mapping[str, Job], store: Path, workers: int, table: Mapping[str, JobKind], attempts: int | None = None
+    jobs: Mapping[str, Job],
+    store: Path,
+    workers: int,
+    table: Mapping[str, JobKind],
+    attempts: int | None = None,
 ) -> Generator[tuple[str, SurgicaiError | None]]:
-    """Do `jobs` and yield each key as its result is committed, or with the error that the job ended in."""
+    """Do `jobs` and yield each key as its result is committed, or with the error that the job ended
+    in.
+    """
     if not workers:
         for key, job in jobs.items():
-            yield key, failure_of(work(table[job.name].function, dict(job.arguments), store / key), job)
+            yield (
+                key,
+                failure_of(work(table[job.name].function, dict(job.arguments), store / key), job),
+            )
         return
     queue, started = list(jobs), Counter[str]()
     crew: list[_Worker] = []
@@ -40,7 +57,9 @@ def execute(
             while queue and len([worker for worker in crew if worker.key]) < workers:
                 key = queue.pop(0)
                 started[key] += 1
-                _free(crew).begin(key, table[jobs[key].name].function, dict(jobs[key].arguments), store / key)
+                _free(crew).begin(
+                    key, table[jobs[key].name].function, dict(jobs[key].arguments), store / key
+                )
             for worker in _heard(crew):
                 key = worker.key
                 try:
@@ -127,7 +146,9 @@ class _Worker:
 
 
 def _serve(connection: Connection, parent: int) -> None:
-    """Do jobs until the connection ends: Ctrl-C is the parent's to handle, and without a parent there is no work."""
+    """Do jobs until the connection ends: Ctrl-C is the parent's to handle, and without a parent
+    there is no work.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def end_with_parent() -> None:

@@ -1,8 +1,8 @@
 """The Ray engine: the same jobs as tasks of Ray Core, on this machine or on a cluster.
 
-A cluster of its own listens on loopback only, without a dashboard and without reports of use. Ray starts a task again
-whose worker or node was lost; its result is committed by one rename, so that a task done twice is there once. What is
-committed counts, whatever becomes of Ray.
+A cluster of its own listens on loopback only, without a dashboard and without reports of use. Ray
+starts a task again whose worker or node was lost; its result is committed by one rename, so that a
+task done twice is there once. What is committed counts, whatever becomes of Ray.
 """
 
 import importlib.util
@@ -14,13 +14,22 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core.errors import InputError, SurgicaiError
-from surgicai_vision.core.executor.jobs import WORKER_ENVIRONMENT, Job, JobKind, describe, failure_of, work
+from surgicai_vision.core.executor.jobs import (
+    WORKER_ENVIRONMENT,
+    Job,
+    JobKind,
+    describe,
+    failure_of,
+    work,
+)
 
 ATTEMPTS = 5
 """How often Ray starts a task whose worker or node is lost, where the caller does not say."""
 
 OBJECT_STORE = 80 * 2**20
-"""Bytes of Ray's shared memory, its least: results are files, and nothing of size is passed through it."""
+"""Bytes of Ray's shared memory, its least: results are files, and nothing of size is passed through
+it.
+"""
 
 ENVIRONMENT: Mapping[str, str] = {
     **WORKER_ENVIRONMENT,
@@ -28,8 +37,9 @@ ENVIRONMENT: Mapping[str, str] = {
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
 }
 """Set while Ray starts, and so in its workers. The last one, read on Ray's import (ray 2.60,
-_private/ray_constants.py), makes every one of its servers listen on 127.0.0.1 alone; without it they listen on all
-interfaces. A cluster of several nodes is started by its owner and given by address."""
+_private/ray_constants.py), makes every one of its servers listen on 127.0.0.1 alone; without it
+they listen on all interfaces. A cluster of several nodes is started by its owner and given by
+address."""
 
 
 def check() -> None:
@@ -48,7 +58,9 @@ def execute(
     address: str | None,
     attempts: int | None = None,
 ) -> Generator[tuple[str, SurgicaiError | None]]:
-    """Do `jobs` as Ray tasks, `workers` at a time; yield each key as it is committed, or with the job's error."""
+    """Do `jobs` as Ray tasks, `workers` at a time; yield each key as it is committed, or with the
+    job's error.
+    """
     if not jobs:
         return
     with _cluster(max(1, workers), address) as ray:
@@ -59,7 +71,9 @@ def execute(
             while queue and len(running) < max(1, workers):
                 key = queue.pop(0)
                 job = jobs[key]
-                running[task.remote(table[job.name].function, dict(job.arguments), str(store / key))] = key
+                running[
+                    task.remote(table[job.name].function, dict(job.arguments), str(store / key))
+                ] = key
             done, _ = ray.wait(list(running), num_returns=1)
             for reference in done:
                 key = running.pop(reference)
@@ -87,14 +101,20 @@ def _task(function: str, arguments: dict[str, Any], destination: str) -> Any:
 def _cluster(workers: int, address: str | None) -> Iterator[Any]:
     """Connect to the cluster at `address`, or start one; leave it at the end."""
     before = {name: os.environ.get(name) for name in ENVIRONMENT}
-    own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False, "object_store_memory": OBJECT_STORE}
+    own: dict[str, Any] = {
+        "num_cpus": workers,
+        "include_dashboard": False,
+        "object_store_memory": OBJECT_STORE,
+    }
     if not address:
         os.environ.update(ENVIRONMENT)
     try:
         import ray
 
         if ray.is_initialized():
-            raise InputError("This process is connected to Ray already; leave it first (ray.shutdown()).")
+            raise InputError(
+                "This process is connected to Ray already; leave it first (ray.shutdown())."
+            )
         ray.init(
             address=address or "local",
             log_to_driver=False,
@@ -112,7 +132,9 @@ def _cluster(workers: int, address: str | None) -> Iterator[Any]:
                 os.environ[name] = value
     try:
         if not address and ray.util.get_node_ip_address() != "127.0.0.1":
-            raise SurgicaiError("Ray listens beyond loopback, since it was imported before; start it by --address.")
+            raise SurgicaiError(
+                "Ray listens beyond loopback, since it was imported before; start it by --address."
+            )
         yield ray
     finally:
         ray.shutdown()

@@ -1,4 +1,6 @@
-"""Run jobs against a store: what is there is never computed again, what is missing is done and committed whole."""
+"""Run jobs against a store: what is there is never computed again, what is missing is done and
+committed whole.
+"""
 
 import fcntl
 import os
@@ -17,7 +19,9 @@ Progress = Callable[[int, int, str], None]
 """`progress(done, total, unit)`, called after every finished job and once at the start."""
 
 Ended = Callable[[Job, Path, SurgicaiError | None], None]
-"""`ended(job, folder, error)`, called as a job ends; without an error the folder holds its result."""
+"""`ended(job, folder, error)`, called as a job ends; without an error the folder holds its
+result.
+"""
 
 ENGINES = ("local", "ray")
 
@@ -28,8 +32,8 @@ class Engine:
 
     Attributes:
         name: "local" (processes of this machine) or "ray".
-        address: of a running Ray cluster whose nodes see the store under the same path; by default Ray starts on this
-            machine alone.
+        address: of a running Ray cluster whose nodes see the store under the same path; by default
+            Ray starts on this machine alone.
     """
 
     name: str = "local"
@@ -38,7 +42,9 @@ class Engine:
     def __post_init__(self) -> None:
         check_name("executor", self.name, ENGINES)
         if self.address and self.name != "ray":
-            raise InputError(f"--address {self.address} is of a Ray cluster; give --executor ray with it.")
+            raise InputError(
+                f"--address {self.address} is of a Ray cluster; give --executor ray with it."
+            )
         if self.name == "ray":
             ray_engine.check()
 
@@ -72,11 +78,12 @@ def run(
         table: name → kind of job.
         engine: what runs them.
         attempts: how often a job is started whose worker dies; the engine's own number by default.
-        ended: called with (job, its folder, its error or None) for every job of this run as it ends; then a job that
-            fails does not end the run.
+        ended: called with (job, its folder, its error or None) for every job of this run as it
+            ends; then a job that fails does not end the run.
 
     Raises:
-        InputError: `workers` below 0, an unknown job, a store in use by another run, or bad input to a job.
+        InputError: `workers` below 0, an unknown job, a store in use by another run, or bad input
+            to a job.
         SurgicaiError: a job failed, or its worker died at every attempt.
     """
     if workers < 0:
@@ -91,7 +98,9 @@ def run(
         done = total - sum(job.weight for job in missing.values())
         report(done, total, unit)
         if engine.name == "ray":
-            finished = ray_engine.execute(missing, store.resolve(), workers, table, engine.address, attempts)
+            finished = ray_engine.execute(
+                missing, store.resolve(), workers, table, engine.address, attempts
+            )
         else:
             finished = local.execute(missing, store, workers, table, attempts)
         with closing(finished):  # workers end with it, whatever is raised here
@@ -125,7 +134,9 @@ def claim(store: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise InputError(f"Another run is working in {store}; wait for it or stop it first.") from None
+            raise InputError(
+                f"Another run is working in {store}; wait for it or stop it first."
+            ) from None
         for left in path.glob(f"{TEMPORARY}*"):
             shutil.rmtree(left, ignore_errors=True)
         _claimed.add(path)
@@ -144,9 +155,9 @@ def work_folder(out: Path) -> Path:
 def building(out: Path) -> Iterator[tuple[Path, Path]]:
     """Build the folder `out` so that it appears whole, with the store of its jobs beside it.
 
-    Yields the store, for `run`, and a path in it for the result, to be made with `files.whole_folder`. At the end
-    the result becomes `out` by one rename and the store is removed; after an error or a kill the store stays, and
-    the next run goes on with what it holds.
+    Yields the store, for `run`, and a path in it for the result, to be made with
+    `files.whole_folder`. At the end the result becomes `out` by one rename and the store is
+    removed; after an error or a kill the store stays, and the next run goes on with what it holds.
 
         with building(out) as (store, result):
             shards = run(jobs, store)

@@ -1,13 +1,15 @@
-"""Check a dataset, ours or anyone's: counts, order, pictures, numbers, statistics and the digest, every frame of it.
+"""Check a dataset, ours or anyone's: counts, order, images, numbers, statistics and the digest,
+every frame of it.
 
     report = check_dataset(Path("dataset"))
     report.ok, report.problems        # each problem one line
 
-What is checked: `meta/surgicai.json`, LeRobot's `meta/info.json`, `meta/episodes` and `meta/stats.json` agree
-with the data and with each other; index columns are gapless and in order; every number is finite; every
-picture decodes, has its size, is not of one colour and is not the one before it while the arm or the needle
-moved; depth is positive; the digest over the decoded content is the one recorded when it was rendered. Of another
-LeRobot dataset, everything that is not ours alone; its digest is that over its files.
+What is checked: `meta/surgicai.json`, LeRobot's `meta/info.json`, `meta/episodes` and
+`meta/stats.json` agree with the data and with each other; index columns are gapless and in order;
+every number is finite; every image decodes, has its size, is not of one colour and is not the one
+before it while the arm or the needle moved; depth is positive; the digest over the decoded content
+is the one recorded when it was rendered. Of another LeRobot dataset, everything that is not ours
+alone; its digest is that over its files.
 """
 
 import tempfile
@@ -29,18 +31,22 @@ from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.reader import Dataset, open_dataset
 from surgicai_vision.dataset.stats import column_statistics
 from surgicai_vision.dataset.validate.lerobot_files import INFO, LeRobotFiles
-from surgicai_vision.dataset.validate.rules import PictureWatch, episode_problems, number_problems
+from surgicai_vision.dataset.validate.rules import ImageWatch, episode_problems, number_problems
 from surgicai_vision.dataset.validate.verify import Verifier
 
 MOST_PROBLEMS = 50
 """Problems listed; the rest is counted."""
 STATISTICS_TOLERANCE = 1e-4
-"""Largest deviation of a column's statistics from the recomputed ones, relative to the largest value."""
+"""Largest deviation of a column's statistics from the recomputed ones, relative to the largest
+value.
+"""
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What a check found: frames and episodes read, the digest of the content, and one line a problem."""
+    """What a check found: frames and episodes read, the digest of the content, and one line a
+    problem.
+    """
 
     frames: int
     episodes: int
@@ -68,7 +74,12 @@ def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
     dataset = open_dataset(path)
     problems: list[str] = []
     columns = dataset.columns()
-    keys = [key for key, _, _ in schema.picture_keys(dataset.views, dataset.has_depth, dataset.has_segmentation)]
+    keys = [
+        key
+        for key, _, _ in schema.image_keys(
+            dataset.views, dataset.has_depth, dataset.has_segmentation
+        )
+    ]
     _check_order(dataset, columns, problems)
     problems.extend(number_problems(columns))
     _check_lerobot(dataset, columns, keys, problems)
@@ -81,7 +92,9 @@ def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
             progress(stop, dataset.length, "frames")
     digest = schema.dataset_digest(digests)
     if digest != dataset.meta.get("digest"):
-        problems.append(f"digest: the content has {digest[:16]}…, its {names.META_FILE} says otherwise.")
+        problems.append(
+            f"digest: the content has {digest[:16]}…, its {names.META_FILE} says otherwise."
+        )
     return CheckReport(dataset.length, len(bounds), digest, _listed(problems))
 
 
@@ -108,15 +121,22 @@ def _check_foreign(files: LeRobotFiles, progress: Progress) -> CheckReport:
             f"frames; {len(rows)} and {start} are whole."
         )
     written = [
-        tuple(row.get(key) for key in ("length", "dataset_from_index", "dataset_to_index")) for row in files.rows
+        tuple(row.get(key) for key in ("length", "dataset_from_index", "dataset_to_index"))
+        for row in files.rows
     ]
     if written != rows:
         problems.append("meta/episodes: its rows are not the episodes of the data.")
-    missing = [key for key, row in files.features.items() if row["dtype"] != "string" and key not in files.statistics]
+    missing = [
+        key
+        for key, row in files.features.items()
+        if row["dtype"] != "string" and key not in files.statistics
+    ]
     if missing:
         problems.append(f"meta/stats.json: no statistics of {', '.join(missing)}.")
     data = [*files.data_files(), *sorted(files.path.glob("videos/*/chunk-*/file-*.mp4"))]
-    return CheckReport(start, len(rows), digest_of([sha256_file(file) for file in data]), _listed(problems))
+    return CheckReport(
+        start, len(rows), digest_of([sha256_file(file) for file in data]), _listed(problems)
+    )
 
 
 def _check_order(dataset: Dataset, columns: Mapping[str, np.ndarray], problems: list[str]) -> None:
@@ -127,24 +147,34 @@ def _check_order(dataset: Dataset, columns: Mapping[str, np.ndarray], problems: 
     if [int(dataset.episode_index[start]) for start, _ in bounds] != list(range(len(bounds))):
         problems.append("episode_index: episodes are not 0, 1, 2, … in order.")
     if len(bounds) != dataset.meta.get("episodes"):
-        problems.append(f"episodes: {len(bounds)} in the data, {dataset.meta.get('episodes')} in {names.META_FILE}.")
+        problems.append(
+            f"episodes: {len(bounds)} in the data, {dataset.meta.get('episodes')} in {names.META_FILE}."
+        )
     for number, (start, stop) in enumerate(bounds):
         problems.extend(
-            episode_problems(number, {key: rows[start:stop] for key, rows in columns.items()}, dataset.fps)
+            episode_problems(
+                number, {key: rows[start:stop] for key, rows in columns.items()}, dataset.fps
+            )
         )
 
 
-def _check_lerobot(dataset: Dataset, columns: Mapping[str, np.ndarray], keys: list[str], problems: list[str]) -> None:
+def _check_lerobot(
+    dataset: Dataset, columns: Mapping[str, np.ndarray], keys: list[str], problems: list[str]
+) -> None:
     """Check LeRobot's own metadata against the data."""
     try:
         info = read_json(dataset.path / "meta/info.json")
         statistics = read_json(dataset.path / "meta/stats.json")
         table = pa.concat_tables(
-            pq.read_table(file, columns=["episode_index", "length", "dataset_from_index", "dataset_to_index"])
+            pq.read_table(
+                file, columns=["episode_index", "length", "dataset_from_index", "dataset_to_index"]
+            )
             for file in sorted(dataset.path.glob("meta/episodes/chunk-*/file-*.parquet"))
         )
     except (BadFile, OSError, pa.ArrowException) as error:
-        problems.append(f"LeRobot's metadata cannot be read ({(str(error).splitlines() or [''])[0]}).")
+        problems.append(
+            f"LeRobot's metadata cannot be read ({(str(error).splitlines() or [''])[0]})."
+        )
         return
     bounds = dataset.bounds()
     if (info.get("total_frames"), info.get("total_episodes")) != (dataset.length, len(bounds)):
@@ -157,7 +187,9 @@ def _check_lerobot(dataset: Dataset, columns: Mapping[str, np.ndarray], keys: li
         problems.append("meta/episodes: its rows are not the episodes of the data.")
     for key in schema.COLUMNS:
         _check_statistics(key, statistics.get(key), columns[key], problems)
-    problems.extend(f"meta/stats.json: no statistics of {key}." for key in keys if key not in statistics)
+    problems.extend(
+        f"meta/stats.json: no statistics of {key}." for key in keys if key not in statistics
+    )
 
 
 def _check_statistics(key: str, recorded: Any, values: np.ndarray, problems: list[str]) -> None:
@@ -175,12 +207,19 @@ def _check_statistics(key: str, recorded: Any, values: np.ndarray, problems: lis
 
 
 def _check_episode(
-    dataset: Dataset, keys: list[str], start: int, stop: int, rows: Mapping[str, np.ndarray], problems: list[str]
+    dataset: Dataset,
+    keys: list[str],
+    start: int,
+    stop: int,
+    rows: Mapping[str, np.ndarray],
+    problems: list[str],
 ) -> str:
-    """Check one episode's pictures; return the digest of its content."""
+    """Check one episode's images; return the digest of its content."""
     digest = schema.EpisodeDigest(keys)
     for key in keys:
-        watch = PictureWatch(key, dataset.image_size, dataset.views, rows, key not in dataset.video_keys)
+        watch = ImageWatch(
+            key, dataset.image_size, dataset.views, rows, key not in dataset.video_keys
+        )
         for index, frame in enumerate(_frames(dataset, key, start, stop, problems)):
             digest.add(key, frame)
             problem = watch.problem(index, frame)
@@ -189,8 +228,10 @@ def _check_episode(
     return digest.hexdigest(rows)
 
 
-def _frames(dataset: Dataset, key: str, start: int, stop: int, problems: list[str]) -> Iterator[np.ndarray]:
-    """Yield an episode's pictures of one column; those before the first that cannot be decoded."""
+def _frames(
+    dataset: Dataset, key: str, start: int, stop: int, problems: list[str]
+) -> Iterator[np.ndarray]:
+    """Yield an episode's images of one column; those before the first that cannot be decoded."""
     try:
         yield from dataset.decoded(key, start, stop)
     except BadFile as error:

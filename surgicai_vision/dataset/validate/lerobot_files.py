@@ -4,8 +4,8 @@
     files.features, files.fps, files.tasks, files.rows      # what its metadata says
     for table in files.episodes(scratch): …                 # one pyarrow table an episode, in order
 
-Nothing is needed but `meta/info.json`: what else is missing or damaged is listed in `problems`, a data file without a
-footer is salvaged into `scratch`, and reading ends where the data does.
+Nothing is needed but `meta/info.json`: what else is missing or damaged is listed in `problems`, a
+data file without a footer is salvaged into `scratch`, and reading ends where the data does.
 """
 
 import itertools
@@ -49,7 +49,9 @@ class LeRobotFiles:
     def __init__(self, path: Path):
         self.path = Path(path)
         if not (self.path / INFO).is_file():
-            raise BadFile(f"{self.path} is no LeRobot dataset: it has no {INFO}, without which nothing can be read.")
+            raise BadFile(
+                f"{self.path} is no LeRobot dataset: it has no {INFO}, without which nothing can be read."
+            )
         self.info = read_json(self.path / INFO)
         self.problems: list[str] = []
         try:
@@ -58,13 +60,19 @@ class LeRobotFiles:
                 for key, row in self.info["features"].items()
             }
             self.fps = float(self.info["fps"])
-            self._own = {key: row for key, row in self.features.items() if key not in INDEX_FEATURES}
+            self._own = {
+                key: row for key, row in self.features.items() if key not in INDEX_FEATURES
+            }
             self.schema = arrow_schema(self._own)
             version = self.info["codebase_version"]
         except (KeyError, TypeError, ValueError, AttributeError, pa.ArrowException) as error:
-            raise BadFile(f"{self.path / INFO} is not that of a LeRobot dataset ({line(error)}).") from None
+            raise BadFile(
+                f"{self.path / INFO} is not that of a LeRobot dataset ({line(error)})."
+            ) from None
         if version not in VERSIONS or not self.fps > 0:
-            raise BadFile(f"{self.path / INFO}: version {version!r}, {self.fps:g} fps; read: {', '.join(VERSIONS)}.")
+            raise BadFile(
+                f"{self.path / INFO}: version {version!r}, {self.fps:g} fps; read: {', '.join(VERSIONS)}."
+            )
         self.tasks = self._read_tasks()
         self.rows = self._read_rows()
         self.statistics = self._read_statistics()
@@ -76,7 +84,7 @@ class LeRobotFiles:
 
     @property
     def image_keys(self) -> tuple[str, ...]:
-        """Features stored as pictures in the data files."""
+        """Features stored as images in the data files."""
         return tuple(key for key, row in self.features.items() if row["dtype"] == "image")
 
     def data_files(self) -> list[Path]:
@@ -91,7 +99,9 @@ class LeRobotFiles:
         try:
             table = pq.read_table(self.path / TASKS)
             name = "task" if "task" in table.column_names else "__index_level_0__"
-            pairs = zip(table.column("task_index").to_pylist(), table.column(name).to_pylist(), strict=True)
+            pairs = zip(
+                table.column("task_index").to_pylist(), table.column(name).to_pylist(), strict=True
+            )
             return {int(index): str(text) for index, text in pairs}
         except UNREADABLE as error:
             self.problems.append(f"{TASKS} cannot be read ({line(error)}).")
@@ -110,7 +120,9 @@ class LeRobotFiles:
             self.problems.append("meta/episodes is missing.")
         for number, row in enumerate(rows):
             if row.get("episode_index") != number:
-                self.problems.append(f"meta/episodes: row {number} is of episode {row.get('episode_index')}.")
+                self.problems.append(
+                    f"meta/episodes: row {number} is of episode {row.get('episode_index')}."
+                )
                 return rows[:number]
         return rows
 
@@ -142,7 +154,11 @@ class LeRobotFiles:
             try:
                 reader = self._open(file, scratch)
                 for number in range(reader.num_row_groups):
-                    yield reader.read_row_group(number, self.schema.names).select(self.schema.names).combine_chunks()
+                    yield (
+                        reader.read_row_group(number, self.schema.names)
+                        .select(self.schema.names)
+                        .combine_chunks()
+                    )
             except UNREADABLE as error:
                 self.problems.append(f"{name} cannot be read further ({line(error)}).")
                 return
@@ -152,9 +168,13 @@ class LeRobotFiles:
         try:
             return pq.ParquetFile(file)
         except (OSError, pa.ArrowException):
-            self.problems.append(f"{file.relative_to(self.path)} has no footer: its writer was killed.")
+            self.problems.append(
+                f"{file.relative_to(self.path)} has no footer: its writer was killed."
+            )
         mended = scratch / "-".join(file.relative_to(self.path).parts)
-        depth = [key for key, row in self._own.items() if (row.get("info") or {}).get("is_depth_map")]
+        depth = [
+            key for key, row in self._own.items() if (row.get("info") or {}).get("is_depth_map")
+        ]
         for writing in (LEROBOT, Writing(compression(self.schema, depth), False)):
             if salvage(file, self.sample(), mended, writing):
                 return pq.ParquetFile(mended)
@@ -195,10 +215,14 @@ def _split(table: pa.Table) -> Iterator[pa.Table]:
 
 
 def contents(column: pa.ChunkedArray) -> list[tuple[bytes | None, str | None]]:
-    """Return the (bytes, path) of a column of pictures."""
+    """Return the (bytes, path) of a column of images."""
     whole = column.combine_chunks()
     return list(
-        zip(pc.struct_field(whole, "bytes").to_pylist(), pc.struct_field(whole, "path").to_pylist(), strict=True)
+        zip(
+            pc.struct_field(whole, "bytes").to_pylist(),
+            pc.struct_field(whole, "path").to_pylist(),
+            strict=True,
+        )
     )
 
 

@@ -1,11 +1,13 @@
 """Read a parquet file whose writer was killed before it wrote the footer.
 
-    kept = salvage(Path("data/chunk-000/file-000.parquet"), schema, Path("mended.parquet"))   # row groups
+    kept = salvage(Path("data/chunk-000/file-000.parquet"), schema, Path("mended.parquet"))   # row
+    groups
 
-The row groups of such a file are whole: pyarrow writes each as it is closed, and only the table of where they lie
-is missing. That table is rebuilt by walking the pages' own headers, with the schema as the guide to how many values
-each column has, and written behind the row groups. A last row group that is not whole is left out. What comes back
-is not trusted: the caller reads and verifies every row of it.
+The row groups of such a file are whole: pyarrow writes each as it is closed, and only the table of
+where they lie is missing. That table is rebuilt by walking the pages' own headers, with the schema
+as the guide to how many values each column has, and written behind the row groups. A last row group
+that is not whole is left out. What comes back is not trusted: the caller reads and verifies every
+row of it.
 """
 
 import io
@@ -32,12 +34,16 @@ COLUMNS, GROUP_BYTES, GROUP_ROWS, GROUP_OFFSET, GROUP_COMPRESSED, ORDINAL = 1, 2
 CHUNK_OFFSET, CHUNK_META = 2, 3
 VALUES, UNCOMPRESSED, COMPRESSED, DATA_OFFSET, DICTIONARY_OFFSET = 5, 6, 7, 9, 11
 OPTIONAL_META = (8, 10, 12, 13, 14, 15, 16, 17)
-"""Field numbers of FileMetaData, RowGroup, ColumnChunk and ColumnMetaData; the last are hints nobody needs."""
+"""Field numbers of FileMetaData, RowGroup, ColumnChunk and ColumnMetaData; the last are hints
+nobody needs.
+"""
 
 
 @dataclass(frozen=True)
 class Writing:
-    """How a file was written: codec by column (or of all) and whether values were put into dictionaries."""
+    """How a file was written: codec by column (or of all) and whether values were put into
+    dictionaries.
+    """
 
     compression: str | Mapping[str, str]
     dictionary: bool
@@ -48,7 +54,9 @@ LEROBOT = Writing("snappy", True)
 
 
 class _Page(NamedTuple):
-    """A page: where it begins and ends, its kind, its number of values, its bytes when decompressed."""
+    """A page: where it begins and ends, its kind, its number of values, its bytes when
+    decompressed.
+    """
 
     start: int
     end: int
@@ -68,7 +76,8 @@ class _Chunk(NamedTuple):
 
 
 def salvage(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) -> int:
-    """Write the whole row groups of the footerless file `path` as the parquet file `to`; return their number.
+    """Write the whole row groups of the footerless file `path` as the parquet file `to`; return
+    their number.
 
     Args:
         path: the broken file.
@@ -96,7 +105,8 @@ def salvage(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) 
         return 0
     rows = [chunks[0].values // leaves[0][VALUES][1] for chunks in groups]
     tables = [
-        _group(model, chunks, count, number) for number, (chunks, count) in enumerate(zip(groups, rows, strict=True))
+        _group(model, chunks, count, number)
+        for number, (chunks, count) in enumerate(zip(groups, rows, strict=True))
     ]
     footer[ROWS] = (thrift.I64, sum(rows))
     footer[GROUPS] = (thrift.LIST, (thrift.STRUCT, tables))
@@ -129,8 +139,8 @@ def _groups(content: Any, leaves: list[Fields]) -> Iterator[list[_Chunk]]:
 def _next_group(content: Any, position: int, leaves: list[Fields]) -> list[_Chunk] | None:
     """Return the row group at `position`, or None where there is no whole one.
 
-    Nothing says how many rows it has or where its first column ends; so the first column is taken with one page,
-    with two, …, until every other column comes to the same number of rows.
+    Nothing says how many rows it has or where its first column ends; so the first column is taken
+    with one page, with two, …, until every other column comes to the same number of rows.
     """
     first: list[_Page] = []
     for page in _pages(content, position):
@@ -148,7 +158,9 @@ def _next_group(content: Any, position: int, leaves: list[Fields]) -> list[_Chun
 
 
 def _others(content: Any, position: int, leaves: list[Fields], rows: int) -> list[_Chunk] | None:
-    """Return the columns behind the first one of a row group of `rows` rows, or None where they do not fit."""
+    """Return the columns behind the first one of a row group of `rows` rows, or None where they do
+    not fit.
+    """
     chunks = []
     for leaf in leaves:
         chunk = _chunk(content, position, leaf, rows * leaf[VALUES][1])
@@ -193,7 +205,9 @@ def _group(model: Fields, chunks: list[_Chunk], rows: int, number: int) -> Field
     """Return the RowGroup of the footer for `chunks`, made like that of the sample."""
     tables = []
     for example, chunk in zip(model[COLUMNS][1][1], chunks, strict=True):
-        meta = {key: value for key, value in example[CHUNK_META][1].items() if key not in OPTIONAL_META}
+        meta = {
+            key: value for key, value in example[CHUNK_META][1].items() if key not in OPTIONAL_META
+        }
         pages = chunk.pages
         data = next(page for page in pages if page.kind != DICTIONARY_PAGE)
         meta[VALUES] = (thrift.I64, chunk.values)
@@ -203,7 +217,9 @@ def _group(model: Fields, chunks: list[_Chunk], rows: int, number: int) -> Field
         meta.pop(DICTIONARY_OFFSET, None)
         if pages[0].kind == DICTIONARY_PAGE:
             meta[DICTIONARY_OFFSET] = (thrift.I64, pages[0].start)
-        tables.append({CHUNK_OFFSET: (thrift.I64, pages[0].start), CHUNK_META: (thrift.STRUCT, meta)})
+        tables.append(
+            {CHUNK_OFFSET: (thrift.I64, pages[0].start), CHUNK_META: (thrift.STRUCT, meta)}
+        )
     return {
         COLUMNS: (thrift.LIST, (thrift.STRUCT, tables)),
         GROUP_BYTES: (thrift.I64, sum(page.size for chunk in chunks for page in chunk.pages)),

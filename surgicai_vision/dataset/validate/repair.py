@@ -1,11 +1,13 @@
 """Repair a broken LeRobot dataset, anyone's or ours: keep its longest verified prefix.
 
-    repair = repair_dataset(Path("dataset"))                       # the original stays beside it as dataset.broken
-    repair = repair_dataset(Path("dataset"), Path("mended"))       # the original stays as it is
+    repair = repair_dataset(Path("dataset"))                       # the original stays beside it as
+    dataset.broken repair = repair_dataset(Path("dataset"), Path("mended"))       # the original
+    stays as it is
 
-LeRobot's writer leaves data files without footers, no `meta/episodes` and an `info.json` that counts what is not
-there when it is killed. The episodes that can be verified from the first on (`verifying`) are written into a new
-folder with fresh metadata and statistics, which appears whole and is checked before it takes the old one's place.
+LeRobot's writer leaves data files without footers, no `meta/episodes` and an `info.json` that
+counts what is not there when it is killed. The episodes that can be verified from the first on
+(`verifying`) are written into a new folder with fresh metadata and statistics, which appears whole
+and is checked before it takes the old one's place.
 """
 
 import ctypes
@@ -56,7 +58,8 @@ class Repair:
 
 
 def repair_dataset(path: Path, out: Path | None = None, progress: Progress | None = None) -> Repair:
-    """Write the longest verified prefix of the dataset `path` to `out`, or put it in the place of `path`.
+    """Write the longest verified prefix of the dataset `path` to `out`, or put it in the place of
+    `path`.
 
     A dataset with nothing wrong is left alone, and `out` is not made.
 
@@ -86,7 +89,9 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress | Non
             rows = _write(files, made, work, claimed, progress or (lambda done, total, unit: None))
             after = check_dataset(made)
             if not after.ok:
-                raise SurgicaiError(f"The repair of {path} does not pass its own check: {after.problems[0]}")
+                raise SurgicaiError(
+                    f"The repair of {path} does not pass its own check: {after.problems[0]}"
+                )
             problems = tuple(files.problems) or (before.problems if before else ())
             original = _commit(made, path, out)
     finally:
@@ -102,7 +107,9 @@ def _checked(path: Path) -> CheckReport | None:
         return None
 
 
-def _write(files: LeRobotFiles, made: Path, scratch: Path, claimed: int, progress: Progress) -> list[EpisodeRow]:
+def _write(
+    files: LeRobotFiles, made: Path, scratch: Path, claimed: int, progress: Progress
+) -> list[EpisodeRow]:
     """Write the verified prefix as the folder `made`; return its episodes' rows."""
     verifier = Verifier(files)
     features = {key: row for key, row in files.features.items() if key not in INDEX_FEATURES}
@@ -116,7 +123,9 @@ def _write(files: LeRobotFiles, made: Path, scratch: Path, claimed: int, progres
             progress(len(rows), max(claimed, len(rows)), "episodes")
         data.close()
         if not rows:
-            raise BadFile(f"{files.path} cannot be repaired: not one episode is whole ({_why(files.problems)})")
+            raise BadFile(
+                f"{files.path} cannot be repaired: not one episode is whole ({_why(files.problems)})"
+            )
         for key, videos in verifier.video_files.items():
             for number in sorted({row.videos[key][0] for row in rows}):
                 target = folder / video_path(key, number)
@@ -143,7 +152,9 @@ def _texts(tasks: Mapping[int, str], rows: Sequence[EpisodeRow]) -> list[str]:
     return [f"task {index}" for index in range(len(named))]
 
 
-def _meta(ours: Mapping[str, Any], rows: Sequence[EpisodeRow], digests: Sequence[str], claimed: int) -> dict[str, Any]:
+def _meta(
+    ours: Mapping[str, Any], rows: Sequence[EpisodeRow], digests: Sequence[str], claimed: int
+) -> dict[str, Any]:
     """Return `meta/surgicai.json` of the prefix; it is the result of no request any more."""
     return {
         **ours,
@@ -177,7 +188,8 @@ def _commit(made: Path, path: Path, out: Path | None) -> Path:
     assert original is not None
     os.rename(made, original)
     if not _exchange(original, path):
-        # Not on this file system: the two steps leave, between them, both folders whole under other names.
+        # Not on this file system: the two steps leave, between them, both folders whole under other
+        # names.
         aside = _free(path, "repaired")
         assert aside is not None
         os.rename(original, aside)

@@ -1,4 +1,6 @@
-"""What a good episode of ours is: one rule for the check of a whole dataset and for the repair of a broken one."""
+"""What a good episode of ours is: one rule for the check of a whole dataset and for the repair of a
+broken one.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -8,7 +10,9 @@ from surgicai_vision.core import names
 from surgicai_vision.dataset import schema
 
 MOVED = 0.001
-"""An arm or a needle that went further than this between two frames [m] must be seen to have moved."""
+"""An arm or a needle that went further than this between two frames [m] must be seen to have
+moved.
+"""
 
 
 def episode_problems(number: int, columns: Mapping[str, np.ndarray], fps: float) -> Iterator[str]:
@@ -34,49 +38,58 @@ def episode_problems(number: int, columns: Mapping[str, np.ndarray], fps: float)
 def number_problems(columns: Mapping[str, np.ndarray]) -> Iterator[str]:
     """Yield which columns hold numbers that are not finite, or actions outside [-1, 1]."""
     for key in schema.COLUMNS:
-        wrong = ~np.isfinite(columns[key].astype(np.float64)).reshape(len(columns[key]), -1).all(axis=1)
+        wrong = ~np.isfinite(columns[key].astype(np.float64)).reshape(len(columns[key]), -1).all(
+            axis=1
+        )
         if wrong.any():
             yield f"{key}: {wrong.sum()} frames with numbers that are not finite, first {wrong.argmax()}."
     if len(columns[names.ACTION]) and np.nanmax(np.abs(columns[names.ACTION])) > 1.0:
         yield f"{names.ACTION}: values outside [-1, 1]."
 
 
-class PictureWatch:
-    """Looks at one episode's pictures of one column, in order.
+class ImageWatch:
+    """Looks at one episode's images of one column, in order.
 
     Args:
         key: the column.
-        size: side of its pictures [px].
+        size: side of its images [px].
         views: the dataset's cameras.
         rows: the episode's columns.
-        lossless: not from a video, whose encoder may leave a picture as it was.
+        lossless: not from a video, whose encoder may leave an image as it was.
     """
 
     def __init__(
-        self, key: str, size: int, views: Sequence[str], rows: Mapping[str, np.ndarray], lossless: bool = True
+        self,
+        key: str,
+        size: int,
+        views: Sequence[str],
+        rows: Mapping[str, np.ndarray],
+        lossless: bool = True,
     ):
         # A camera that moves along need not see what moved, and a part's outline can stay the same.
         still = [view for view in views if view in names.FIXED_CAMERAS]
         self._watched = lossless and key in {
             name(view) for view in still for name in (names.image_key, names.depth_key)
         }
-        self._shown = np.concatenate([rows[names.STATE][:, :3], rows[names.NEEDLE_POSE][:, :3]], axis=1)
+        self._shown = np.concatenate(
+            [rows[names.STATE][:, :3], rows[names.NEEDLE_POSE][:, :3]], axis=1
+        )
         self._size, self._last = size, self._shown[0]
         self._before: np.ndarray | None = None
 
     def problem(self, index: int, frame: np.ndarray) -> str:
         """Return what is wrong with the episode's frame `index`, or nothing."""
-        problem = picture_problem(frame, self._size)
+        problem = image_problem(frame, self._size)
         if self._before is not None and np.array_equal(frame, self._before):
             if self._watched and np.abs(self._shown[index] - self._last).max() > MOVED:
-                problem = problem or "the picture before it again, although something moved"
+                problem = problem or "the image before it again, although something moved"
         else:
             self._before, self._last = frame, self._shown[index]
         return problem
 
 
-def picture_problem(frame: np.ndarray, size: int) -> str:
-    """Return what is wrong with a picture by itself, or nothing."""
+def image_problem(frame: np.ndarray, size: int) -> str:
+    """Return what is wrong with an image by itself, or nothing."""
     if frame.shape[:2] != (size, size):
         return f"it is {frame.shape[0]} × {frame.shape[1]}, not {size} × {size}"
     if frame.dtype == np.float32 and not (np.isfinite(frame).all() and frame.min() > 0.0):

@@ -3,8 +3,9 @@
     fields, end = read_struct(content, start)        # {field id: (type, value)}
     content = write_struct(fields)
 
-A struct is a table of field id → (type, value); a list is (element type, [values]). Reading checks every length
-against the content, so foreign bytes end in a `ValueError` and never in a hang or an overrun.
+A struct is a table of field id → (type, value); a list is (element type, [values]). Reading checks
+every length against the content, so foreign bytes end in a `ValueError` and never in a hang or an
+overrun.
 """
 
 import struct
@@ -109,7 +110,9 @@ def write_struct(fields: Fields) -> bytes:
     for number in sorted(fields):
         kind, value = fields[number]
         step = number - last
-        parts.append(bytes([step << 4 | kind]) if step < 16 else bytes([kind]) + _write_signed(number))
+        parts.append(
+            bytes([step << 4 | kind]) if step < 16 else bytes([kind]) + _write_signed(number)
+        )
         if kind not in (TRUE, FALSE):
             parts.append(_write(kind, value))
         last = number

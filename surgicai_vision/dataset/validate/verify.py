@@ -1,11 +1,12 @@
-"""Verify a LeRobot dataset episode by episode, anyone's or ours, and say where it stops being whole.
+"""Verify a LeRobot dataset episode by episode, anyone's or ours, and say where it stops being
+whole.
 
     verifier = Verifier(LeRobotFiles(path))
-    for episode in verifier.episodes(scratch): …        # verified ones; ends at the first that is not
-    verifier.files.problems                             # why
+    for episode in verifier.episodes(scratch): …        # verified ones; ends at the first that is
+    not verifier.files.problems                             # why
 
-An episode is whole when its rows are in order and finite, every picture decodes to the size its feature says, and
-every video has its frames; an episode of ours also when it passes `judging`.
+An episode is whole when its rows are in order and finite, every image decodes to the size its
+feature says, and every video has its frames; an episode of ours also when it passes `judging`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,15 +23,17 @@ from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import read_json
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.metadata import row_statistics
-from surgicai_vision.dataset.stats import PictureStatistics, Statistics, column_statistics
+from surgicai_vision.dataset.stats import ImageStatistics, Statistics, column_statistics
 from surgicai_vision.dataset.validate.lerobot_files import LeRobotFiles, contents
-from surgicai_vision.dataset.validate.rules import PictureWatch, episode_problems, number_problems
+from surgicai_vision.dataset.validate.rules import ImageWatch, episode_problems, number_problems
 from surgicai_vision.dataset.video import count_frames, read_frames
 
 
 @dataclass(frozen=True)
 class Verified:
-    """A verified episode: its rows with every picture's bytes, statistics, tasks, place in the videos, digest."""
+    """A verified episode: its rows with every image's bytes, statistics, tasks, place in the
+    videos, digest.
+    """
 
     table: pa.Table
     statistics: Mapping[str, Statistics]
@@ -44,19 +47,24 @@ class _Unfit(Exception):
 
 
 class Verifier:
-    """Verifies the episodes of `files` in order; `ours` is the content of `meta/surgicai.json`, if it has one."""
+    """Verifies the episodes of `files` in order; `ours` is the content of `meta/surgicai.json`, if
+    it has one.
+    """
 
     def __init__(self, files: LeRobotFiles):
         self.files = files
         self.ours = _ours(files.path)
         self.video_files = {
-            key: sorted(files.path.glob(f"videos/{key}/chunk-*/file-*.mp4")) for key in files.video_keys
+            key: sorted(files.path.glob(f"videos/{key}/chunk-*/file-*.mp4"))
+            for key in files.video_keys
         }
         self._lengths: dict[Path, int] = {}
         self._ends = dict.fromkeys(files.video_keys, (0, 0))
 
     def episodes(self, scratch: Path) -> Iterator[Verified]:
-        """Yield the verified episodes from the first on; what ends them is added to `files.problems`."""
+        """Yield the verified episodes from the first on; what ends them is added to
+        `files.problems`.
+        """
         start = 0
         for number, table in enumerate(self.files.episodes(scratch)):
             try:
@@ -68,27 +76,39 @@ class Verifier:
             start += len(table)
 
     def _verify(self, number: int, start: int, table: pa.Table) -> Verified:
-        columns = {key: _array(table.column(key), self.files.features, key) for key in self._plain(table)}
+        columns = {
+            key: _array(table.column(key), self.files.features, key) for key in self._plain(table)
+        }
         self._check_indices(number, start, columns)
         if self.ours:
-            for problem in (*episode_problems(number, columns, self.files.fps), *number_problems(columns)):
+            for problem in (
+                *episode_problems(number, columns, self.files.fps),
+                *number_problems(columns),
+            ):
                 raise _Unfit(problem)
         known = row_statistics(self.files.rows[number]) if number < len(self.files.rows) else {}
         statistics = {
-            key: _statistics(values, self._shape(key)) for key, values in columns.items() if values.dtype != "O"
+            key: _statistics(values, self._shape(key))
+            for key, values in columns.items()
+            if values.dtype != "O"
         }
         digest = schema.EpisodeDigest(self._digested())
         for key in self.files.image_keys:
-            table, statistics[key] = self._pictures(key, table, columns, digest)
+            table, statistics[key] = self._images(key, table, columns, digest)
         videos = {}
         for key in self.files.video_keys:
             videos[key], seen = self._video(key, number, columns, digest)
             statistics[key] = seen or known.get(key) or self.files.statistics.get(key) or {}
             if not statistics[key]:
                 del statistics[key]
-        texts = {index: self.files.tasks.get(index, f"task {index}") for index in columns["task_index"].tolist()}
+        texts = {
+            index: self.files.tasks.get(index, f"task {index}")
+            for index in columns["task_index"].tolist()
+        }
         content = digest.hexdigest(columns) if self.ours else ""
-        return Verified(table, statistics, tuple(texts[index] for index in sorted(texts)), videos, content)
+        return Verified(
+            table, statistics, tuple(texts[index] for index in sorted(texts)), videos, content
+        )
 
     def _plain(self, table: pa.Table) -> list[str]:
         return [name for name in table.column_names if name not in self.files.image_keys]
@@ -97,11 +117,11 @@ class Verifier:
         return self.files.features.get(key, {"shape": (1,)})["shape"]
 
     def _digested(self) -> list[str]:
-        """Return the picture columns of a dataset of ours, in the order of its digest."""
+        """Return the image columns of a dataset of ours, in the order of its digest."""
         if not self.ours:
             return []
         options = (self.ours["views"], self.ours["depth"], self.ours["segmentation"])
-        return [key for key, _, _ in schema.picture_keys(*options)]
+        return [key for key, _, _ in schema.image_keys(*options)]
 
     def _check_indices(self, number: int, start: int, columns: Mapping[str, np.ndarray]) -> None:
         count = len(columns["index"])
@@ -112,7 +132,9 @@ class Verifier:
         }
         for key, values in expected.items():
             if not np.array_equal(columns[key], values):
-                raise _Unfit(f"its {key} is {columns[key][0]} … {columns[key][-1]}, not {values[0]} … {values[-1]}.")
+                raise _Unfit(
+                    f"its {key} is {columns[key][0]} … {columns[key][-1]}, not {values[0]} … {values[-1]}."
+                )
         if not np.allclose(columns["timestamp"], np.arange(count) / self.files.fps, atol=1e-3):
             raise _Unfit(f"its timestamp is not frame_index / {self.files.fps:g}.")
         for key, values in columns.items():
@@ -120,13 +142,19 @@ class Verifier:
                 raise _Unfit(f"{key} holds numbers that are not finite.")
         rows = self.files.rows
         if number < len(rows) and rows[number].get("length") != count:
-            raise _Unfit(f"it has {count} frames, and {rows[number].get('length')} in meta/episodes.")
+            raise _Unfit(
+                f"it has {count} frames, and {rows[number].get('length')} in meta/episodes."
+            )
 
-    def _pictures(
-        self, key: str, table: pa.Table, columns: Mapping[str, np.ndarray], digest: schema.EpisodeDigest
+    def _images(
+        self,
+        key: str,
+        table: pa.Table,
+        columns: Mapping[str, np.ndarray],
+        digest: schema.EpisodeDigest,
     ) -> tuple[pa.Table, Statistics]:
-        """Verify one picture column; return the table with the bytes of pictures that lay beside it."""
-        watch, statistics, found = self._watch(key, columns, True), PictureStatistics(), []
+        """Verify one image column; return the table with the bytes of images that lay beside it."""
+        watch, statistics, found = self._watch(key, columns, True), ImageStatistics(), []
         for index, (content, name) in enumerate(contents(table.column(key))):
             content = self._beside(name) if content is None else content
             frame = codecs.decode(content, f"frame {index} of {key}")
@@ -139,13 +167,15 @@ class Verifier:
         column = pa.array(found, table.schema.field(key).type)
         return table.set_column(table.schema.get_field_index(key), key, column), statistics.result()
 
-    def _watch(self, key: str, columns: Mapping[str, np.ndarray], lossless: bool) -> PictureWatch | None:
+    def _watch(
+        self, key: str, columns: Mapping[str, np.ndarray], lossless: bool
+    ) -> ImageWatch | None:
         if not self.ours:
             return None
-        return PictureWatch(key, self.ours["image_size"], self.ours["views"], columns, lossless)
+        return ImageWatch(key, self.ours["image_size"], self.ours["views"], columns, lossless)
 
-    def _look(self, watch: PictureWatch | None, key: str, index: int, frame: np.ndarray) -> None:
-        """Refuse a picture that a dataset of ours cannot hold."""
+    def _look(self, watch: ImageWatch | None, key: str, index: int, frame: np.ndarray) -> None:
+        """Refuse an image that a dataset of ours cannot hold."""
         problem = watch.problem(index, frame) if watch else ""
         if problem:
             raise _Unfit(f"frame {index} of {key}: {problem}.")
@@ -156,10 +186,10 @@ class Verifier:
             raise _Unfit(f"frame {index} of {key} is {frame.shape}, not {shape}.")
 
     def _beside(self, name: str | None) -> bytes:
-        """Read a picture that lies as a file in the dataset."""
+        """Read an image that lies as a file in the dataset."""
         path = (self.files.path / (name or "")).resolve()
         if not name or not path.is_relative_to(self.files.path.resolve()) or not path.is_file():
-            raise _Unfit(f"the picture {name or '(no name)'} is missing.")
+            raise _Unfit(f"the image {name or '(no name)'} is missing.")
         return path.read_bytes()
 
     def _video(
@@ -174,9 +204,11 @@ class Verifier:
         if (self.files.features[key].get("info") or {}).get("is_depth_map"):
             # Quantised depth is LeRobot's to decode; here its frames are counted.
             if self._length(path) < first + count:
-                raise _Unfit(f"{path.name} of {key} has {self._length(path)} frames; it needs {first + count}.")
+                raise _Unfit(
+                    f"{path.name} of {key} has {self._length(path)} frames; it needs {first + count}."
+                )
             return place, None
-        watch, statistics = self._watch(key, columns, False), PictureStatistics()
+        watch, statistics = self._watch(key, columns, False), ImageStatistics()
         for index, frame in enumerate(read_frames(path, first, count, fps)):
             self._check_shape(key, index, frame)
             self._look(watch, key, index, frame)
@@ -186,11 +218,15 @@ class Verifier:
         return place, statistics.result()
 
     def _place(self, key: str, number: int, count: int) -> tuple[int, int]:
-        """Return (file, first frame) of an episode in a feature's videos: as its row says, else as they follow."""
+        """Return (file, first frame) of an episode in a feature's videos: as its row says, else as
+        they follow.
+        """
         files = self.video_files[key]
         row = self.files.rows[number] if number < len(self.files.rows) else {}
         if row.get(f"videos/{key}/from_timestamp") is not None:
-            named = self.files.video_file(key, row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"])
+            named = self.files.video_file(
+                key, row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]
+            )
             if named not in files:
                 raise _Unfit(f"the video {named.relative_to(self.files.path)} is missing.")
             return files.index(named), round(row[f"videos/{key}/from_timestamp"] * self.files.fps)
@@ -232,6 +268,8 @@ def _array(column: pa.ChunkedArray, features: Mapping[str, Any], key: str) -> np
 
 
 def _statistics(values: np.ndarray, shape: tuple[int, ...]) -> Statistics:
-    """Return a column's statistics; of a feature of several axes over all but the last, as LeRobot's."""
+    """Return a column's statistics; of a feature of several axes over all but the last, as
+    LeRobot's.
+    """
     table = column_statistics(values.reshape(-1, shape[-1]))
     return {**table, "count": [len(values)]}

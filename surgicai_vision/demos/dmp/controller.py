@@ -5,14 +5,15 @@
     imitator.reset()
     env.step(imitator.action())
 
-A lesson's primitives (`lesson`) run from the needle's measured start to the goal. Each step the needle's next pose
-becomes the tool's through the rigid grasp, measured anew each time, and the tool's becomes an action like the
-expert's. The primitive's clock waits while the command is more than one action behind it (phase stopping of Ijspeert
-et al., all or nothing), so the path is kept whatever the step size. Demonstrations end as soon as they are within
-the tolerance; when the last primitive has run out, its goal moves on to the subtask's own.
+A lesson's primitives (`lesson`) run from the needle's measured start to the goal. Each step the
+needle's next pose becomes the tool's through the rigid grasp, measured anew each time, and the
+tool's becomes an action like the expert's. The primitive's clock waits while the command is more
+than one action behind it (phase stopping of Ijspeert et al., all or nothing), so the path is kept
+whatever the step size. Demonstrations end as soon as they are within the tolerance; when the last
+primitive has run out, its goal moves on to the subtask's own.
 
-Where the needle is taken the tool runs relative to the grasp goal on the needle where it lies, jaws as open as the
-demonstration's before it closed, and closes when it is there.
+Where the needle is taken the tool runs relative to the grasp goal on the needle where it lies, jaws
+as open as the demonstration's before it closed, and closes when it is there.
 """
 
 import functools
@@ -40,7 +41,8 @@ class Imitator:
 
     Args:
         env: the env.
-        demos: files of demonstrations of its subtask; they may come from another scene or step size.
+        demos: files of demonstrations of its subtask; they may come from another scene or step
+            size.
         scaled: see `movement`.
 
     Raises:
@@ -50,7 +52,9 @@ class Imitator:
 
     def __init__(self, env: SuturingEnv, demos: Sequence[str | Path], scaled: bool = False):
         if env.task == SUTURE:
-            raise InputError("Movement primitives are learned for a subtask; the whole procedure has none.")
+            raise InputError(
+                "Movement primitives are learned for a subtask; the whole procedure has none."
+            )
         self.env = env
         self.lesson = _lesson(env.task, tuple(map(str, demos)), scaled)
         self._course: Course | None = None
@@ -74,7 +78,7 @@ class Imitator:
         self._waits, self._told = bool(np.abs(moves(sight, wish.tip)).max() > 1.0), sight.command
         return toward(sight, wish)
 
-    # -- the course -----------------------------------------------------------------------------------------------
+    # -- the course --------------------------------------------------------------------------------
 
     def _begin(self, index: int, pose: Matrix) -> None:
         """Start a part of the lesson at a pose in its coordinates."""
@@ -83,7 +87,9 @@ class Imitator:
         self._course = part.primitive.start(*_split(pose), *_split(part.goal))
 
     def _next(self) -> Matrix:
-        """Move the course on by a control step, unless the tool is behind; return its pose in its coordinates."""
+        """Move the course on by a control step, unless the tool is behind; return its pose in its
+        coordinates.
+        """
         course = self._course
         assert course is not None
         if not self._waits:
@@ -93,7 +99,9 @@ class Imitator:
             before, after = self._pieces[self._piece], self._pieces[self._piece + 1]
             stitch = self.env.stitch
             needle_pose = before.goal(stitch) @ pose @ np.linalg.inv(before.frame())
-            self._begin(self._piece + 1, np.linalg.inv(after.goal(stitch)) @ needle_pose @ after.frame())
+            self._begin(
+                self._piece + 1, np.linalg.inv(after.goal(stitch)) @ needle_pose @ after.frame()
+            )
         elif course.done:
             course.aim(*_split(np.eye(4)))
         return pose
@@ -109,7 +117,7 @@ class Imitator:
         piece = self._pieces[0]
         return np.linalg.inv(piece.goal(sight.stitch)) @ sight.needle @ piece.frame()
 
-    # -- wishes ---------------------------------------------------------------------------------------------------
+    # -- wishes ------------------------------------------------------------------------------------
 
     def _carry(self, sight: Sight) -> Wish:
         piece = self._pieces[self._piece]
@@ -127,7 +135,9 @@ class Imitator:
         return Wish(wanted, self.lesson.opening)
 
     def _grasp(self, sight: Sight) -> Matrix:
-        """Return T_world_tip of the grasp: at the angle the episode drew, or else at the demonstrated one."""
+        """Return T_world_tip of the grasp: at the angle the episode drew, or else at the
+        demonstrated one.
+        """
         angle = sight.memory.grasp_angle or self.lesson.angle
         return sight.needle @ grasp_in_needle(sight.arm, angle)
 

@@ -2,16 +2,17 @@
 
     lesson = learn_lesson("insert", [read_demo(path)])
 
-Where the needle is carried (place, insert, pullout) the primitives move a frame on the needle; where it is taken
-(grasp, handoff) they move the tool relative to the frame in which it grasps the needle. Coordinates are those of the
-goal's frame, so a lesson holds wherever the holes are.
+Where the needle is carried (place, insert, pullout) the primitives move a frame on the needle;
+where it is taken (grasp, handoff) they move the tool relative to the frame in which it grasps the
+needle. Coordinates are those of the goal's frame, so a lesson holds wherever the holes are.
 
-An insertion and a pull-out have two pieces, because inside the tissue the way is the phantom's and not a matter of
-scaling: the start's error must be gone where the needle enters, so the first piece ends there and the second starts
-where the demonstration did; likewise the pull-out is cut where the needle's base leaves the exit. In the second and
-the first of them the needle is `bound`. A demonstration that there strays further from the path through the holes
-than the openings leave room (SurgicAI's own do, by up to 10 mm: its tissue offered no resistance) is put onto the
-path, turn by turn: it then teaches the timing, and `Lesson.bent` says so.
+An insertion and a pull-out have two pieces, because inside the tissue the way is the phantom's and
+not a matter of scaling: the start's error must be gone where the needle enters, so the first piece
+ends there and the second starts where the demonstration did; likewise the pull-out is cut where the
+needle's base leaves the exit. In the second and the first of them the needle is `bound`. A
+demonstration that there strays further from the path through the holes than the openings leave room
+(SurgicAI's own do, by up to 10 mm: its tissue offered no resistance) is put onto the path, turn by
+turn: it then teaches the timing, and `Lesson.bent` says so.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -78,7 +79,8 @@ class Piece:
     """A part of a subtask in which the needle is carried.
 
     Attributes:
-        point: the frame that moves is the needle's at this angle [rad]; None: at its origin, the arc's centre.
+        point: the frame that moves is the needle's at this angle [rad]; None: at its origin, the
+            arc's centre.
         goal: where that frame ends when the subtask is done perfectly, T_world_point (4, 4).
         end: index of the demonstration's last sample of the piece.
         bound: the needle is in the tissue.
@@ -108,20 +110,27 @@ def _entered(seen: Seen) -> int:
 
 def _left(seen: Seen) -> int:
     """Return the first sample with the whole needle beyond the exit."""
-    points = np.einsum("tij,pj->tpi", seen.needle[:, :3, :3], needle.polyline(13)) + seen.needle[:, None, :3, 3]
+    points = (
+        np.einsum("tij,pj->tpi", seen.needle[:, :3, :3], needle.polyline(13))
+        + seen.needle[:, None, :3, 3]
+    )
     leave = seen.stitch.pair.exit
     beyond = ((points - np.asarray(leave.centre)) @ leave.rotation[:, 2]).min(axis=1) > 0.0
     return int(np.argmax(beyond)) if beyond.any() else _last(seen)
 
 
-_ENTER = Piece(needle.TIP_ANGLE, lambda stitch: stitch.place() @ needle_frame(needle.TIP_ANGLE), _entered)
+_ENTER = Piece(
+    needle.TIP_ANGLE, lambda stitch: stitch.place() @ needle_frame(needle.TIP_ANGLE), _entered
+)
 CARRIED: Mapping[str, tuple[Piece, ...]] = MappingProxyType(
     {
         "place": (Piece(_ENTER.point, _ENTER.goal, _last),),
         "insert": (_ENTER, Piece(None, lambda stitch: stitch.inserted(), _last, bound=True)),
         "pullout": (
             Piece(None, lambda stitch: stitch.inserted(), _left, bound=True),
-            Piece(HANDOFF_ANGLE, lambda stitch: stitch.pulled() @ needle_frame(HANDOFF_ANGLE), _last),
+            Piece(
+                HANDOFF_ANGLE, lambda stitch: stitch.pulled() @ needle_frame(HANDOFF_ANGLE), _last
+            ),
         ),
     }
 )
@@ -177,7 +186,9 @@ def learn_lesson(task: str, demos: Sequence[Demo], scaled: bool = False) -> Less
         raise InputError("There is no demonstration to learn from; give at least one.")
     for demo in demos:
         if demo.config.task != task:
-            raise InputError(f"A demonstration of {demo.config.task} cannot teach {task}; give one of {task}.")
+            raise InputError(
+                f"A demonstration of {demo.config.task} cannot teach {task}; give one of {task}."
+            )
     seen = [watch(demo) for demo in demos]
     return _carried(task, seen, scaled) if task in CARRIED else _taken(task, seen, scaled)
 
@@ -200,13 +211,17 @@ def watch(demo: Demo) -> Seen:
         env.set_state_vector(state)
         simulation = env.simulation
         rows.append(
-            (poses.square(simulation.needle()), poses.square(simulation.tip(arm)), simulation.commands[arm].jaw)
+            (
+                poses.square(simulation.needle()),
+                poses.square(simulation.tip(arm)),
+                simulation.commands[arm].jaw,
+            )
         )
     needles, tips, jaws = (np.array(column) for column in zip(*rows, strict=True))
     return Seen(needles, tips, jaws, env.stitch, arm, env.dt)
 
 
-# -- the needle is carried --------------------------------------------------------------------------------------------
+# -- the needle is carried -------------------------------------------------------------------------
 
 
 def _carried(task: str, seen: list[Seen], scaled: bool) -> Lesson:
@@ -236,14 +251,18 @@ def _carried(task: str, seen: list[Seen], scaled: bool) -> Lesson:
 
 
 def _on_path(stitch: Stitch, path: Array) -> Array:
-    """Return needle poses (T, 4, 4) put onto the path through the holes, at the same turn about the wound."""
+    """Return needle poses (T, 4, 4) put onto the path through the holes, at the same turn about the
+    wound.
+    """
     turns = np.unwrap([turn_about_wound(stitch.place(), pose) for pose in path])
     turns += 2 * np.pi * (turns[-1] < 0.0)
     return np.array([on_path(stitch, max(float(turn), 0.0)) for turn in turns])
 
 
 def _stray(stitch: Stitch, path: Array) -> float:
-    """Return the furthest that a point of the needle gets from where it would be on the path [m]."""
+    """Return the furthest that a point of the needle gets from where it would be on the path
+    [m].
+    """
     line = np.column_stack([needle.polyline(5), np.ones(5)])
     apart = np.einsum("tij,pj->tpi", path - _on_path(stitch, path), line)
     return float(np.linalg.norm(apart[..., :3], axis=-1).max())
@@ -261,13 +280,16 @@ def _part(motions: list[Motion], goals: list[Array], scaled: bool) -> Part:
 def _mean(some: list[Array]) -> Array:
     """Return the mean of poses (4, 4) that lie near each other."""
     first = matrix_to_quaternion(some[0][:3, :3])
-    turns = [turn_of(multiply(matrix_to_quaternion(pose[:3, :3]), conjugate(first))) for pose in some]
+    turns = [
+        turn_of(multiply(matrix_to_quaternion(pose[:3, :3]), conjugate(first))) for pose in some
+    ]
     return as_pose(
-        np.mean([pose[:3, 3] for pose in some], axis=0), multiply(quaternion_of(np.mean(turns, axis=0)), first)
+        np.mean([pose[:3, 3] for pose in some], axis=0),
+        multiply(quaternion_of(np.mean(turns, axis=0)), first),
     )
 
 
-# -- the needle is taken ----------------------------------------------------------------------------------------------
+# -- the needle is taken ---------------------------------------------------------------------------
 
 
 def _taken(task: str, seen: list[Seen], scaled: bool) -> Lesson:
@@ -290,12 +312,14 @@ def closing(jaw: Array) -> int:
     return int(opens[-1]) + 1 if len(opens) else 0
 
 
-# -- poses ------------------------------------------------------------------------------------------------------------
+# -- poses -----------------------------------------------------------------------------------------
 
 
 def as_motion(path: Array, dt: float) -> Motion:
     """Return poses (T, 4, 4) as a motion."""
-    return Motion(path[:, :3, 3].copy(), np.array([matrix_to_quaternion(pose[:3, :3]) for pose in path]), dt)
+    return Motion(
+        path[:, :3, 3].copy(), np.array([matrix_to_quaternion(pose[:3, :3]) for pose in path]), dt
+    )
 
 
 def as_pose(position: Array, rotation: Array) -> Array:

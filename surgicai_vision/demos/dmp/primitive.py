@@ -5,16 +5,21 @@
     while not course.done:
         course.advance(0.02)                              # course.position, course.rotation
 
-Position (Ijspeert et al., Neural Computation 25, 2013): a spring-damper pulled to the goal g and a learned force,
-    τ ż = α (β (g - y) - z) + f(x),   τ ẏ = z,   τ ẋ = -γ x,   f(x) = a x Σψᵢwᵢ / Σψᵢ,   ψᵢ = exp(-hᵢ (x - cᵢ)²).
-Orientation as unit quaternion (Ude et al., ICRA 2014): the error is the logarithm, the integral the exponential,
+Position (Ijspeert et al., Neural Computation 25, 2013): a spring-damper pulled to the goal g and a
+learned force,
+    τ ż = α (β (g - y) - z) + f(x),   τ ẏ = z,   τ ẋ = -γ x,   f(x) = a x Σψᵢwᵢ / Σψᵢ,   ψᵢ =
+    exp(-hᵢ (x - cᵢ)²).
+Orientation as unit quaternion (Ude et al., ICRA 2014): the error is the logarithm, the integral the
+exponential,
     τ η̇ = α (β 2 log(g ∗ q̄) - η) + f(x),   τ q̇ = ½ η ∗ q.
-Weights by locally weighted regression, jointly over the demonstrations. The papers leave the gains open; the usual
-ones are our choice: α = 25, β = α / 4 (critically damped), γ = α / 3, 80 kernels with centres at equal times.
+Weights by locally weighted regression, jointly over the demonstrations. The papers leave the gains
+open; the usual ones are our choice: α = 25, β = α / 4 (critically damped), γ = α / 3, 80 kernels
+with centres at equal times.
 
-The amplitude a is 1 by default (Hoffmann et al., ICRA 2009): what a new start or goal adds decays or grows like the
-bare spring, the demonstrated shape stays as it is. With `scaled` it is the standard g - y₀, axis by axis, which
-needs an amplitude in every axis: a needle that turns on the spot, or starts beside its goal, has none.
+The amplitude a is 1 by default (Hoffmann et al., ICRA 2009): what a new start or goal adds decays
+or grows like the bare spring, the demonstrated shape stays as it is. With `scaled` it is the
+standard g - y₀, axis by axis, which needs an amplitude in every axis: a needle that turns on the
+spot, or starts beside its goal, has none.
 
 Quaternions are (w, x, y, z). Lengths are in metres, angles in radians, times in seconds.
 """
@@ -65,7 +70,9 @@ def conjugate(q: Array) -> Array:
 
 
 def turn_of(q: Array) -> Array:
-    """Return the rotation vector 2 log q (..., 3) [rad] of unit quaternions, the short way: at most π long."""
+    """Return the rotation vector 2 log q (..., 3) [rad] of unit quaternions, the short way: at most
+    π long.
+    """
     q = np.where(q[..., :1] < 0.0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, q[..., :1])
@@ -88,7 +95,8 @@ class Motion:
         dt: time between samples [s].
 
     Raises:
-        InputError: shapes that do not fit each other, numbers that are not finite, quaternions that are no units.
+        InputError: shapes that do not fit each other, numbers that are not finite, quaternions that
+            are no units.
     """
 
     position: Array
@@ -103,7 +111,11 @@ class Motion:
                 "they must be (T, 3) and (T, 4), T at least 1."
             )
         norms = np.linalg.norm(self.rotation, axis=1)
-        if not (np.isfinite(self.position).all() and np.allclose(norms, 1.0, atol=1e-6) and self.dt > 0.0):
+        if not (
+            np.isfinite(self.position).all()
+            and np.allclose(norms, 1.0, atol=1e-6)
+            and self.dt > 0.0
+        ):
             raise InputError("A motion needs finite positions, unit quaternions and dt > 0.")
 
     def __len__(self) -> int:
@@ -119,7 +131,9 @@ class Motion:
 def filtered(motion: Motion, slow: float = SLOW, slow_turn: float = SLOW_TURN) -> Motion:
     """Return `motion` without its pauses: without samples slower than both limits [m/s, rad/s]."""
     steps = np.linalg.norm(np.diff(motion.position, axis=0), axis=1)
-    turns = np.linalg.norm(turn_of(multiply(motion.rotation[1:], conjugate(motion.rotation[:-1]))), axis=1)
+    turns = np.linalg.norm(
+        turn_of(multiply(motion.rotation[1:], conjugate(motion.rotation[:-1]))), axis=1
+    )
     moves = (steps >= slow * motion.dt) | (turns >= slow_turn * motion.dt)
     kept = np.concatenate([[True], moves])
     return Motion(motion.position[kept], motion.rotation[kept], motion.dt)
@@ -132,7 +146,8 @@ class Primitive:
     Attributes:
         duration: time it took in the demonstrations, τ [s].
         weights: of the force on position and on orientation, (kernels, 6).
-        drift: initial velocity times τ, (6,): what a demonstration has that was cut out of a longer one.
+        drift: initial velocity times τ, (6,): what a demonstration has that was cut out of a longer
+            one.
         scaled: the force grows with the amplitude of the new movement; see the module's docstring.
     """
 
@@ -182,7 +197,13 @@ class Course:
     """
 
     def __init__(
-        self, primitive: Primitive, position: Array, rotation: Array, goal: Array, goal_rotation: Array, tau: float
+        self,
+        primitive: Primitive,
+        position: Array,
+        rotation: Array,
+        goal: Array,
+        goal_rotation: Array,
+        tau: float,
     ):
         self.position, self.rotation = position.copy(), rotation / np.linalg.norm(rotation)
         self.elapsed = 0.0
@@ -232,7 +253,9 @@ def learn(motions: Sequence[Motion], kernels: int = KERNELS, scaled: bool = Fals
         InputError: no motion, or fewer than 2 kernels.
     """
     if not motions or kernels < 2:
-        raise InputError(f"Learning needs a motion and 2 kernels or more; got {len(motions)} and {kernels}.")
+        raise InputError(
+            f"Learning needs a motion and 2 kernels or more; got {len(motions)} and {kernels}."
+        )
     shaped = [motion for motion in motions if len(motion) >= FEWEST]
     duration = float(np.mean([motion.duration for motion in shaped or motions])) or motions[0].dt
     above, below = np.zeros((kernels, 6)), np.zeros((kernels, 6))
@@ -241,7 +264,9 @@ def learn(motions: Sequence[Motion], kernels: int = KERNELS, scaled: bool = Fals
         force, drift, amplitude = _forces(motion)
         drifts.append(drift)
         phase = np.exp(-GAMMA * np.linspace(0.0, 1.0, len(motion)))
-        base = phase[:, None] * (np.where(np.abs(amplitude) > FLAT, amplitude, 0.0) if scaled else np.ones(6))
+        base = phase[:, None] * (
+            np.where(np.abs(amplitude) > FLAT, amplitude, 0.0) if scaled else np.ones(6)
+        )
         psi = _kernels(phase, kernels)
         above += psi.T @ (base * force)
         below += psi.T @ base**2
@@ -250,7 +275,9 @@ def learn(motions: Sequence[Motion], kernels: int = KERNELS, scaled: bool = Fals
 
 
 def _dense(motion: Motion) -> Motion:
-    """Return `motion` with at least `DENSE` samples, by splines: a few samples make poor derivatives."""
+    """Return `motion` with at least `DENSE` samples, by splines: a few samples make poor
+    derivatives.
+    """
     if len(motion) >= DENSE:
         return motion
     from scipy.interpolate import CubicSpline
@@ -259,11 +286,14 @@ def _dense(motion: Motion) -> Motion:
     times, fine = np.linspace(0.0, 1.0, len(motion)), np.linspace(0.0, 1.0, DENSE)
     turning = RotationSpline(times, Rotation.from_quat(motion.rotation, scalar_first=True))
     rotation = turning(fine).as_quat(scalar_first=True)
-    return Motion(CubicSpline(times, motion.position)(fine), rotation, motion.duration / (DENSE - 1))
+    return Motion(
+        CubicSpline(times, motion.position)(fine), rotation, motion.duration / (DENSE - 1)
+    )
 
 
 def _forces(motion: Motion) -> tuple[Array, Array, Array]:
-    """Return the force (T, 6) that makes the spring follow `motion`, its initial speed (6,) and amplitude (6,).
+    """Return the force (T, 6) that makes the spring follow `motion`, its initial speed (6,) and
+    amplitude (6,).
 
     In units of its duration, so that demonstrations of different speed agree.
     """
@@ -291,7 +321,8 @@ def _kernels(phase: Array, count: int) -> Array:
 def _centres(count: int) -> tuple[Array, Array]:
     """Return centres c at equal times and widths h by the way to the next centre, (count,) each.
 
-    At the next centre a kernel has fallen to e⁻²: of the widths tried (e^-½ to e⁻⁴) the best at 60 samples and more.
+    At the next centre a kernel has fallen to e⁻²: of the widths tried (e^-½ to e⁻⁴) the best at 60
+    samples and more.
     """
     centres = np.exp(-GAMMA * np.linspace(0.0, 1.0, count))
     gaps = np.diff(centres)

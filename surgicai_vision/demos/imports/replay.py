@@ -2,22 +2,23 @@
 
     demo, clipped = Replay(config).demo(episode)
 
-A recording of SurgicAI holds the commanded tip pose of one arm and nothing of the needle. In every state the
-arm stands at the recorded pose, the other one at its start or, in handoff, holding the needle, and the needle
-lies where the task's definition puts it:
+A recording of SurgicAI holds the commanded tip pose of one arm and nothing of the needle. In every
+state the arm stands at the recorded pose, the other one at its start or, in handoff, holding the
+needle, and the needle lies where the task's definition puts it:
 
 * handoff: still; its 105° point is where the goal grasps it.
-* grasp: still; its 17.5° point is where the goal grasps it. (The angle was drawn from 5°–20° and not recorded;
-  the shipped set has the needle's tip on the entry, which gives 15°–20°.)
-* place, insert: rigid in the jaws as it is when they stand at the goal, that is with the tip on the entry and
-  perpendicular to it, or with the 100° point 2 mm beyond the exit.
+* grasp: still; its 17.5° point is where the goal grasps it. (The angle was drawn from 5°–20° and
+  not recorded; the shipped set has the needle's tip on the entry, which gives 15°–20°.)
+* place, insert: rigid in the jaws as it is when they stand at the goal, that is with the tip on the
+  entry and perpendicular to it, or with the 100° point 2 mm beyond the exit.
 * pullout: rigid in PSM1's jaws, grasped as the handoff's goal grasps it.
 
-Sources: needle points, insertion depth and lift from SurgicAI's released code (the project's facts); the
-relations between needle and goal were fitted to needle poses that were derived independently for handoff, place
-and insert, and the tests compare with those.
+Sources: needle points, insertion depth and lift from SurgicAI's released code (the project's
+facts); the relations between needle and goal were fitted to needle poses that were derived
+independently for handoff, place and insert, and the tests compare with those.
 
-The first transition of a pullout episode is dropped: a jump from the start pose, a fault of the recorder.
+The first transition of a pullout episode is dropped: a jump from the start pose, a fault of the
+recorder.
 """
 
 import itertools
@@ -38,17 +39,19 @@ from surgicai_vision.scene.rotations import matrix_to_rotvec, rpy_to_matrix
 
 LIFT = 0.005
 """Height of the tip frame over the needle's plane at the released code's grasp goals [m]."""
-GRASP_ANGLE, HANDOFF_ANGLE, INSERT_ANGLE = (float(angle) for angle in np.radians([17.5, 105.0, 100.0]))
+GRASP_ANGLE, HANDOFF_ANGLE, INSERT_ANGLE = (
+    float(angle) for angle in np.radians([17.5, 105.0, 100.0])
+)
 INSERT_DEPTH = 0.002
 """Distance of the needle's 100° point beyond the exit at the goal of insert [m]."""
 MOST_CLIPPED = 0.01
 """Largest share of a recording's steps that may exceed a step preset for it to serve."""
 HOLD_ANGLES = np.radians([15.0, 20.0, 25.0, 30.0, 10.0, 35.0, 40.0, 5.0])
-"""Points of the needle at which PSM2 may hold it during the handoff, tried in this order: SurgicAI draws its
-grasps from 10°–50° after the approach's 5°–20°."""
+"""Points of the needle at which PSM2 may hold it during the handoff, tried in this order: SurgicAI
+draws its grasps from 10°–50° after the approach's 5°–20°."""
 RADIAL_SLACK, DEPTHS = 0.004, (0.004, 0.014)
-"""A held needle's arc lies within this of the jaws' axis, and its plane within these distances of the tip frame
-[m]; place and insert recordings have 1.5 mm and 8–10 mm."""
+"""A held needle's arc lies within this of the jaws' axis, and its plane within these distances of
+the tip frame [m]; place and insert recordings have 1.5 mm and 8–10 mm."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,9 @@ def trimmed(episode: Episode, task: str) -> Episode:
     """Return the episode without the jump that opens every pullout recording."""
     if task != "pullout":
         return episode
-    return Episode(episode.pose[1:], episode.goal, episode.action[1:], episode.reward[1:], episode.success[1:])
+    return Episode(
+        episode.pose[1:], episode.goal, episode.action[1:], episode.reward[1:], episode.success[1:]
+    )
 
 
 def pose_matrix(seven: np.ndarray) -> np.ndarray:
@@ -86,7 +91,9 @@ def pose_matrix(seven: np.ndarray) -> np.ndarray:
 
 
 def needle_path(episode: Episode, task: str) -> np.ndarray:
-    """Return T_world_needle (T + 1, 4, 4) of a recorded episode; see the module's docstring for the rules."""
+    """Return T_world_needle (T + 1, 4, 4) of a recorded episode; see the module's docstring for the
+    rules.
+    """
     base = kinematics.base_in_world(names.ACTIVE_ARM[task])
     goal = base @ pose_matrix(episode.goal)
     tips = base @ np.stack([pose_matrix(row) for row in episode.pose])
@@ -100,7 +107,8 @@ def needle_path(episode: Episode, task: str) -> np.ndarray:
 def _grasp(task: str) -> np.ndarray:
     """Return T_needle_tip (4, 4) at the goal of grasp or handoff.
 
-    The jaws come down the normal of the needle's plane; PSM1 closes along -radial, PSM2 along +radial.
+    The jaws come down the normal of the needle's plane; PSM1 closes along -radial, PSM2 along
+    +radial.
     """
     angle, sign = (GRASP_ANGLE, 1.0) if task == "grasp" else (HANDOFF_ANGLE, -1.0)
     pose = np.eye(4)
@@ -111,7 +119,9 @@ def _grasp(task: str) -> np.ndarray:
 
 
 def _needle_at_goal(task: str) -> np.ndarray:
-    """Return T_world_needle (4, 4) when place or insert is done, at the first pair of holes of layout "simple"."""
+    """Return T_world_needle (4, 4) when place or insert is done, at the first pair of holes of
+    layout "simple".
+    """
     pair = PAIRS["simple"][0]
     # Columns: radial, tangent and normal of the needle's point, in the hole's frame.
     if task == "place":
@@ -121,22 +131,32 @@ def _needle_at_goal(task: str) -> np.ndarray:
         hole, angle = pair.exit.pose, INSERT_ANGLE
         target = np.array([[-1.0, 0, 0, INSERT_DEPTH], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     point = np.eye(4)
-    point[:3, 0], point[:3, 1], point[:3, 3] = -needle.radial(angle), needle.tangent(angle), needle.point(angle)
+    point[:3, 0], point[:3, 1], point[:3, 3] = (
+        -needle.radial(angle),
+        needle.tangent(angle),
+        needle.point(angle),
+    )
     return hole @ target @ np.linalg.inv(point)
 
 
 def grip_error(episode: Episode, task: str) -> float:
-    """Return how far the needle would lie outside the jaws that hold it [m]; 0 where it is inside or not held."""
+    """Return how far the needle would lie outside the jaws that hold it [m]; 0 where it is inside
+    or not held.
+    """
     if task not in ("place", "insert"):
         return 0.0
     base = kinematics.base_in_world(names.ACTIVE_ARM[task])
-    x, y, z = (np.linalg.inv(needle_path(episode, task)[0]) @ base @ pose_matrix(episode.pose[0]))[:3, 3]
+    x, y, z = (np.linalg.inv(needle_path(episode, task)[0]) @ base @ pose_matrix(episode.pose[0]))[
+        :3, 3
+    ]
     radial = abs(np.hypot(x, y) - needle.RADIUS) - RADIAL_SLACK
     return float(max(radial, DEPTHS[0] - z, z - DEPTHS[1], 0.0))
 
 
 def actions(episode: Episode, step: str) -> tuple[np.ndarray, int]:
-    """Return the motion as actions of our envs, (T, 7) float32, and how many had to be clipped to [-1, 1]."""
+    """Return the motion as actions of our envs, (T, 7) float32, and how many had to be clipped to
+    [-1, 1].
+    """
     return moves(np.stack([pose_matrix(row) for row in episode.pose]), episode.pose[:, 6], step)
 
 
@@ -149,9 +169,14 @@ def moves(tip: np.ndarray, jaw: np.ndarray, step: str) -> tuple[np.ndarray, int]
         step: a key of `STEPS`.
     """
     metres, degrees, opening = STEPS[step]
-    turns = [matrix_to_rotvec(after[:3, :3] @ before[:3, :3].T) for before, after in itertools.pairwise(tip)]
+    turns = [
+        matrix_to_rotvec(after[:3, :3] @ before[:3, :3].T)
+        for before, after in itertools.pairwise(tip)
+    ]
     shifts = np.diff(tip[:, :3, 3], axis=0)
-    values = np.column_stack([shifts / metres, np.stack(turns) / np.radians(degrees), np.diff(jaw) / opening])
+    values = np.column_stack(
+        [shifts / metres, np.stack(turns) / np.radians(degrees), np.diff(jaw) / opening]
+    )
     inside = np.clip(values, -1.0, 1.0)
     return inside.astype(np.float32), int((np.abs(values - inside) > 1e-4).any(axis=1).sum())
 
@@ -220,7 +245,10 @@ class Replay:
         arms = dict(track.arms)
         if self.config.task == "handoff" and names.PSM2 not in arms:
             tip, jaw = self._hold(track.needle[0])
-            arms[names.PSM2] = np.broadcast_to(tip, track.needle.shape), np.full(len(track.needle), jaw)
+            arms[names.PSM2] = (
+                np.broadcast_to(tip, track.needle.shape),
+                np.full(len(track.needle), jaw),
+            )
         states, infos = [], []
         for index, needle_pose in enumerate(track.needle):
             poses = {arm: (tip[index], float(jaw[index])) for arm, (tip, jaw) in arms.items()}
@@ -237,11 +265,15 @@ class Replay:
         """Return the env's reward of a state that is judged a success or none."""
         return self._env.reward({**info, "is_success": success})
 
-    def as_demo(self, source: str, states: np.ndarray, **columns: np.ndarray) -> Demo:
-        """Return states and the columns `action`, `reward`, `success`, `contact` as a demonstration."""
+    def as_demo(self, demonstrator: str, states: np.ndarray, **columns: np.ndarray) -> Demo:
+        """Return states and the columns `action`, `reward`, `success`, `contact` as a
+        demonstration.
+        """
         phase = np.full(len(states) - 1, names.SUBTASKS.index(self.config.task), np.int8)
         scene = self._env.scene.hash
-        return Demo(self.config, -1, source, scene, code_version(), states, phase=phase, **columns)
+        return Demo(
+            self.config, -1, demonstrator, scene, code_version(), states, phase=phase, **columns
+        )
 
     def _hold(self, needle_pose: np.ndarray) -> tuple[np.ndarray, float]:
         """Return PSM2's pose (T_base_tip, jaw) that holds the needle near its base."""

@@ -2,11 +2,12 @@
 
     tree = unpickle(content, "demos.pkl")     # dict, list, tuple, str, bytes, numbers, numpy arrays
 
-A pickle is a program. Here it is read twice: first its instructions are listed without running any, and a
-global outside `ADMITTED`, an instruction that could make other objects, or a memo made to eat memory is refused
-by name; then it is run by an unpickler whose globals are not numpy's functions but the small stand-ins below,
-which check every argument and build arrays from bytes themselves. Numpy's own state setters never see foreign
-data, and object arrays (arrays of further pickled objects) are refused.
+A pickle is a program. Here it is read twice: first its instructions are listed without running any,
+and a global outside `ADMITTED`, an instruction that could make other objects, or a memo made to eat
+memory is refused by name; then it is run by an unpickler whose globals are not numpy's functions
+but the small stand-ins below, which check every argument and build arrays from bytes themselves.
+Numpy's own state setters never see foreign data, and object arrays (arrays of further pickled
+objects) are refused.
 
 Every refusal is a `BadFile` of one line.
 """
@@ -31,25 +32,56 @@ MAX_DEPTH = 16
 
 _NUMPY = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248])")
 
-_STRINGS = ("STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8")
+_STRINGS = (
+    "STRING",
+    "BINSTRING",
+    "SHORT_BINSTRING",
+    "UNICODE",
+    "SHORT_BINUNICODE",
+    "BINUNICODE",
+    "BINUNICODE8",
+)
 _OPCODES = frozenset(
     (
         *_STRINGS,
         *("PROTO", "FRAME", "STOP", "MARK", "POP", "POP_MARK", "DUP"),
-        *("NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4"),
+        *(
+            "NONE",
+            "NEWTRUE",
+            "NEWFALSE",
+            "INT",
+            "BININT",
+            "BININT1",
+            "BININT2",
+            "LONG",
+            "LONG1",
+            "LONG4",
+        ),
         *("FLOAT", "BINFLOAT", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
-        *("EMPTY_LIST", "LIST", "APPEND", "APPENDS", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"),
+        *(
+            "EMPTY_LIST",
+            "LIST",
+            "APPEND",
+            "APPENDS",
+            "EMPTY_TUPLE",
+            "TUPLE",
+            "TUPLE1",
+            "TUPLE2",
+            "TUPLE3",
+        ),
         *("EMPTY_DICT", "DICT", "SETITEM", "SETITEMS"),
         *("GET", "BINGET", "LONG_BINGET", "PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"),
         *("GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD"),
     )
 )
-"""Instructions a pickle of arrays and containers needs; those that make instances, extensions or persistent
-objects are not among them."""
+"""Instructions a pickle of arrays and containers needs; those that make instances, extensions or
+persistent objects are not among them."""
 
 
 class _Ndarray:
-    """Stands for the class numpy.ndarray, which a pickle names only to hand it to `_reconstruct`."""
+    """Stands for the class numpy.ndarray, which a pickle names only to hand it to
+    `_reconstruct`.
+    """
 
     __slots__ = ()
 
@@ -88,7 +120,9 @@ class _Dtype:
         self.code, self.order = code, "="
 
     def __setstate__(self, state: Any) -> None:
-        plain = isinstance(state, tuple) and len(state) in (7, 8) and state[2:5] == (None, None, None)
+        plain = (
+            isinstance(state, tuple) and len(state) in (7, 8) and state[2:5] == (None, None, None)
+        )
         if not plain or state[1] not in ("<", ">", "=", "|"):
             _refuse("a dtype's state is not that of a plain number")
         self.order = state[1]
@@ -166,12 +200,15 @@ def unpickle(content: bytes, where: str) -> Any:
         where: the file's name, for messages.
 
     Raises:
-        BadFile: not a pickle, truncated, too large, or one that holds anything but arrays and containers.
+        BadFile: not a pickle, truncated, too large, or one that holds anything but arrays and
+            containers.
     """
     if not content:
         raise BadFile(f"{where} is empty.")
     if len(content) > MAX_BYTES:
-        raise BadFile(f"{where} has {len(content) / 2**20:.0f} MB; pickles above {MAX_BYTES >> 20} MB are not read.")
+        raise BadFile(
+            f"{where} has {len(content) / 2**20:.0f} MB; pickles above {MAX_BYTES >> 20} MB are not read."
+        )
     try:
         _inspect(content)
         return _plain(_Unpickler(io.BytesIO(content), encoding="latin1").load(), {}, 0)
@@ -181,7 +218,9 @@ def unpickle(content: bytes, where: str) -> Any:
         raise BadFile(f"{where} is refused: it asks for more memory than there is.") from None
     except Exception as error:  # a damaged pickle can fail in any way
         line = (str(error).splitlines() or [""])[0][:120]
-        raise BadFile(f"{where} is not a readable pickle ({type(error).__name__}: {line}).") from None
+        raise BadFile(
+            f"{where} is not a readable pickle ({type(error).__name__}: {line})."
+        ) from None
 
 
 def _inspect(content: bytes) -> None:
@@ -242,4 +281,6 @@ def _refuse(why: str) -> NoReturn:
 
 def _refuse_global(module: str, name: str) -> NoReturn:
     shown = "".join(c if c.isprintable() else "?" for c in f"{module}.{name}")[:80]
-    _refuse(f"it names '{shown}', and only numpy arrays and dtypes are admitted; nothing of it was run")
+    _refuse(
+        f"it names '{shown}', and only numpy arrays and dtypes are admitted; nothing of it was run"
+    )

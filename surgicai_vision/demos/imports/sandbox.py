@@ -3,11 +3,11 @@
     arrays = read_foreign(Path("regrasp_all_episodes_merged.pkl"))
     arrays = read_foreign(Path("trial.bag"), "bag", topics={"psm2_pose": "/PSM2/measured_cp"})
 
-The child sets its limits before it opens the file: memory, processor time, size of what it writes, and, where the
-kernel lets it, a network namespace of its own with nothing in it; an audit hook that cannot be removed then ends
-every attempt to start a process, to open a socket, to change or to write any file (its one result is open by then).
-It hands back plain arrays (npz without pickles). Whatever goes wrong in it is a `BadFile`, or the `InputError` of its
-reader.
+The child sets its limits before it opens the file: memory, processor time, size of what it writes,
+and, where the kernel lets it, a network namespace of its own with nothing in it; an audit hook that
+cannot be removed then ends every attempt to start a process, to open a socket, to change or to
+write any file (its one result is open by then). It hands back plain arrays (npz without pickles).
+Whatever goes wrong in it is a `BadFile`, or the `InputError` of its reader.
 """
 
 import contextlib
@@ -28,7 +28,10 @@ import numpy as np
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
 
 READERS: Mapping[str, str] = MappingProxyType(
-    {"surgicai": "surgicai_vision.demos.imports.surgicai_pickle", "bag": "surgicai_vision.demos.imports.rosbag.reader"}
+    {
+        "surgicai": "surgicai_vision.demos.imports.surgicai_pickle",
+        "bag": "surgicai_vision.demos.imports.rosbag.reader",
+    }
 )
 """Kind of file → the module whose `read(path, …)` returns its arrays."""
 
@@ -73,17 +76,31 @@ def read_foreign(path: Path, kind: str = "surgicai", **options: Any) -> dict[str
         InputError: what the reader says the caller asked wrongly for.
     """
     if not path.is_file() and not (path.is_dir() and kind == "bag"):
-        raise BadFile(f"Cannot read {path}: {'it is a folder' if path.is_dir() else 'no such file'}.")
+        raise BadFile(
+            f"Cannot read {path}: {'it is a folder' if path.is_dir() else 'no such file'}."
+        )
     with tempfile.TemporaryDirectory(prefix="surgicai-vision-") as folder:
         result = Path(folder) / "arrays.npz"
-        command = [sys.executable, "-m", "surgicai_vision.demos.imports.sandbox", str(path), str(result), kind]
+        command = [
+            sys.executable,
+            "-m",
+            "surgicai_vision.demos.imports.sandbox",
+            str(path),
+            str(result),
+            kind,
+        ]
         try:
             child = subprocess.run(
                 [*command, json.dumps(options)],
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 timeout=WALL_SECONDS,
-                env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": _search_path()},
+                env={
+                    **os.environ,
+                    "OPENBLAS_NUM_THREADS": "1",
+                    "OMP_NUM_THREADS": "1",
+                    "PYTHONPATH": _search_path(),
+                },
             )
         except subprocess.TimeoutExpired:
             raise BadFile(f"{path} was not read within {WALL_SECONDS} s.") from None
@@ -132,7 +149,9 @@ def main(path: str, result: str, kind: str, options: str) -> int:
         try:
             arrays = read(Path(path), **json.loads(options))
         except SurgicaiError as error:
-            print(json.dumps({"bad": isinstance(error, BadFile), "line": str(error)}), file=sys.stderr)
+            print(
+                json.dumps({"bad": isinstance(error, BadFile), "line": str(error)}), file=sys.stderr
+            )
             return InputError.exit_code
         np.savez(file, **arrays)
     return 0

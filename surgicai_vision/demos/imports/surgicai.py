@@ -1,13 +1,15 @@
 """Import SurgicAI's recordings: its arm motions, replayed state by state in our scene.
 
-    summary = import_demos(Path("regrasp_all_episodes_merged.pkl"), task="handoff", out=Path("demos"))
+    summary = import_demos(Path("regrasp_all_episodes_merged.pkl"), task="handoff",
+    out=Path("demos"))
 
-Read (`foreign`), cut into episodes, check that the motion can be the task's, infer the step preset, replay
-(`replay`), write. Half of the released insertions, and a few placements, turn the long way round, because the released
-code compares yaw angles without unwrapping them; our arm's roll joint cannot follow, so they are `unwound`: the same
-path, with the yaw going the short way at the same times. The recorded rotation increments are roll, pitch and yaw;
-ours are rotation vectors in the base's axes, so actions are recomputed from the poses and the recorded ones only tell
-the step size. Where more than one in a hundred would not fit into it, the next larger preset is taken.
+Read (`foreign`), cut into episodes, check that the motion can be the task's, infer the step preset,
+replay (`replay`), write. Half of the released insertions, and a few placements, turn the long way
+round, because the released code compares yaw angles without unwrapping them; our arm's roll joint
+cannot follow, so they are `unwound`: the same path, with the yaw going the short way at the same
+times. The recorded rotation increments are roll, pitch and yaw; ours are rotation vectors in the
+base's axes, so actions are recomputed from the poses and the recorded ones only tell the step size.
+Where more than one in a hundred would not fit into it, the next larger preset is taken.
 """
 
 import dataclasses
@@ -23,15 +25,26 @@ from surgicai_vision.core.config import STEPS, TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnreachablePose, check_name
 from surgicai_vision.core.executor import Progress, building
 from surgicai_vision.core.files import check_output, code_version, sha256_file, whole_folder
-from surgicai_vision.demos.imports.replay import MOST_CLIPPED, Episode, Replay, actions, grip_error, trimmed
+from surgicai_vision.demos.imports.replay import (
+    MOST_CLIPPED,
+    Episode,
+    Replay,
+    actions,
+    grip_error,
+    trimmed,
+)
 from surgicai_vision.demos.imports.sandbox import read_foreign
 from surgicai_vision.demos.record import finished
 from surgicai_vision.demos.store import MARKER, list_demos, read_marker, write_demo, write_marker
 
 OPEN_JAW = 0.4
-"""A jaw wider than this [rad] after the first step belongs to a grasp; the recordings have 0.8 or 0."""
+"""A jaw wider than this [rad] after the first step belongs to a grasp; the recordings have 0.8 or
+0.
+"""
 AGREEMENT = 0.02
-"""A step agrees with a preset when it is within this of action × step size, in units of the step size."""
+"""A step agrees with a preset when it is within this of action × step size, in units of the step
+size.
+"""
 STEP_LIMIT = 200
 """Episode limit of the image evaluation (facts of SurgicAI); longer recordings raise it."""
 
@@ -59,7 +72,9 @@ class ImportSummary:
     unwound: int = 0
 
 
-def import_demos(file: Path, *, task: str, out: Path, progress: Progress | None = None) -> ImportSummary:
+def import_demos(
+    file: Path, *, task: str, out: Path, progress: Progress | None = None
+) -> ImportSummary:
     """Import a recording of SurgicAI into the folder of demonstrations `out`.
 
     Args:
@@ -89,13 +104,22 @@ def import_demos(file: Path, *, task: str, out: Path, progress: Progress | None 
         limit = max(STEP_LIMIT, *(len(episode.action) for episode in episodes))
         config = TaskConfig(task, step=step, tolerance="released", reward="dense", max_steps=limit)
         with building(out) as (_, result), whole_folder(result) as folder:
-            notes, skipped = _write(folder, episodes, config, progress or (lambda done, total, unit: None))
-            notes.update(step=step, steps=sum(len(e.action) for e in episodes), disagreeing=disagreeing, unwound=wound)
+            notes, skipped = _write(
+                folder, episodes, config, progress or (lambda done, total, unit: None)
+            )
+            notes.update(
+                step=step,
+                steps=sum(len(e.action) for e in episodes),
+                disagreeing=disagreeing,
+                unwound=wound,
+            )
             kept = len(episodes) - len(skipped)
             details = {"request": request, "skipped": skipped, "episodes": kept, "notes": notes}
             write_marker(folder, task, "surgicai", code=code_version(), **details)
     marker = read_marker(out)
-    return ImportSummary(tuple(list_demos(out)), skipped=tuple(marker["skipped"]), **marker["notes"])
+    return ImportSummary(
+        tuple(list_demos(out)), skipped=tuple(marker["skipped"]), **marker["notes"]
+    )
 
 
 def _write(
@@ -127,18 +151,26 @@ def split(arrays: Mapping[str, np.ndarray]) -> list[Episode]:
     """
     ends = np.flatnonzero(arrays["done"] > 0.5)
     if not len(ends) or ends[-1] != len(arrays["done"]) - 1:
-        raise BadFile("The recording does not end with a transition that is done; it seems cut off.")
+        raise BadFile(
+            "The recording does not end with a transition that is done; it seems cut off."
+        )
     metres = np.array([0.01, 0.01, 0.01, 1.0, 1.0, 1.0, 1.0])
     episodes, start = [], 0
     for number, end in enumerate(ends):
         rows = slice(start, end + 1)
         before, after = arrays["observation"][rows], arrays["next_observation"][rows]
         if not np.allclose(after[:-1, :7], before[1:, :7], atol=1e-4):
-            raise BadFile(f"The recording jumps inside episode {number}: a next observation is not the next one.")
+            raise BadFile(
+                f"The recording jumps inside episode {number}: a next observation is not the next one."
+            )
         if not np.allclose(before[:, 7:14] - before[:, :7], before[:, 14:], atol=1e-3):
-            raise BadFile(f"Episode {number}: its observations are not (current, goal, goal - current).")
+            raise BadFile(
+                f"Episode {number}: its observations are not (current, goal, goal - current)."
+            )
         if len(before) < 2:
-            raise BadFile(f"Episode {number} has {len(before)} transition; an episode has at least 2.")
+            raise BadFile(
+                f"Episode {number} has {len(before)} transition; an episode has at least 2."
+            )
         poses = np.concatenate([before[:, :7], after[-1:, :7]]) * metres
         action, reward, success = (arrays[key][rows] for key in ("action", "reward", "success"))
         episodes.append(Episode(poses, before[0, 7:14] * metres, action, reward, success > 0.5))
@@ -147,13 +179,18 @@ def split(arrays: Mapping[str, np.ndarray]) -> list[Episode]:
 
 
 def check_task(episodes: list[Episode], task: str) -> None:
-    """Refuse a task that the motion contradicts: another arm, open jaws on a held needle, a needle beside them.
+    """Refuse a task that the motion contradicts: another arm, open jaws on a held needle, a needle
+    beside them.
 
     Raises:
         InputError: the contradiction, and the tasks that would fit.
     """
     # PSM1 works at positive x of its base and PSM2 at negative x, in every recording.
-    arm = names.PSM1 if np.median([episode.pose[:, 0].mean() for episode in episodes]) > 0 else names.PSM2
+    arm = (
+        names.PSM1
+        if np.median([episode.pose[:, 0].mean() for episode in episodes]) > 0
+        else names.PSM2
+    )
     # After the first step: the first one of a pullout recording starts from another pose.
     jaw = float(np.median([episode.pose[1, 6] for episode in episodes]))
     grasps = ("grasp", "handoff") if jaw > OPEN_JAW else ("place", "insert", "pullout")
@@ -172,12 +209,15 @@ def check_task(episodes: list[Episode], task: str) -> None:
 
 
 def roomy(episodes: list[Episode], step: str) -> str:
-    """Return the smallest preset from `step` on that nearly all actions fit into, or the one that most fit into."""
+    """Return the smallest preset from `step` on that nearly all actions fit into, or the one that
+    most fit into.
+    """
     total = sum(len(episode.action) for episode in episodes)
     sizes = list(STEPS)[list(STEPS).index(step) :]
     clipped = {size: sum(actions(episode, size)[1] for episode in episodes) for size in sizes}
     return next(
-        (size for size in sizes if clipped[size] <= MOST_CLIPPED * total), min(sizes, key=lambda s: clipped[s])
+        (size for size in sizes if clipped[size] <= MOST_CLIPPED * total),
+        min(sizes, key=lambda s: clipped[s]),
     )
 
 
@@ -200,8 +240,8 @@ def unwound(episode: Episode) -> Episode:
 def infer_step(episodes: list[Episode]) -> tuple[str, int]:
     """Return the step preset that explains the motion best, and the steps it does not explain.
 
-    The first release's insertions have a step of 0.25 mm, which is no preset of ours: a motion that any other constant
-    step explains gets the smallest preset that is as large.
+    The first release's insertions have a step of 0.25 mm, which is no preset of ours: a motion that
+    any other constant step explains gets the smallest preset that is as large.
 
     Raises:
         InputError: no constant step explains the motion.
@@ -218,7 +258,9 @@ def infer_step(episodes: list[Episode]) -> tuple[str, int]:
         return best, wrong[best]
     own = _fitted(moves, told)
     disagreeing = _unexplained(moves, told, own)
-    larger = [name for name, size in sizes.items() if (own[:6] <= size[:6] * (1.0 + AGREEMENT)).all()]
+    larger = [
+        name for name, size in sizes.items() if (own[:6] <= size[:6] * (1.0 + AGREEMENT)).all()
+    ]
     if disagreeing > len(told) // 2 or not larger:
         raise InputError(
             f"No step size explains the motion: {wrong[best]} of {len(told)} steps differ from action × step "
@@ -233,11 +275,15 @@ def _unexplained(moves: np.ndarray, actions: np.ndarray, size: np.ndarray) -> in
 
 
 def _fitted(moves: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Return the step size (7,) of a motion: the median of move over action, for translation and for rotation."""
+    """Return the step size (7,) of a motion: the median of move over action, for translation and
+    for rotation.
+    """
     size = np.full(7, STEPS["paper"][2])
     for part in (slice(0, 3), slice(3, 6)):
         told = np.abs(actions[:, part]) > AGREEMENT
         size[part] = (
-            np.median((moves[:, part] / np.where(told, actions[:, part], 1.0))[told]) if told.any() else np.inf
+            np.median((moves[:, part] / np.where(told, actions[:, part], 1.0))[told])
+            if told.any()
+            else np.inf
         )
     return np.maximum(size, 1e-9)

@@ -1,14 +1,15 @@
 """SurgicAI's recordings as arrays: what its pickles hold, before anything is believed about it.
 
-The layout (read from the released files; the observation's from the released code): a list of transitions,
-each {"obs": {"observation": (21,), …}, "next_obs": likewise, "action": (7,), "reward": (1,), "done": (1,),
-"info": {"is_success": …}}. The 21 values are the active arm's commanded pose, its goal and their difference,
-each x y z [cm] roll pitch yaw jaw [rad] in the arm's own base; fixed-axis angles, R = Rz(yaw) Ry(pitch) Rx(roll).
-The same transitions as plain arrays (.npz) are read too.
+The layout (read from the released files; the observation's from the released code): a list of
+transitions, each {"obs": {"observation": (21,), …}, "next_obs": likewise, "action": (7,), "reward":
+(1,), "done": (1,), "info": {"is_success": …}}. The 21 values are the active arm's commanded pose,
+its goal and their difference, each x y z [cm] roll pitch yaw jaw [rad] in the arm's own base;
+fixed-axis angles, R = Rz(yaw) Ry(pitch) Rx(roll). The same transitions as plain arrays (.npz) are
+read too.
 
-`read(path)` returns {"observation": (N, 21), "next_observation": (N, 21), "action": (N, 7), "reward": (N,),
-"done": (N,), "success": (N,)}, float64, or raises `BadFile`. It imports nothing but numpy and runs where
-`foreign` puts it.
+`read(path)` returns {"observation": (N, 21), "next_observation": (N, 21), "action": (N, 7),
+"reward": (N,), "done": (N,), "success": (N,)}, float64, or raises `BadFile`. It imports nothing but
+numpy and runs where `foreign` puts it.
 """
 
 import zipfile
@@ -21,7 +22,14 @@ import numpy as np
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.demos.imports.safe_pickle import MAX_BYTES, unpickle
 
-FIELDS = {"observation": 21, "next_observation": 21, "action": 7, "reward": 1, "done": 1, "success": 1}
+FIELDS = {
+    "observation": 21,
+    "next_observation": 21,
+    "action": 7,
+    "reward": 1,
+    "done": 1,
+    "success": 1,
+}
 """Array → numbers in a row."""
 
 MAX_TRANSITIONS = 1_000_000
@@ -36,17 +44,25 @@ def read(path: Path) -> dict[str, np.ndarray]:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            raise BadFile(f"{path} has {size / 2**20:.0f} MB; recordings above {MAX_BYTES >> 20} MB are not read.")
+            raise BadFile(
+                f"{path} has {size / 2**20:.0f} MB; recordings above {MAX_BYTES >> 20} MB are not read."
+            )
         content = path.read_bytes()
     except OSError as error:
         raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
-    rows = _npz(path) if content[:4] == b"PK\x03\x04" else _transitions(unpickle(content, str(path)), path)
+    rows = (
+        _npz(path)
+        if content[:4] == b"PK\x03\x04"
+        else _transitions(unpickle(content, str(path)), path)
+    )
     arrays = {}
     for name, width in FIELDS.items():
         array = np.asarray(rows[name], dtype=np.float64)
         arrays[name] = array.reshape(len(array), -1)
         if arrays[name].shape != (len(rows["action"]), width):
-            raise BadFile(f"{path}: {name} has shape {array.shape}; expected {len(rows['action'])} rows of {width}.")
+            raise BadFile(
+                f"{path}: {name} has shape {array.shape}; expected {len(rows['action'])} rows of {width}."
+            )
         if not np.isfinite(array).all():
             raise BadFile(f"{path}: {name} holds numbers that are not finite.")
     return {name: array[:, 0] if FIELDS[name] == 1 else array for name, array in arrays.items()}
@@ -57,7 +73,9 @@ def _transitions(tree: Any, path: Path) -> dict[str, list[np.ndarray]]:
     if not isinstance(tree, (list, tuple)) or not tree:
         raise BadFile(f"{path} holds {_kind(tree)}; expected a list of transitions.")
     if len(tree) > MAX_TRANSITIONS:
-        raise BadFile(f"{path} holds {len(tree)} transitions; above {MAX_TRANSITIONS} are not read.")
+        raise BadFile(
+            f"{path} holds {len(tree)} transitions; above {MAX_TRANSITIONS} are not read."
+        )
     rows: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
     for index, item in enumerate(tree):
         if not isinstance(item, Mapping):
@@ -74,9 +92,13 @@ def _transitions(tree: Any, path: Path) -> dict[str, list[np.ndarray]]:
             for name, value in values.items():
                 rows[name].append(np.asarray(value, dtype=np.float64).reshape(FIELDS[name]))
         except KeyError as error:
-            raise BadFile(f"{path}: transition {index} has no {error}; it has {sorted(item)[:8]}.") from None
+            raise BadFile(
+                f"{path}: transition {index} has no {error}; it has {sorted(item)[:8]}."
+            ) from None
         except (TypeError, ValueError, AttributeError) as error:
-            raise BadFile(f"{path}: transition {index} is not one of SurgicAI's ({error}).") from None
+            raise BadFile(
+                f"{path}: transition {index} is not one of SurgicAI's ({error})."
+            ) from None
     return rows
 
 
@@ -90,21 +112,29 @@ def _npz(path: Path) -> dict[str, np.ndarray]:
     names = {name: "is_success" if name == "success" else name for name in FIELDS}
     try:
         with zipfile.ZipFile(path) as archive:
-            sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in archive.infolist()}
+            sizes = {
+                entry.filename.removesuffix(".npy"): entry.file_size for entry in archive.infolist()
+            }
         missing = sorted(set(names.values()) - set(sizes))
         if missing:
-            raise BadFile(f"{path} has no array {', '.join(missing)}; it has {', '.join(sorted(sizes))[:200]}.")
+            raise BadFile(
+                f"{path} has no array {', '.join(missing)}; it has {', '.join(sorted(sizes))[:200]}."
+            )
         if any(sizes[name] > MAX_BYTES for name in names.values()):
             raise BadFile(f"{path}: an array unpacks to more than {MAX_BYTES >> 20} MB.")
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: np.asarray(archive[stored]) for name, stored in names.items()}
         strange = [name for name, array in arrays.items() if array.dtype.kind not in "biuf"]
         if strange:
-            raise BadFile(f"{path}: {strange[0]} is of type {arrays[strange[0]].dtype}, no plain numbers.")
+            raise BadFile(
+                f"{path}: {strange[0]} is of type {arrays[strange[0]].dtype}, no plain numbers."
+            )
         return {name: np.asarray(array, np.float64) for name, array in arrays.items()}
     except BadFile:
         raise
-    except Exception as error:  # a damaged archive can fail in any way, and ask for any amount of memory
+    except (
+        Exception
+    ) as error:  # a damaged archive can fail in any way, and ask for any amount of memory
         line = (str(error).splitlines() or [""])[0][:120]
         raise BadFile(f"{path} is not a readable npz ({type(error).__name__}: {line}).") from None
 

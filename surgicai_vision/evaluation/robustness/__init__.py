@@ -1,9 +1,11 @@
-"""Robustness: the same policy on the same starts while one thing at a time shifts away from what it was trained on.
+"""Robustness: the same policy on the same starts while one thing at a time shifts away from what it
+was trained on.
 
-`robustness(subject, seeds, out)` evaluates every axis of `axes.AXES` at every strength, one evaluation folder each
-(`<out>/<axis>/<strength>/`), and writes `robustness.parquet`: a row for every axis and strength with its successes,
-interval, and the axis's area under the curve. Every strength has the same starts, and an episode's shift keeps its
-direction and grows with the strength, so that strengths are paired. Strength 0 is the plain evaluation.
+`robustness(subject, seeds, out)` evaluates every axis of `axes.AXES` at every strength, one
+evaluation folder each (`<out>/<axis>/<strength>/`), and writes `robustness.parquet`: a row for
+every axis and strength with its successes, interval, and the axis's area under the curve. Every
+strength has the same starts, and an episode's shift keeps its direction and grows with the
+strength, so that strengths are paired. Strength 0 is the plain evaluation.
 """
 
 import itertools
@@ -18,7 +20,13 @@ from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.policy_spec import Subject
 from surgicai_vision.evaluation.robustness.axes import AXES, axes_of, shifted
 from surgicai_vision.evaluation.run import evaluate_into
-from surgicai_vision.evaluation.statistics import area_interval, area_under_curve, clopper_pearson, holm, mcnemar
+from surgicai_vision.evaluation.statistics import (
+    area_interval,
+    area_under_curve,
+    clopper_pearson,
+    holm,
+    mcnemar,
+)
 from surgicai_vision.evaluation.storage import MARKER, parquet_bytes, read_rows
 
 __all__ = ["AXES", "CURVES", "MARK", "STRENGTHS", "axes_of", "robustness", "shifted"]
@@ -51,7 +59,8 @@ def robustness(
 
     Raises:
         UnknownName: an axis that does not exist.
-        InputError: strengths out of range or order, or an axis of pictures for a policy that sees none.
+        InputError: strengths out of range or order, or an axis of images for a policy that sees
+            none.
         OutputExists: `out` holds the curves of another subject or of other starts.
     """
     chosen = _checked(subject, axes, strengths)
@@ -67,7 +76,9 @@ def robustness(
                     _copy(plain, folder, axis)
                 else:
                     with stage(f"{axis} {strength:g}: {subject.name}", "steps") as progress:
-                        evaluate_into(folder, shifted(subject, axis, strength), seeds, workers, progress)
+                        evaluate_into(
+                            folder, shifted(subject, axis, strength), seeds, workers, progress
+                        )
             results.append([bool(row["success"]) for row in read_rows(folder)])
         rows += _curve(axis, strengths, results)
     _correct(rows)
@@ -82,7 +93,7 @@ def _checked(subject: Subject, axes: Sequence[str], strengths: Sequence[float]) 
         check_name("axis", axis, AXES)
         if axis not in possible:
             raise InputError(
-                f"{subject.name} sees no pictures, so '{axis}' changes nothing; allowed: {_list(possible)}."
+                f"{subject.name} sees no images, so '{axis}' changes nothing; allowed: {_list(possible)}."
             )
     rising = all(a < b for a, b in itertools.pairwise(strengths))
     if not strengths or not rising or not all(0 <= strength <= 1 for strength in strengths):
@@ -119,7 +130,9 @@ def _copy(plain: Path, folder: Path, axis: str) -> None:
     files.write_json(folder / MARKER, stored)
 
 
-def _curve(axis: str, strengths: Sequence[float], results: list[list[bool]]) -> list[dict[str, Any]]:
+def _curve(
+    axis: str, strengths: Sequence[float], results: list[list[bool]]
+) -> list[dict[str, Any]]:
     """Return the rows of one axis; `results` holds the successes by start, for each strength."""
     area: dict[str, Any] = {"auc": None, "auc_low": None, "auc_high": None}
     if len(strengths) > 1:
@@ -133,7 +146,9 @@ def _curve(axis: str, strengths: Sequence[float], results: list[list[bool]]) -> 
         compared = strengths[0] == 0 and strength > 0
         p = mcnemar(results[0], successes) if compared else None
         counts = {"k": sum(successes), "n": len(successes), "low": low, "high": high}
-        rows.append({"axis": axis, "strength": float(strength), **counts, "p": p, "p_holm": None, **area})
+        rows.append(
+            {"axis": axis, "strength": float(strength), **counts, "p": p, "p_holm": None, **area}
+        )
     return rows
 
 

@@ -1,8 +1,9 @@
 """Axes: what can shift, and how far strength 1 goes. A new axis is one line of `AXES`.
 
-An axis changes either the world, by the randomisation the env already has (`config.RandomisationConfig`), or only the
-pictures the agent is given (`corruption`). In the world every episode draws its own direction from its seed, uniform
-in ± the axis's size; the strength scales the size. It comes on top of the task's own randomisation of the axis.
+An axis changes either the world, by the randomisation the env already has
+(`config.RandomisationConfig`), or only the images the agent is given (`corruption`). In the world
+every episode draws its own direction from its seed, uniform in ± the axis's size; the strength
+scales the size. It comes on top of the task's own randomisation of the axis.
 """
 
 import dataclasses
@@ -27,43 +28,54 @@ class Axis:
     Attributes:
         text: what it is, for people.
         world: field of `config.RandomisationConfig` → what is added to it.
-        pictures: key of `corruption.CORRUPTIONS`, or "".
-        seen: whether it changes pictures only, so that a policy without them cannot notice.
+        images: key of `corruption.CORRUPTIONS`, or "".
+        seen: whether it changes images only, so that a policy without them cannot notice.
     """
 
     text: str
     world: Mapping[str, float] = MappingProxyType({})
-    pictures: str = ""
+    images: str = ""
     seen: bool = True
 
 
 AXES: Mapping[str, Axis] = MappingProxyType(
     {
-        "camera": Axis("cameras off by ±10 mm and ±10° about each axis", {"camera_shift": 10.0, "camera_turn": 10.0}),
+        "camera": Axis(
+            "cameras off by ±10 mm and ±10° about each axis",
+            {"camera_shift": 10.0, "camera_turn": 10.0},
+        ),
         "field_of_view": Axis("vertical field of view off by ±10°", {"camera_fovy": 10.0}),
         "light": Axis("brightness of each light off by ±80 %", {"light": 0.8}),
         "texture": Axis("colour channels of tissue and surroundings off by ±80 %", {"colour": 0.8}),
-        "blur": Axis("Gaussian blur, standard deviation 1/56 of the picture's height", pictures="blur"),
-        "noise": Axis("Gaussian pixel noise, standard deviation 64 of 255 grey levels", pictures="noise"),
-        "smoke": Axis("drifting grey smoke that hides 40 to 90 % of what lies behind it", pictures="smoke"),
-        "latency": Axis("actions take effect 5 control steps (100 ms) later", {"latency": 5}, seen=False),
+        "blur": Axis("Gaussian blur, standard deviation 1/56 of the image's height", images="blur"),
+        "noise": Axis(
+            "Gaussian pixel noise, standard deviation 64 of 255 grey levels", images="noise"
+        ),
+        "smoke": Axis(
+            "drifting grey smoke that hides 40 to 90 % of what lies behind it", images="smoke"
+        ),
+        "latency": Axis(
+            "actions take effect 5 control steps (100 ms) later", {"latency": 5}, seen=False
+        ),
         "kinematic_error": Axis(
-            "first three joints off by ±5°, ±5°, ±5 mm, unknown to the arm", {"kinematic_error": 1.0}, seen=False
+            "first three joints off by ±5°, ±5°, ±5 mm, unknown to the arm",
+            {"kinematic_error": 1.0},
+            seen=False,
         ),
     }
 )
-"""Axis → what strength 1 means. The largest kinematic error is that of the surgical robotics challenge; the others are
-ours: the plain picture is just about recognisable at strength 1."""
+"""Axis → what strength 1 means. The largest kinematic error is that of the surgical robotics
+challenge; the others are ours: the plain image is just about recognisable at strength 1."""
 
 
 def axes_of(subject: Subject) -> tuple[str, ...]:
-    """Return the axes that can change what a subject does: without pictures only those of the arm."""
-    pictures = bool(subject.about.get("views"))
-    return tuple(name for name, axis in AXES.items() if pictures or not axis.seen)
+    """Return the axes that can change what a subject does: without images only those of the arm."""
+    images = bool(subject.about.get("views"))
+    return tuple(name for name, axis in AXES.items() if images or not axis.seen)
 
 
 def shifted(subject: Subject, axis: str, strength: float) -> Subject:
-    """Return the subject in a world, or behind pictures, that shifted by `strength` along `axis`.
+    """Return the subject in a world, or behind images, that shifted by `strength` along `axis`.
 
     Args:
         subject: who acts in which task.
@@ -78,11 +90,14 @@ def shifted(subject: Subject, axis: str, strength: float) -> Subject:
         raise InputError(f"strength is {strength}; allowed: 0 to 1.")
     chosen = AXES[axis]
     make = subject.make_agent
-    if chosen.pictures:
-        make = functools.partial(_corrupted, make, chosen.pictures, strength)
+    if chosen.images:
+        make = functools.partial(_corrupted, make, chosen.images, strength)
     about = {**subject.about, "shift": {"axis": axis, "strength": float(strength)}}
     return dataclasses.replace(
-        subject, config=_shifted_config(subject.config, chosen, strength), make_agent=make, about=about
+        subject,
+        config=_shifted_config(subject.config, chosen, strength),
+        make_agent=make,
+        about=about,
     )
 
 
@@ -93,7 +108,9 @@ def _shifted_config(config: TaskConfig, axis: Axis, strength: float) -> TaskConf
         own = getattr(config.randomisation, name)
         value = min(own + strength * size, RANDOMISATION_LIMITS[name])
         changed[name] = math.floor(value + 0.5) if isinstance(own, int) else value
-    return dataclasses.replace(config, randomisation=dataclasses.replace(config.randomisation, **changed))
+    return dataclasses.replace(
+        config, randomisation=dataclasses.replace(config.randomisation, **changed)
+    )
 
 
 def _corrupted(make: MakeAgent, kind: str, strength: float) -> Agent:

@@ -1,8 +1,9 @@
-"""Corruption: blur, noise and smoke on the pictures an agent is given; the env, its rewards and its films stay clean.
+"""Corruption: blur, noise and smoke on the images an agent is given; the env, its rewards and its
+films stay clean.
 
-A corruption is `change(picture, strength, moment) -> picture` of (height, width, 3) uint8. It is a function of the
-picture, the strength, the start seed, the step and the view alone, so an episode looks the same in any batch and
-process. At strength 0 the picture comes back as it was.
+A corruption is `change(image, strength, moment) -> image` of (height, width, 3) uint8. It is a
+function of the image, the strength, the start seed, the step and the view alone, so an episode
+looks the same in any batch and process. At strength 0 the image comes back as it was.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,10 +17,10 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.evaluation.rollout import Agent
 
-Picture = NDArray[np.uint8]
+Image = NDArray[np.uint8]
 
 BLUR = 1 / 56
-"""Standard deviation of the blur at strength 1, of the picture's height: 4 px at 224."""
+"""Standard deviation of the blur at strength 1, of the image's height: 4 px at 224."""
 NOISE = 64.0
 """Standard deviation of the noise at strength 1 [grey levels of 255]."""
 SMOKE_COLOUR = (196.0, 198.0, 202.0)
@@ -27,48 +28,54 @@ SMOKE_COLOUR = (196.0, 198.0, 202.0)
 SMOKE_THIN, SMOKE_THICK = 0.4, 0.9
 """Opacity of the smoke at strength 1 where it is thinnest and thickest."""
 SMOKE_KNOTS, SMOKE_DRIFT = 5, 1 / 200
-"""Clouds across a picture, and their way a control step, of its width: a width in 4 s."""
+"""Clouds across an image, and their way a control step, of its width: a width in 4 s."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """When and where a picture was taken: start seed, step in the episode, index of the view."""
+    """When and where an image was taken: start seed, step in the episode, index of the view."""
 
     seed: int
     step: int
     view: int
 
 
-def blur(picture: Picture, strength: float, moment: Moment) -> Picture:
-    """Return the picture out of focus."""
+def blur(image: Image, strength: float, moment: Moment) -> Image:
+    """Return the image out of focus."""
     import cv2
 
-    sigma = strength * BLUR * picture.shape[0]
+    sigma = strength * BLUR * image.shape[0]
     if sigma == 0:
-        return picture
-    changed: Picture = cv2.GaussianBlur(picture, (0, 0), sigma)
+        return image
+    changed: Image = cv2.GaussianBlur(image, (0, 0), sigma)
     return changed
 
 
-def noise(picture: Picture, strength: float, moment: Moment) -> Picture:
-    """Return the picture with Gaussian noise, drawn anew for every picture."""
+def noise(image: Image, strength: float, moment: Moment) -> Image:
+    """Return the image with Gaussian noise, drawn anew for every image."""
     rng = np.random.default_rng((moment.seed, moment.step, moment.view))
-    grain = rng.standard_normal(picture.shape, dtype=np.float32)
-    return _bytes(picture + np.float32(strength * NOISE) * grain)
+    grain = rng.standard_normal(image.shape, dtype=np.float32)
+    return _bytes(image + np.float32(strength * NOISE) * grain)
 
 
-def smoke(picture: Picture, strength: float, moment: Moment) -> Picture:
-    """Return the picture behind smoke that drifts across; each start and view has clouds of its own."""
-    height, width = picture.shape[:2]
+def smoke(image: Image, strength: float, moment: Moment) -> Image:
+    """Return the image behind smoke that drifts across; each start and view has clouds of its
+    own.
+    """
+    height, width = image.shape[:2]
     field = _clouds(moment.seed, moment.view, height, width)
     field = np.roll(field, round(moment.step * SMOKE_DRIFT * width), axis=1)
     opacity = np.float32(strength) * (SMOKE_THIN + (SMOKE_THICK - SMOKE_THIN) * field)[..., None]
-    return _bytes(picture + opacity * (np.array(SMOKE_COLOUR, np.float32) - picture))
+    return _bytes(image + opacity * (np.array(SMOKE_COLOUR, np.float32) - image))
 
 
 def _clouds(seed: int, view: int, height: int, width: int) -> NDArray[np.float32]:
-    """Return smooth noise from 0 to 1, (height, width), that tiles across: bilinear between random knots."""
-    knots = np.random.default_rng((seed, view)).random((SMOKE_KNOTS + 1, SMOKE_KNOTS), dtype=np.float32)
+    """Return smooth noise from 0 to 1, (height, width), that tiles across: bilinear between random
+    knots.
+    """
+    knots = np.random.default_rng((seed, view)).random(
+        (SMOKE_KNOTS + 1, SMOKE_KNOTS), dtype=np.float32
+    )
     rows, columns = np.arange(height) * SMOKE_KNOTS / height, np.arange(width) * SMOKE_KNOTS / width
     row, column = rows.astype(int), columns.astype(int)
     down, right = (rows - row).astype(np.float32)[:, None], (columns - column).astype(np.float32)
@@ -78,11 +85,11 @@ def _clouds(seed: int, view: int, height: int, width: int) -> NDArray[np.float32
     return upper * (1 - down) + lower * down
 
 
-def _bytes(values: NDArray[Any]) -> Picture:
+def _bytes(values: NDArray[Any]) -> Image:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-Change = Callable[[Picture, float, Moment], Picture]
+Change = Callable[[Image, float, Moment], Image]
 CORRUPTIONS: Mapping[str, Change] = MappingProxyType({"blur": blur, "noise": noise, "smoke": smoke})
 
 
@@ -108,9 +115,14 @@ class CorruptedAgent:
         self._seeds[slot], self._steps[slot] = seed, 0
         self._agent.begin(slot, env, seed)
 
-    def act(self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]) -> NDArray[np.float32]:
+    def act(
+        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
+    ) -> NDArray[np.float32]:
         """Return the agent's actions (n, 7) on what it sees."""
-        seen = [self._seen(slot, observation) for slot, observation in zip(slots, observations, strict=True)]
+        seen = [
+            self._seen(slot, observation)
+            for slot, observation in zip(slots, observations, strict=True)
+        ]
         for slot in slots:
             self._steps[slot] += 1
         return self._agent.act(slots, envs, seen)
@@ -119,7 +131,7 @@ class CorruptedAgent:
         if not isinstance(observation, dict) or "pixels" not in observation:
             return observation
         changed = {}
-        for view, picture in observation["pixels"].items():
+        for view, image in observation["pixels"].items():
             moment = Moment(self._seeds[slot], self._steps[slot], names.CAMERAS.index(view))
-            changed[view] = self._change(picture, self._strength, moment)
+            changed[view] = self._change(image, self._strength, moment)
         return {**observation, "pixels": changed}

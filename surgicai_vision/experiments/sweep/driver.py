@@ -1,6 +1,8 @@
-"""Running: what cells share is made first, each thing once; then the cells, side by side; then the table.
+"""Running: what cells share is made first, each thing once; then the cells, side by side; then the
+table.
 
-A finished job is filed by one rename from `work/` to its place. A run that was killed in between finds it in `work/`.
+A finished job is filed by one rename from `work/` to its place. A run that was killed in between
+finds it in `work/`.
 """
 
 import functools
@@ -17,14 +19,18 @@ from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
 from surgicai_vision.core.executor import LOCAL, Engine, Job, claim, run
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.provenance import command_line, provenance
-from surgicai_vision.evaluation.storage import parquet_bytes, read_rows
+from surgicai_vision.evaluation.storage import (
+    CELL_FILE,
+    FAILED_FILE,
+    GRID_FILE,
+    RUN_FILE,
+    parquet_bytes,
+    read_rows,
+)
 from surgicai_vision.experiments.run import Cell
 from surgicai_vision.experiments.sweep.grid import Grid, chain_parts
 from surgicai_vision.experiments.sweep.plan import (
     CACHED,
-    CELL_FILE,
-    FAILED_FILE,
-    GRID_FILE,
     LEFT,
     NOT_RUN,
     PROBE_FILE,
@@ -35,7 +41,6 @@ from surgicai_vision.experiments.sweep.plan import (
     plan,
 )
 from surgicai_vision.experiments.sweep.selection import EVERYTHING, Choice
-from surgicai_vision.report import RUN_FILE
 
 EPISODES, PROBES = "episodes.parquet", "probes.parquet"
 WORK = "work"
@@ -64,8 +69,8 @@ def run_sweep(
         choice: the cells to work on; others that are not there yet are left for another call.
 
     Returns:
-        {"cells", "done" (by this call), "cached", "failed", "not_run", "left", "digest" (of all rows there are),
-        "problems": one line for each cell that failed or was not run}.
+        {"cells", "done" (by this call), "cached", "failed", "not_run", "left", "digest" (of all
+        rows there are), "problems": one line for each cell that failed or was not run}.
 
     Raises:
         InputError: `out` cannot be written, or another sweep is at work in it.
@@ -74,18 +79,30 @@ def run_sweep(
     _open(grid, out)
     with claim(out / WORK):
         states = plan(grid, out, choice)
-        tasks = [task for task in grid.task if any(s.cell.task == task and s.state != LEFT for s in states)]
+        tasks = [
+            task
+            for task in grid.task
+            if any(s.cell.task == task and s.state != LEFT for s in states)
+        ]
         do = functools.partial(run, workers=workers, engine=engine, attempts=attempts)
         sweep = _Sweep(grid, out, stage, do, tuple(tasks))
         to_do = [state for state in states if state.state == TO_DO]
         sweep.prepare(to_do, workers, engine)
         sweep.do(to_do)
-        here = [state for state in states if state.state in (CACHED, TO_DO) and state.key not in sweep.errors]
+        here = [
+            state
+            for state in states
+            if state.state in (CACHED, TO_DO) and state.key not in sweep.errors
+        ]
         sweep.probe([state.cell for state in here])
         shutil.rmtree(out / WORK)
     skipped = [state for state in states if state.state == NOT_RUN]
     problems = [f"not run: {state.where}: {state.reason}" for state in skipped]
-    problems += [f"failed: {state.where}: {sweep.errors[state.key]}" for state in to_do if state.key in sweep.errors]
+    problems += [
+        f"failed: {state.where}: {sweep.errors[state.key]}"
+        for state in to_do
+        if state.key in sweep.errors
+    ]
     problems += sweep.problems
     table = _collect(grid, out)
     _collect_probes(out)
@@ -106,12 +123,16 @@ def _open(grid: Grid, out: Path) -> None:
     files.check_output(out, may_resume=GRID_FILE)
     if (out / GRID_FILE).exists():
         if files.read_json(out / GRID_FILE) != to_mapping(grid):
-            raise OutputExists(f"--out {out} holds another sweep (see {out / GRID_FILE}); give another folder.")
+            raise OutputExists(
+                f"--out {out} holds another sweep (see {out / GRID_FILE}); give another folder."
+            )
         return
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"--out {out} cannot be written: {error.strerror}; choose another folder.") from None
+        raise InputError(
+            f"--out {out} cannot be written: {error.strerror}; choose another folder."
+        ) from None
     files.write_json(out / GRID_FILE, to_mapping(grid))
 
 
@@ -142,22 +163,30 @@ class _Sweep:
 
     def _renew(self) -> None:
         """Look at the folder anew: digests of datasets are parts of keys."""
-        ours = {name: value for name, value in os.environ.items() if name.startswith("SURGICAI_VISION_")}
+        ours = {
+            name: value for name, value in os.environ.items() if name.startswith("SURGICAI_VISION_")
+        }
         self.jobs = Jobs(self.grid, self.out, command_line(), ours)
 
     def prepare(self, to_do: Sequence[CellState], workers: int, engine: Engine) -> None:
-        """Make the datasets, features and policies that cells share; a task whose dataset fails fails its cells."""
+        """Make the datasets, features and policies that cells share; a task whose dataset fails
+        fails its cells.
+        """
         from surgicai_vision.experiments.prepare import prepare_dataset
 
         needed = {state.cell.task: None for state in to_do}
-        replayed = [task for task in self.tasks if self.grid.replay and not self._filed_reference("replay", task)]
+        replayed = [
+            task
+            for task in self.tasks
+            if self.grid.replay and not self._filed_reference("replay", task)
+        ]
         for task in [*needed, *(task for task in replayed if task not in needed)]:
             try:
                 prepare_dataset(
                     self.grid.config(task), self.jobs.data_folder(task), self.stage, engine=engine, workers=workers,
                     demonstrations=self.grid.recorded, views=self.grid.cameras or ("front",), size=self.grid.size,
-                    depth=self.grid.has_depth, source=self.grid.source, disturbance=self.grid.disturbance,
-                    every=self.grid.every, linger=self.grid.linger,
+                    depth=self.grid.has_depth, demonstrator=self.grid.demonstrator, disturbance=self.grid.disturbance,
+                    frame_stride=self.grid.frame_stride, post_success_steps=self.grid.post_success_steps,
                 )  # fmt: skip
             except SurgicaiError as error:
                 for state in to_do:
@@ -166,10 +195,14 @@ class _Sweep:
         self._renew()
         live = [state.cell for state in to_do if state.key not in self.errors]
         self._share("features", [job for cell in live for job in self.jobs.features(cell)])
-        self._train_chains([state for state in to_do if state.cell.chain and state.key not in self.errors])
+        self._train_chains(
+            [state for state in to_do if state.cell.chain and state.key not in self.errors]
+        )
 
     def _share(self, title: str, jobs: Iterable[Job]) -> dict[str, SurgicaiError]:
-        """Do jobs, each once; return the errors by key. What failed here fails again in the cell and is told there."""
+        """Do jobs, each once; return the errors by key. What failed here fails again in the cell
+        and is told there.
+        """
         once = {job.key(): job for job in jobs}
         errors: dict[str, SurgicaiError] = {}
 
@@ -179,13 +212,23 @@ class _Sweep:
 
         if once:
             with self.stage(title, title) as progress:
-                self.run(list(once.values()), self.out / WORK, unit=title, progress=progress, ended=ended)
+                self.run(
+                    list(once.values()), self.out / WORK, unit=title, progress=progress, ended=ended
+                )
         return errors
 
     def _train_chains(self, states: Sequence[CellState]) -> None:
         """Train the policies of chains and file them; a chain that lacks one fails."""
-        parts = {self.jobs.policy(part).key(): part for state in states for part in chain_parts(state.cell).values()}
-        missing = [part for key, part in parts.items() if not self._is_filed(self.jobs.policy_folder(part), key)]
+        parts = {
+            self.jobs.policy(part).key(): part
+            for state in states
+            for part in chain_parts(state.cell).values()
+        }
+        missing = [
+            part
+            for key, part in parts.items()
+            if not self._is_filed(self.jobs.policy_folder(part), key)
+        ]
         errors = self._share("policies", map(self.jobs.policy, missing))
         for key, part in parts.items():
             if (self.out / WORK / key).is_dir():
@@ -212,7 +255,11 @@ class _Sweep:
             job = self.jobs.reference(name, task)
             jobs.append(job)
             places[job.key()] = (self._reference_folder(name, task), REFERENCE_FILE, None)
-        for key, (place, record, _) in places.items():  # done by a run that was killed before it could file them
+        for key, (
+            place,
+            record,
+            _,
+        ) in places.items():  # done by a run that was killed before it could file them
             if (self.out / WORK / key).is_dir():
                 _file(self.out / WORK / key, place, record, key)
         left = [job for job in jobs if not self._at(places[job.key()], job.key())]
@@ -233,13 +280,20 @@ class _Sweep:
     def probe(self, cells: Sequence[Cell]) -> None:
         """Probe what the cells see, where the grid asks for it."""
         wanted = self.jobs.probes(cells) if self.grid.probe else {}
-        places = {job.key(): (self.out / "probes" / name, PROBE_FILE, None) for name, job in wanted.items()}
-        errors = self._share("probes", [job for job in wanted.values() if not self._at(places[job.key()], job.key())])
+        places = {
+            job.key(): (self.out / "probes" / name, PROBE_FILE, None)
+            for name, job in wanted.items()
+        }
+        errors = self._share(
+            "probes", [job for job in wanted.values() if not self._at(places[job.key()], job.key())]
+        )
         for key, (place, record, _) in places.items():
             if (self.out / WORK / key).is_dir():
                 _file(self.out / WORK / key, place, record, key)
             if key in errors:
-                self.problems.append(f"failed: probe {place.name}: {' '.join(str(errors[key]).split())}")
+                self.problems.append(
+                    f"failed: probe {place.name}: {' '.join(str(errors[key]).split())}"
+                )
 
     def _at(self, place: tuple[Path, str, CellState | None], key: str) -> bool:
         path = place[0] / place[1]
@@ -247,13 +301,20 @@ class _Sweep:
 
     def _references(self) -> list[tuple[str, str]]:
         """Return (name, task) of the references that are not there."""
-        wanted = [(name, on) for name, on in (("expert", self.grid.expert), ("replay", self.grid.replay)) if on]
+        wanted = [
+            (name, on)
+            for name, on in (("expert", self.grid.expert), ("replay", self.grid.replay))
+            if on
+        ]
         pairs = [(name, task) for task in self.tasks for name, _ in wanted]
         return [(name, task) for name, task in pairs if not self._filed_reference(name, task)]
 
     def _filed_reference(self, name: str, task: str) -> bool:
         path = self._reference_folder(name, task) / REFERENCE_FILE
-        return path.exists() and files.read_json(path).get("job") == self.jobs.reference(name, task).key()
+        return (
+            path.exists()
+            and files.read_json(path).get("job") == self.jobs.reference(name, task).key()
+        )
 
     def _reference_folder(self, name: str, task: str) -> Path:
         return self.out / "references" / f"{name}-{task}"
@@ -287,7 +348,10 @@ def _collect(grid: Grid, out: Path) -> list[dict[str, Any]]:
     for cell in grid.cells:
         key = grid.key(cell)
         if (out / "cells" / key / CELL_FILE).exists():
-            table += [{**_about(grid, key, cell), **row} for row in read_rows(out / "cells" / key / "evaluation")]
+            table += [
+                {**_about(grid, key, cell), **row}
+                for row in read_rows(out / "cells" / key / "evaluation")
+            ]
     files.write_bytes(out / EPISODES, parquet_bytes(table))
     return table
 
@@ -318,16 +382,37 @@ def _store_run(grid: Grid, out: Path, problems: list[str], skipped: Sequence[Cel
     """Write what the report says of the run; only when something changed."""
     old = files.read_json(out / RUN_FILE) if (out / RUN_FILE).exists() else {}
     counts = ", ".join(map(str, grid.demonstrations))
-    parts = [f"{counts} demonstrations of each task by the scripted {grid.source}"]
+    parts = [f"{counts} demonstrations of each task by the scripted {grid.demonstrator}"]
     parts += [f"executed with noise {grid.noise:g}"] if grid.noise else []
-    parts += [f"going on for {grid.linger} steps after their success"] if grid.linger else []
-    parts += [f"{axis} up to {getattr(grid.randomisation, axis):g}" for axis in grid.randomisation.on]
-    parts += [f"a frame every {grid.every} steps"] if grid.every > 1 else []
-    seen = f"{', '.join(grid.views)} at {grid.size} × {grid.size}" if grid.views else "no pictures"
+    parts += (
+        [f"going on for {grid.post_success_steps} steps after their success"]
+        if grid.post_success_steps
+        else []
+    )
+    parts += [
+        f"{axis} up to {getattr(grid.randomisation, axis):g}" for axis in grid.randomisation.on
+    ]
+    parts += [f"a frame every {grid.frame_stride} steps"] if grid.frame_stride > 1 else []
+    seen = f"{', '.join(grid.views)} at {grid.size} × {grid.size}" if grid.views else "no images"
     taught = f"{', '.join(grid.policy)}, recipe {', '.join(grid.recipe)}"
-    data = "; ".join([", ".join(parts), seen, taught, f"{grid.episodes} {grid.starts} starts from {grid.first_seed}"])
-    run = {"title": "sweep", "command": old.get("command") or command_line(), "data": data, "not_run": problems}
-    lacking = [{"key": state.key, "cell": to_mapping(state.cell), "reason": state.reason} for state in skipped]
+    data = "; ".join(
+        [
+            ", ".join(parts),
+            seen,
+            taught,
+            f"{grid.episodes} {grid.starts} starts from {grid.first_seed}",
+        ]
+    )
+    run = {
+        "title": "sweep",
+        "command": old.get("command") or command_line(),
+        "data": data,
+        "not_run": problems,
+    }
+    lacking = [
+        {"key": state.key, "cell": to_mapping(state.cell), "reason": state.reason}
+        for state in skipped
+    ]
     made = {**run, "skipped": lacking, "provenance": old.get("provenance") or provenance()}
     if made != old:
         files.write_json(out / RUN_FILE, made)

@@ -1,7 +1,9 @@
-"""Estimating: how long a sweep will take, from what its cells took already and else from figures measured once.
+"""Estimating: how long a sweep will take, from what its cells took already and else from figures
+measured once.
 
-The figures are seconds on one core of a two-core Xeon virtual machine with software rendering; on another machine
-they are wrong by its speed, until the first cells are done: then their own times count.
+The figures are seconds on one core of a two-core Xeon virtual machine with software rendering; on
+another machine they are wrong by its speed, until the first cells are done: then their own times
+count.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,14 +31,16 @@ ENCODE: Mapping[str, float] = MappingProxyType(
 ENCODE_ELSE = 0.08
 """Per frame encoded [s]: the light encoders, and a ResNet-50 or a small transformer."""
 LIVE = 2.5
-"""Encoding in an evaluation takes so many times as long a frame: eight at a time at most, and seldom as many."""
+"""Encoding in an evaluation takes so many times as long a frame: eight at a time at most, and
+seldom as many.
+"""
 TRAIN = 4e-5
 """Per frame and epoch [s]."""
 EPOCHS = 30
 STEP, SEE = 0.002, 0.006
 """Per control step of an evaluation; and per view seen [s]."""
 LEROBOT: Mapping[str, float] = MappingProxyType({"act": 0.15, "diffusion": 0.25})
-"""Per picture of a batch in one update [s]."""
+"""Per image of a batch in one update [s]."""
 ACT: Mapping[str, float] = MappingProxyType({"act": 0.02, "diffusion": 0.1})
 """Per control step, what LeRobot's policies take themselves [s]."""
 START = 3.0
@@ -44,18 +48,27 @@ START = 3.0
 
 
 def estimate(grid: Grid, out: Path, states: Sequence[CellState], workers: int) -> dict[str, Any]:
-    """Return {"seconds": of the whole run with so many workers, "source": what the estimate stands on}."""
+    """Return {"seconds": of the whole run with so many workers, "source": what the estimate stands
+    on}.
+    """
     to_do = [state.cell for state in states if state.state == TO_DO]
     jobs = Jobs(grid, out)
     tasks = {cell.task for cell in to_do if not jobs.dataset_digest(cell.task)}
     shared = sum(_data_seconds(grid, task) for task in tasks)
     seen = {(cell.task, cell.encoder, view) for cell in to_do for view in cell.view}
     shared += sum(_frames(grid, task) * _encode(encoder) for task, encoder, view in seen)
-    shared += sum(_train(grid, part) for part in {part for cell in to_do if cell.chain for part in _parts(cell)})
+    shared += sum(
+        _train(grid, part)
+        for part in {part for cell in to_do if cell.chain for part in _parts(cell)}
+    )
     ratios = _ratios(grid, jobs, states)
     speed = sum(ratios) / len(ratios) if ratios else 1.0
     cells = sum(_cell_seconds(grid, cell) for cell in to_do) * speed
-    source = f"by the time {len(ratios)} cells took here" if ratios else "by figures of another machine; a rough guess"
+    source = (
+        f"by the time {len(ratios)} cells took here"
+        if ratios
+        else "by figures of another machine; a rough guess"
+    )
     return {"seconds": round((shared * speed + cells) / max(1, workers)), "source": source}
 
 
@@ -80,7 +93,9 @@ def _frames(grid: Grid, task: str, demonstrations: int | None = None) -> int:
 
 
 def _data_seconds(grid: Grid, task: str) -> float:
-    return _frames(grid, task) * (RECORD + RENDER * len(grid.cameras) * (2 if grid.has_depth else 1))
+    return _frames(grid, task) * (
+        RECORD + RENDER * len(grid.cameras) * (2 if grid.has_depth else 1)
+    )
 
 
 def _encode(encoder: str | None) -> float:
@@ -97,4 +112,8 @@ def _cell_seconds(grid: Grid, cell: Cell) -> float:
     """Return the estimate of one cell: training, unless chains share it, and evaluation."""
     steps = grid.episodes * 200 * (len(names.SUBTASKS) if cell.task == names.SUTURE else 1)
     look = len(cell.view) * (SEE + LIVE * _encode(cell.encoder))
-    return START + (0.0 if cell.chain else _train(grid, cell)) + steps * (STEP + look + ACT.get(cell.policy, 0.0))
+    return (
+        START
+        + (0.0 if cell.chain else _train(grid, cell))
+        + steps * (STEP + look + ACT.get(cell.policy, 0.0))
+    )

@@ -7,9 +7,15 @@ from types import MappingProxyType
 from typing import Any
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import RandomisationConfig, TaskConfig, check_every, digest, to_mapping
+from surgicai_vision.core.config import (
+    RandomisationConfig,
+    TaskConfig,
+    check_frame_stride,
+    digest,
+    to_mapping,
+)
 from surgicai_vision.core.errors import InputError, check_name
-from surgicai_vision.demos.record import SOURCES, TAUGHT
+from surgicai_vision.demos.record import DEMONSTRATORS, LEARNING
 from surgicai_vision.demos.rollout import Disturbance
 from surgicai_vision.evaluation.hierarchical import TERMINATIONS
 from surgicai_vision.experiments.run import OWN, Cell
@@ -17,19 +23,33 @@ from surgicai_vision.experiments.sweep.lerobot import LEROBOT_POLICIES
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
 
-AXES = ("task", "encoder", "view", "recipe", "policy", "deviation", "demonstrations", "seed", "chain")
+AXES = (
+    "task",
+    "encoder",
+    "view",
+    "recipe",
+    "policy",
+    "deviation",
+    "demonstrations",
+    "seed",
+    "chain",
+)
 """Keys of a grid that hold lists; one value alone may be written without brackets."""
 
-TEACHERS = tuple(name for name in SOURCES if name not in TAUGHT)
+TEACHERS = tuple(name for name in DEMONSTRATORS if name not in LEARNING)
 """Sources of demonstrations that need none themselves."""
 
 
-BANKS: Mapping[str, int] = MappingProxyType({"test": names.TEST_SEED, "validation": names.VALIDATION_SEED})
-"""Bank of start states → its first seed: what is chosen is chosen on validation, and told of test."""
+BANKS: Mapping[str, int] = MappingProxyType(
+    {"test": names.TEST_SEED, "validation": names.VALIDATION_SEED}
+)
+"""Bank of start states → its first seed: what is chosen is chosen on validation, and told of
+test.
+"""
 
 
 @dataclass(frozen=True)
-class Lever:
+class Ablation:
     """What is replaced in each cell that sees, alone and all else kept; what is None stays.
 
     Attributes:
@@ -48,7 +68,9 @@ class Lever:
         if self.encoder is not None:
             encoders.check_encoder_name(self.encoder)
         if not self.replaced:
-            raise InputError("A lever replaces nothing; give one of encoder, view, pool, recipe, change.")
+            raise InputError(
+                "A ablation replaces nothing; give one of encoder, view, pool, recipe, change."
+            )
 
     @property
     def replaced(self) -> dict[str, Any]:
@@ -62,35 +84,40 @@ class Grid:
 
     Attributes:
         task: tasks.
-        encoder: encoders; `own` for policies that train a network of their own on the pictures (`act`, `diffusion`).
+        encoder: encoders; `own` for policies that train a network of their own on the images
+            (`act`, `diffusion`).
         view: view sets, each a list of views.
         seed: training seeds.
         policy: policies: those of `train`, and LeRobot's `act` and `diffusion`.
         recipe: recipes of the former.
         pool: what is taken from the encoders.
         deviation: sets of `config.Deviations` switches to be on; none takes the recipe's.
-        lever: what is replaced one at a time in each cell that sees: ablations beside the whole.
-        demonstrations: numbers of the expert's demonstrations of each task; the smaller set lies within the larger.
-        source: who demonstrates: `expert`, or `search`, which does not know the goal of a grasp.
+        ablation: what is replaced one at a time in each cell that sees: ablations beside the whole.
+        demonstrations: numbers of the expert's demonstrations of each task; the smaller set lies
+            within the larger.
+        demonstrator: who demonstrates: `expert`, or `search`, which does not know the goal of a
+            grasp.
         noise: what they execute is disturbed by so much (`record-demos --noise`).
-        linger: control steps that demonstrations go on after their success.
-        randomisation: what differs from episode to episode besides the start, in demonstrations and evaluations.
-        every: frames are rendered every so many steps; recipes must then take them so.
-        chain: add, for the whole procedure, a high-level policy over a policy for each subtask, by how subtasks end:
-            `privileged` or `learned`.
+        post_success_steps: control steps that demonstrations go on after their success.
+        randomisation: what differs from episode to episode besides the start, in demonstrations and
+            evaluations.
+        frame_stride: frames are rendered every so many steps; recipes must then take them so.
+        chain: add, for the whole procedure, a high-level policy over a policy for each subtask, by
+            how subtasks end: `privileged` or `learned`.
         swap: add each such chain with the expert in the place of each subtask's policy.
         accept_licence: accept weights under a non-commercial licence.
-        proprioception: add a cell without pictures for each task and seed.
+        proprioception: add a cell without images for each task and seed.
         state: add a cell that sees the state with the goal, the ceiling, for each task and seed.
         expert: evaluate the expert on each task beside the cells.
         replay: evaluate blind replay of the mean demonstration too.
-        probe: probe the encoders' features for the needle's pose, where the command `probe` is there.
+        probe: probe the encoders' features for the needle's pose, where the command `probe` is
+            there.
         epochs: passes over the frames; none takes the recipe's.
         steps: updates of LeRobot's policies.
         batch: their batch size.
         starts: the bank of the evaluation's starts, one of `BANKS`.
         episodes: starts of each evaluation.
-        size: height and width of pictures [px].
+        size: height and width of images [px].
         depth: render depth beside RGB; done by itself where a view is a depth view.
     """
 
@@ -102,13 +129,13 @@ class Grid:
     recipe: tuple[str, ...] = ("paper",)
     pool: str = "global"
     deviation: tuple[tuple[str, ...], ...] = ()
-    lever: tuple[Lever, ...] = ()
+    ablation: tuple[Ablation, ...] = ()
     demonstrations: tuple[int, ...] = (50,)
-    source: str = "expert"
+    demonstrator: str = "expert"
     noise: float = 0.0
-    linger: int = 0
+    post_success_steps: int = 0
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
-    every: int = 1
+    frame_stride: int = 1
     chain: tuple[str, ...] = ()
     swap: bool = False
     accept_licence: bool = False
@@ -131,25 +158,37 @@ class Grid:
                 encoders.check_encoder_name(name)
         for name in self.policy:
             check_name("policy", name, (*policies.POLICIES, *LEROBOT_POLICIES))
-        check_name("source", self.source, TEACHERS)
+        check_name("demonstrator", self.demonstrator, TEACHERS)
         check_name("bank of starts", self.starts, BANKS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
-        check_every(self.every)
-        if self.linger < 0:
-            raise InputError(f"linger is {self.linger}; it must be at least 0.")
+        check_frame_stride(self.frame_stride)
+        if self.post_success_steps < 0:
+            raise InputError(
+                f"post_success_steps is {self.post_success_steps}; it must be at least 0."
+            )
         for name in self.chain:
             check_name("termination", name, TERMINATIONS)
         numbers = [(name, getattr(self, name)) for name in ("episodes", "size", "steps", "batch")]
-        for name, number in [*numbers, *(("demonstrations", number) for number in self.demonstrations)]:
+        for name, number in [
+            *numbers,
+            *(("demonstrations", number) for number in self.demonstrations),
+        ]:
             if number < 1:
                 raise InputError(f"{name} is {number}; it must be at least 1.")
         if not self.demonstrations:
             raise InputError("demonstrations is empty; give at least one number.")
-        for lever in self.lever:
-            if lever.demonstrations is not None and not 1 <= lever.demonstrations <= self.recorded:
-                raise InputError(f"lever: demonstrations is {lever.demonstrations}; allowed: 1 to {self.recorded}.")
+        for ablation in self.ablation:
+            if (
+                ablation.demonstrations is not None
+                and not 1 <= ablation.demonstrations <= self.recorded
+            ):
+                raise InputError(
+                    f"ablation: demonstrations is {ablation.demonstrations}; allowed: 1 to {self.recorded}."
+                )
         if not self.cells or len(set(self.cells)) != len(self.cells):
-            raise InputError(f"The grid has {len(self.cells)} cells, {len(set(self.cells))} of them different.")
+            raise InputError(
+                f"The grid has {len(self.cells)} cells, {len(set(self.cells))} of them different."
+            )
 
     @property
     def cells(self) -> list[Cell]:
@@ -164,18 +203,31 @@ class Grid:
             if task == names.SUTURE:
                 cells += self._chains(common)
         seeing = [cell for cell in cells if cell.encoder not in (None, OWN)]
-        return cells + [replace(cell, **lever.replaced) for cell in seeing for lever in self.lever]
+        return cells + [
+            replace(cell, **ablation.replaced) for cell in seeing for ablation in self.ablation
+        ]
 
     def _of_policy(self, policy: str, task: str, common: dict[str, Any]) -> Iterator[Cell]:
         """Yield the cells of a policy on a task."""
         ours = policy not in LEROBOT_POLICIES
         recipes = self.recipe if ours else ("paper",)
         switches = self.deviation if ours and self.deviation else (None,)
-        for encoder, view, recipe, on in itertools.product(self.encoder, self.view, recipes, switches):
+        for encoder, view, recipe, on in itertools.product(
+            self.encoder, self.view, recipes, switches
+        ):
             if ours and encoder == OWN:
-                continue  # `own` is for policies that see pictures themselves
+                continue  # `own` is for policies that see images themselves
             pool = self.pool if ours else "global"
-            yield Cell(task, encoder, view, policy=policy, recipe=recipe, pool=pool, deviations=on, **common)
+            yield Cell(
+                task,
+                encoder,
+                view,
+                policy=policy,
+                recipe=recipe,
+                pool=pool,
+                deviations=on,
+                **common,
+            )
         for recipe in recipes if ours else ():
             if self.proprioception:
                 yield Cell(task, None, (), policy=policy, recipe=recipe, **common)
@@ -185,8 +237,12 @@ class Grid:
     def _chains(self, common: dict[str, Any]) -> Iterator[Cell]:
         """Yield the chains over the whole procedure."""
         encoders = [encoder for encoder in self.encoder if encoder != OWN]
-        for end, encoder, view, recipe in itertools.product(self.chain, encoders, self.view, self.recipe):
-            whole = Cell(names.SUTURE, encoder, view, recipe=recipe, pool=self.pool, chain=end, **common)
+        for end, encoder, view, recipe in itertools.product(
+            self.chain, encoders, self.view, self.recipe
+        ):
+            whole = Cell(
+                names.SUTURE, encoder, view, recipe=recipe, pool=self.pool, chain=end, **common
+            )
             yield whole
             if self.swap:
                 yield from (replace(whole, swap=subtask) for subtask in names.SUBTASKS)
@@ -224,21 +280,37 @@ class Grid:
 
     @property
     def recorded(self) -> int:
-        """Demonstrations recorded of each task: the largest number; cells with fewer train on the first of them."""
+        """Demonstrations recorded of each task: the largest number; cells with fewer train on the
+        first of them.
+        """
         return max(self.demonstrations)
 
     def key(self, cell: Cell) -> str:
         """Return the digest of everything that decides what a cell is."""
-        lerobot = {"steps": self.steps, "batch": self.batch} if cell.policy in LEROBOT_POLICIES else {}
+        lerobot = (
+            {"steps": self.steps, "batch": self.batch} if cell.policy in LEROBOT_POLICIES else {}
+        )
         shared = {name: getattr(self, name) for name in ("episodes", "size", "depth")}
         shared |= {"views": list(self.views), "demonstrations": self.recorded, **lerobot}
-        shared |= {"source": self.source, "noise": self.noise, **({"every": self.every} if self.every > 1 else {})}
-        shared |= {"linger": self.linger, "starts": self.starts, "randomisation": to_mapping(self.randomisation)}
+        shared |= {
+            "demonstrator": self.demonstrator,
+            "noise": self.noise,
+            **({"frame_stride": self.frame_stride} if self.frame_stride > 1 else {}),
+        }
+        shared |= {
+            "post_success_steps": self.post_success_steps,
+            "starts": self.starts,
+            "randomisation": to_mapping(self.randomisation),
+        }
         return digest({"cell": to_mapping(cell), **shared})[:16]
 
 
 def chain_parts(cell: Cell) -> dict[str, Cell]:
-    """Return the policies a chain is made of: "hlp" and those of its subtasks but for the one swapped."""
+    """Return the policies a chain is made of: "hlp" and those of its subtasks but for the one
+    swapped.
+    """
     alone = replace(cell, chain=None, swap=None)
-    low = {subtask: replace(alone, task=subtask) for subtask in names.SUBTASKS if subtask != cell.swap}
+    low = {
+        subtask: replace(alone, task=subtask) for subtask in names.SUBTASKS if subtask != cell.swap
+    }
     return {"hlp": replace(alone, policy="hlp"), **low}

@@ -1,6 +1,8 @@
-"""Jobs of a sweep, as workers do them: encode, train a chain's policy, do a cell, evaluate a reference.
+"""Jobs of a sweep, as workers do them: encode, train a chain's policy, do a cell, evaluate a
+reference.
 
-Each writes into its own folder and reads datasets and cache by path. Nothing here depends on who does it.
+Each writes into its own folder and reads datasets and cache by path. Nothing here depends on who
+does it.
 """
 
 import dataclasses
@@ -16,7 +18,12 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import Stage, timed
-from surgicai_vision.evaluation.policy_spec import Subject, baseline_subject, checkpoint_subject, replay_subject
+from surgicai_vision.evaluation.policy_spec import (
+    Subject,
+    baseline_subject,
+    checkpoint_subject,
+    replay_subject,
+)
 from surgicai_vision.evaluation.run import evaluate_into
 from surgicai_vision.experiments.run import Cell, encode_cell, train_cell
 from surgicai_vision.experiments.sweep.lerobot import LEROBOT_POLICIES, SCRATCH, train_lerobot
@@ -26,7 +33,13 @@ Table = Mapping[str, Any]
 
 
 def encode_features(
-    folder: Path, cell: Table, dataset: str, accept_licence: bool, options: Table, command: str, environment: Table
+    folder: Path,
+    cell: Table,
+    dataset: str,
+    accept_licence: bool,
+    options: Table,
+    command: str,
+    environment: Table,
 ) -> None:
     """Job "sweep-features": put what a cell sees into the feature cache."""
     os.environ.update(environment)
@@ -35,11 +48,19 @@ def encode_features(
 
 
 def train_policy(
-    folder: Path, cell: Table, dataset: str, accept_licence: bool, options: Table, command: str, environment: Table
+    folder: Path,
+    cell: Table,
+    dataset: str,
+    accept_licence: bool,
+    options: Table,
+    command: str,
+    environment: Table,
 ) -> None:
     """Job "sweep-policy": train one policy of a chain."""
     os.environ.update(environment)
-    train_cell(_cell(cell), _dataset(dataset), folder, silent, accept_licence=accept_licence, **options)
+    train_cell(
+        _cell(cell), _dataset(dataset), folder, silent, accept_licence=accept_licence, **options
+    )
 
 
 def run_cell(
@@ -54,33 +75,60 @@ def run_cell(
     command: str,
     environment: Table,
 ) -> None:
-    """Job "sweep-cell": train a cell's policy, or take a chain's, and count its successes on held-out starts."""
+    """Job "sweep-cell": train a cell's policy, or take a chain's, and count its successes on
+    held-out starts.
+    """
     os.environ.update(environment)
     what, seconds, policy = _cell(cell), dict[str, float](), folder / "policy"
     stage = functools.partial(timed, silent, seconds)
     with stage() as measured:
-        subject = _subject(what, policies, _dataset(dataset), policy, measured, accept_licence, options)
-        about = {**subject.about, "command": command, "folder": str(Path(final) / "policy"), "swap": what.swap}
+        subject = _subject(
+            what, policies, _dataset(dataset), policy, measured, accept_licence, options
+        )
+        about = {
+            **subject.about,
+            "command": command,
+            "folder": str(Path(final) / "policy"),
+            "swap": what.swap,
+        }
         with measured("evaluation", "steps"):
-            summary = _evaluate(folder / "evaluation", dataclasses.replace(subject, about=about), seeds)
+            summary = _evaluate(
+                folder / "evaluation", dataclasses.replace(subject, about=about), seeds
+            )
     shutil.rmtree(folder / SCRATCH, ignore_errors=True)
     write_json(folder / CELL_FILE, {"cell": cell, "summary": summary, "seconds": seconds})
 
 
 def run_reference(
-    folder: Path, name: str, config: Table, seeds: Sequence[int], dataset: str, command: str, environment: Table
+    folder: Path,
+    name: str,
+    config: Table,
+    seeds: Sequence[int],
+    dataset: str,
+    command: str,
+    environment: Table,
 ) -> None:
     """Job "sweep-reference": evaluate who was not trained."""
     os.environ.update(environment)
     replay = name == "replay"
-    subject = replay_subject(_dataset(dataset)) if replay else baseline_subject(name, from_mapping(TaskConfig, config))
+    subject = (
+        replay_subject(_dataset(dataset))
+        if replay
+        else baseline_subject(name, from_mapping(TaskConfig, config))
+    )
     about = {**subject.about, "command": command}
     summary = _evaluate(folder, dataclasses.replace(subject, about=about), seeds)
     write_json(folder / REFERENCE_FILE, {"summary": summary})
 
 
 def run_probe(
-    folder: Path, cell: Table, dataset: str, accept_licence: bool, options: Table, command: str, environment: Table
+    folder: Path,
+    cell: Table,
+    dataset: str,
+    accept_licence: bool,
+    options: Table,
+    command: str,
+    environment: Table,
 ) -> None:
     """Job "sweep-probe": say what of the needle's pose can be read from what a cell sees."""
     from surgicai_vision.features.probe import probe
@@ -88,7 +136,12 @@ def run_probe(
     os.environ.update(environment)
     what, data = _cell(cell), _dataset(dataset)
     features, _ = encode_cell(what, data, silent, accept_licence=accept_licence)
-    row = {"task": what.task, "encoder": what.encoder, "view": "+".join(what.view), "pool": what.pool}
+    row = {
+        "task": what.task,
+        "encoder": what.encoder,
+        "view": "+".join(what.view),
+        "pool": what.pool,
+    }
     write_json(folder / PROBE_FILE, {**row, **probe(data, features).row()})
 
 
@@ -127,7 +180,9 @@ def _chain(cell: Cell, policies: Mapping[str, str], accept_licence: bool) -> Sub
     from surgicai_vision.evaluation import hierarchical
 
     low = {subtask: policies.get(subtask, "expert") for subtask in names.SUBTASKS}
-    made = from_mapping(hierarchical.Chain, {"hlp": policies["hlp"], **low, "termination": cell.chain})
+    made = from_mapping(
+        hierarchical.Chain, {"hlp": policies["hlp"], **low, "termination": cell.chain}
+    )
     subject = hierarchical.subject(made, accept_licence=accept_licence)
     make = functools.partial(hierarchical.ChainAgent, cell.name, made, None, accept_licence)
     about = {**subject.about, "encoder": cell.encoder}

@@ -1,4 +1,5 @@
-"""LeRobot's policies as cells: `lerobot-train` in a process of its own, on pictures or on exported features.
+"""LeRobot's policies as cells: `lerobot-train` in a process of its own, on images or on exported
+features.
 
 Its checkpoint is evaluated as `surgicai-vision evaluate` does. LeRobot is not imported here.
 """
@@ -26,18 +27,21 @@ OPTIONS = {
         "--policy.num_inference_steps=10",
     )
 }
-"""What a policy needs besides: to start its backbone from random weights, and ten steps of denoising in the place of
-a hundred, which take minutes an episode on a core."""
+"""What a policy needs besides: to start its backbone from random weights, and ten steps of
+denoising in the place of a hundred, which take minutes an episode on a core."""
 SCRATCH = "export"
 PARENT_DEATH = 1
 """prctl's PR_SET_PDEATHSIG: the child ends with its parent."""
 
 
-def train_lerobot(cell: Cell, dataset: Any, out: Path, *, steps: int, batch: int, accept_licence: bool) -> None:
+def train_lerobot(
+    cell: Cell, dataset: Any, out: Path, *, steps: int, batch: int, accept_licence: bool
+) -> None:
     """Train a policy of LeRobot into `out`, as `lerobot-train` writes it.
 
     Args:
-        cell: its policy, encoder (`OWN` or frozen features), views, seed and number of demonstrations.
+        cell: its policy, encoder (`OWN` or frozen features), views, seed and number of
+            demonstrations.
         dataset: an opened dataset of the cell's task.
         out: folder to make.
         steps: updates.
@@ -48,20 +52,29 @@ def train_lerobot(cell: Cell, dataset: Any, out: Path, *, steps: int, batch: int
         SurgicaiError: LeRobot failed; the message ends with the last of what it said.
     """
     if dataset.fps != names.FPS:
-        raise InputError(f"{dataset.path} holds {dataset.fps} frames a second; {cell.policy} needs {names.FPS}.")
+        raise InputError(
+            f"{dataset.path} holds {dataset.fps} frames a second; {cell.policy} needs {names.FPS}."
+        )
     root = dataset.path
     if cell.encoder != OWN:
         root = out.with_name(SCRATCH)
         _export(cell, dataset, root, accept_licence)
-    command = [sys.executable, "-m", "lerobot.scripts.lerobot_train", *_arguments(cell, dataset, root, out)]
+    command = [
+        sys.executable,
+        "-m",
+        "lerobot.scripts.lerobot_train",
+        *_arguments(cell, dataset, root, out),
+    ]
     command += [f"--steps={steps}", f"--batch_size={batch}", f"--save_freq={steps}"]
-    done = subprocess.run(command, capture_output=True, text=True, env=_environment(), preexec_fn=_end_with_parent)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=_environment(), preexec_fn=_end_with_parent
+    )
     if done.returncode:
         raise SurgicaiError(f"lerobot-train failed for {cell.name}:\n{done.stderr[-2000:]}")
 
 
 def _export(cell: Cell, dataset: Any, root: Path, accept_licence: bool) -> None:
-    """Write a dataset with the cell's features in place of pictures."""
+    """Write a dataset with the cell's features in place of images."""
     from surgicai_vision.dataset.feature_export import export_features
     from surgicai_vision.features.cache import encode
 
@@ -98,7 +111,10 @@ def _arguments(cell: Cell, dataset: Any, root: Path, out: Path) -> list[str]:
         arguments.append(f"--dataset.episodes={list(range(cell.demonstrations))}")
     if cell.encoder == OWN:
         side = dataset.image_size
-        seen = {names.image_key(view): {"type": "VISUAL", "shape": [3, side, side]} for view in cell.view}
+        seen = {
+            names.image_key(view): {"type": "VISUAL", "shape": [3, side, side]}
+            for view in cell.view
+        }
         inputs = {**seen, names.STATE: {"type": "STATE", "shape": [len(names.STATE_NAMES)]}}
         arguments.append(f"--policy.input_features={json.dumps(inputs)}")
         arguments.append(f"--env.cameras={json.dumps(list(cell.view))}")
@@ -106,10 +122,17 @@ def _arguments(cell: Cell, dataset: Any, root: Path, out: Path) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    return {**os.environ, "HF_HUB_OFFLINE": "1", "HF_DATASETS_DISABLE_PROGRESS_BARS": "1", "WANDB_MODE": "disabled"}
+    return {
+        **os.environ,
+        "HF_HUB_OFFLINE": "1",
+        "HF_DATASETS_DISABLE_PROGRESS_BARS": "1",
+        "WANDB_MODE": "disabled",
+    }
 
 
 def _end_with_parent() -> None:
-    """Be killed when the worker is (Linux alone has this; elsewhere the training runs to its end)."""
+    """Be killed when the worker is (Linux alone has this; elsewhere the training runs to its
+    end).
+    """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PARENT_DEATH, signal.SIGKILL)

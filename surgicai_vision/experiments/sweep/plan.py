@@ -1,4 +1,6 @@
-"""Planning: which cells there are, what stands in the folder already, and the job that makes each."""
+"""Planning: which cells there are, what stands in the folder already, and the job that makes
+each.
+"""
 
 import functools
 import json
@@ -12,6 +14,7 @@ from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import BadFile, MissingWeights
 from surgicai_vision.core.executor import Job
 from surgicai_vision.core.files import read_json
+from surgicai_vision.evaluation.storage import CELL_FILE
 from surgicai_vision.experiments.run import OWN, Cell
 from surgicai_vision.experiments.sweep.grid import Grid, chain_parts
 from surgicai_vision.experiments.sweep.lerobot import LEROBOT_POLICIES
@@ -19,7 +22,7 @@ from surgicai_vision.experiments.sweep.selection import EVERYTHING, Choice, is_c
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
 
-GRID_FILE, CELL_FILE, FAILED_FILE, REFERENCE_FILE = "sweep.json", "cell.json", "failed.json", "reference.json"
+REFERENCE_FILE = "reference.json"
 PROBE_FILE = "probe.json"
 CACHED, TO_DO, NOT_RUN, LEFT = "cached", "to do", "not run", "left"
 STATES = (TO_DO, CACHED, NOT_RUN, LEFT)
@@ -88,7 +91,9 @@ class Jobs:
         environment: variables for the workers, where an engine does not hand ours on.
     """
 
-    def __init__(self, grid: Grid, out: Path, command: str = "", environment: Mapping[str, str] | None = None):
+    def __init__(
+        self, grid: Grid, out: Path, command: str = "", environment: Mapping[str, str] | None = None
+    ):
         self.grid, self.out = grid, out
         self._where = {"command": command, "environment": dict(environment or {})}
         self._digests: dict[str, str | None] = {}
@@ -109,7 +114,9 @@ class Jobs:
         """Return the digest of a task's dataset; None where it is not made yet."""
         if task not in self._digests:
             try:
-                self._digests[task] = str(read_json(self.data_folder(task) / "dataset" / names.META_FILE)["digest"])
+                self._digests[task] = str(
+                    read_json(self.data_folder(task) / "dataset" / names.META_FILE)["digest"]
+                )
             except BadFile:
                 self._digests[task] = None
         return self._digests[task]
@@ -119,21 +126,29 @@ class Jobs:
         return self.cell(cell).key() if self.dataset_digest(cell.task) else None
 
     def cell(self, cell: Cell) -> Job:
-        """Return the job that trains and evaluates a cell, or evaluates the chain of policies made before."""
+        """Return the job that trains and evaluates a cell, or evaluates the chain of policies made
+        before.
+        """
         parts = chain_parts(cell) if cell.chain else {}
         final = self.cell_folder(self.grid.key(cell))
-        inputs = [self.policy(part).key() for part in parts.values()] if parts else self._inputs(cell)
+        inputs = (
+            [self.policy(part).key() for part in parts.values()] if parts else self._inputs(cell)
+        )
         arguments = {
             "cell": to_mapping(cell),
             "seeds": self._seeds,
             "final": str(final.absolute()),
-            "policies": {name: str(self.policy_folder(part).absolute()) for name, part in parts.items()},
+            "policies": {
+                name: str(self.policy_folder(part).absolute()) for name, part in parts.items()
+            },
             **self._common(cell),
         }
         return Job("sweep-cell", arguments, tuple(inputs), label=(*LABELS, "final", "policies"))
 
     def policy(self, part: Cell) -> Job:
-        """Return the job that trains one policy of a chain, on its subtask's frames of whole procedures."""
+        """Return the job that trains one policy of a chain, on its subtask's frames of whole
+        procedures.
+        """
         whole = replace(part, task=names.SUTURE)
         subtask = {} if part.task == names.SUTURE else {"subtask": part.task}
         arguments = {"cell": to_mapping(whole), **self._common(whole), "options": subtask}
@@ -150,7 +165,9 @@ class Jobs:
         return jobs
 
     def probes(self, cells: Iterable[Cell]) -> dict[str, Job]:
-        """Return the probes of what cells see, by their folders' names; a chain and an `own` network have none."""
+        """Return the probes of what cells see, by their folders' names; a chain and an `own`
+        network have none.
+        """
         jobs = {}
         for cell in cells:
             if cell.encoder and cell.encoder != OWN and not cell.chain:
@@ -164,7 +181,13 @@ class Jobs:
         """Return the job that evaluates the expert, or blind replay, on a task."""
         dataset = str((self.data_folder(task) / "dataset").absolute())
         config = to_mapping(self.grid.config(task))
-        arguments = {"name": name, "config": config, "seeds": self._seeds, "dataset": dataset, **self._where}
+        arguments = {
+            "name": name,
+            "config": config,
+            "seeds": self._seeds,
+            "dataset": dataset,
+            **self._where,
+        }
         inputs = (self.dataset_digest(task) or "",) if name == "replay" else ()
         return Job("sweep-reference", arguments, inputs, label=LABELS)
 
@@ -174,7 +197,11 @@ class Jobs:
         return [self.grid.first_seed, self.grid.first_seed + self.grid.episodes]
 
     def _common(self, cell: Cell) -> dict[str, Any]:
-        lerobot = {"steps": self.grid.steps, "batch": self.grid.batch} if cell.policy in LEROBOT_POLICIES else {}
+        lerobot = (
+            {"steps": self.grid.steps, "batch": self.grid.batch}
+            if cell.policy in LEROBOT_POLICIES
+            else {}
+        )
         return {
             "dataset": str((self.data_folder(cell.task) / "dataset").absolute()),
             "accept_licence": self.grid.accept_licence,
@@ -204,8 +231,8 @@ def _seen(cell: Cell) -> list[Cell]:
         recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
         on = tuple(switch for switch in FEATURE_SWITCHES if getattr(recipe.deviations, switch))
         common["deviations"] = on
-        if recipe.every > 1:
-            common["change"] = (f"every={recipe.every}",)
+        if recipe.frame_stride > 1:
+            common["change"] = (f"frame_stride={recipe.frame_stride}",)
     if "batch_norm_drift" in on:  # the statistics are of these views and this seed
         return [Cell(cell.task, cell.encoder, cell.view, cell.seed, **common)]
     return [Cell(cell.task, cell.encoder, (view,), **common) for view in cell.view]

@@ -1,6 +1,7 @@
 """Choosing: the cells of a grid that one call works on, by the values of its axes (`sweep --only`).
 
-A choice maps an axis to values in words: those of `view` are joined by "+", what a cell has none of is "none".
+A choice maps an axis to values in words: those of `view` are joined by "+", what a cell has none of
+is "none".
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +17,8 @@ NONE = "none"
 
 
 def read_choice(texts: Iterable[str], cells: Sequence[Cell]) -> Choice:
-    """Read `encoder=imagenet`, `random`, `seed=0`: a text without an axis is another value of the axis before it.
+    """Read `encoder=imagenet`, `random`, `seed=0`: a text without an axis is another value of the
+    axis before it.
 
     Raises:
         UnknownName: an axis, or a value of it, that no cell has.

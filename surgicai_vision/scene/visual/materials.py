@@ -1,8 +1,10 @@
-"""Look: materials, lights, surroundings, and the visible shape of what physics sees as boxes and capsules.
+"""Look: materials, lights, surroundings, and the visible shape of what physics sees as boxes and
+capsules.
 
-Nothing here touches physics: every geom it adds collides with nothing and weighs nothing (group 1), and the physical
-geoms it covers are only moved to a group that is not drawn (group 4). Colours and lights are chosen so that the
-needle stands out without shadows, which software rendering cannot afford; the key light casts one in high quality.
+Nothing here touches physics: every geom it adds collides with nothing and weighs nothing (group 1),
+and the physical geoms it covers are only moved to a group that is not drawn (group 4). Colours and
+lights are chosen so that the needle stands out without shadows, which software rendering cannot
+afford; the key light casts one in high quality.
 """
 
 from typing import Any
@@ -18,8 +20,9 @@ from surgicai_vision.scene.visual import shapes, skin, textures, tool
 from surgicai_vision.scene.visual.shapes import hide, show
 
 DRAPE_X = (0.04, 0.08, 0.13, 0.19, 0.27, 0.40, 0.60, 0.90)
-"""Columns of the drape's points on each side of the phantom's middle [m], closer where the cameras look; between the
-first two, below the phantom, it has a hole, for every hidden pixel costs as much as a visible one."""
+"""Columns of the drape's points on each side of the phantom's middle [m], closer where the cameras
+look; between the first two, below the phantom, it has a hole, for every hidden pixel costs as much
+as a visible one."""
 DRAPE_WAVE = 0.006
 """Height of its folds [m]."""
 
@@ -55,7 +58,11 @@ def add_materials(spec: mujoco.MjSpec) -> None:
 def add_surroundings(spec: mujoco.MjSpec) -> None:
     """Add the lights, the sky and the drape."""
     head = spec.visual.headlight
-    head.ambient, head.diffuse, head.specular = [0.26, 0.25, 0.25], [0.26, 0.26, 0.26], [0.25, 0.25, 0.25]
+    head.ambient, head.diffuse, head.specular = (
+        [0.26, 0.25, 0.25],
+        [0.26, 0.26, 0.26],
+        [0.25, 0.25, 0.25],
+    )
     world = spec.worldbody
     for name, position, direction, strength in (
         ("key", [-0.10, 0.12, 0.45], [0.25, -0.25, -1.0], 0.44),
@@ -70,7 +77,9 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
             specular=[0.5 * strength] * 3,
             castshadow=name == "key",
         )
-    spec.visual.map.shadowclip = 9.0  # times the extent: a smaller map shows stripes towards its edge
+    spec.visual.map.shadowclip = (
+        9.0  # times the extent: a smaller map shows stripes towards its edge
+    )
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -91,7 +100,10 @@ def dress(spec: mujoco.MjSpec, layout: str = "simple", instrument: str = "400006
     length = INSTRUMENTS[instrument].pitch_to_yaw
     tool.add_tool_meshes(spec, length)
     for arm in ARMS:
-        shaft, wrist = spec.body(f"{arm}_outer_roll_link"), spec.body(f"{arm}_outer_wrist_pitch_link")
+        shaft, wrist = (
+            spec.body(f"{arm}_outer_roll_link"),
+            spec.body(f"{arm}_outer_wrist_pitch_link"),
+        )
         hide(shaft)
         hide(wrist)
         tool.dress_shaft(shaft, arm)
@@ -133,5 +145,7 @@ def _drape() -> shapes.Mesh:
     keep = np.ones((len(rows) - 1, len(columns) - 1), bool)
     keep[len(rows) // 2 - 1, len(columns) // 2 - 1] = False
     mesh = shapes.Mesh()
-    mesh.add_grid(np.stack([x + ORIGIN[0], y + ORIGIN[1], z], axis=2), np.stack([x, y], axis=2) * 13.0, keep)
+    mesh.add_grid(
+        np.stack([x + ORIGIN[0], y + ORIGIN[1], z], axis=2), np.stack([x, y], axis=2) * 13.0, keep
+    )
     return mesh

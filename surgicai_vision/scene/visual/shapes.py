@@ -1,7 +1,7 @@
 """Shapes: triangle meshes from sections and grids, for what only meets the eye.
 
-Coordinates are rounded to a nanometre: the last bits of a sine differ between processors, and the scene's hash must
-not.
+Coordinates are rounded to a nanometre: the last bits of a sine differ between processors, and the
+scene's hash must not.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,11 @@ class Mesh:
     faces: list[Sequence[int]] = field(default_factory=list)
     coordinates: list[Sequence[float]] = field(default_factory=list)
 
-    def add_grid(self, points: ArrayLike, coordinates: ArrayLike | None = None, keep: ArrayLike | None = None) -> None:
-        """Add a grid of points (rows, columns, 3) [m], seen from the side on which rows × columns is the normal.
+    def add_grid(
+        self, points: ArrayLike, coordinates: ArrayLike | None = None, keep: ArrayLike | None = None
+    ) -> None:
+        """Add a grid of points (rows, columns, 3) [m], seen from the side on which rows × columns
+        is the normal.
 
         Args:
             coordinates: of the texture, (rows, columns, 2).
@@ -62,7 +65,9 @@ class Mesh:
 
 
 def loft(sections: ArrayLike) -> Mesh:
-    """Return the closed surface through sections (n, sides, 3) [m], each running anticlockwise seen from the last."""
+    """Return the closed surface through sections (n, sides, 3) [m], each running anticlockwise seen
+    from the last.
+    """
     rings = np.asarray(sections, dtype=np.float64)
     mesh = Mesh()
     closed = np.concatenate([rings, rings[:, :1]], axis=1)
@@ -93,8 +98,12 @@ def tube(centres: ArrayLike, radii: ArrayLike, normal: ArrayLike, sides: int = 8
 
 
 def bar(sections: Sequence[tuple[float, float, float, float]]) -> Mesh:
-    """Return a straight bar along z through rectangles (z, lowest y, highest y, half of the width in x) [m]."""
-    corners = [[(-w, low, z), (w, low, z), (w, high, z), (-w, high, z)] for z, low, high, w in sections]
+    """Return a straight bar along z through rectangles (z, lowest y, highest y, half of the width
+    in x) [m].
+    """
+    corners = [
+        [(-w, low, z), (w, low, z), (w, high, z), (-w, high, z)] for z, low, high, w in sections
+    ]
     return loft(corners)
 
 
@@ -118,11 +127,13 @@ def rod(start: Sequence[float], end: Sequence[float], radius: float, sides: int 
 
 def show(body: mujoco.MjsBody, shape: mujoco.mjtGeom, material: str, **place: Any) -> None:
     """Add a geom to `body` that is seen and nothing else: it neither collides nor weighs."""
-    body.add_geom(type=shape, material=material, contype=0, conaffinity=0, mass=0.0, group=VISIBLE, **place)
+    body.add_geom(
+        type=shape, material=material, contype=0, conaffinity=0, mass=0.0, group=VISIBLE, **place
+    )
 
 
 def hide(body: mujoco.MjsBody, keep: str = "") -> None:
-    """Take a body's physical geoms out of the pictures, but for one whose name ends with `keep`."""
+    """Take a body's physical geoms out of the images, but for one whose name ends with `keep`."""
     for geom in body.geoms:
         if not (keep and geom.name.endswith(keep)):
             geom.group = HIDDEN

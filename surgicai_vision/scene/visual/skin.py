@@ -1,8 +1,8 @@
 """Tissue: the phantom's visible skin, drawn over the boxes that are its physics.
 
-At each hole the skin lies on the faces of the boxes; between two hole pairs, whose gaps differ, it runs straight
-where the boxes have a step of up to 0.5 mm. The holes are open, have walls, and show a dark inside; a ring of ink
-marks each as on a training phantom.
+At each hole the skin lies on the faces of the boxes; between two hole pairs, whose gaps differ, it
+runs straight where the boxes have a step of up to 0.5 mm. The holes are open, have walls, and show
+a dark inside; a ring of ink marks each as on a training phantom.
 """
 
 import math
@@ -29,8 +29,8 @@ RAMP = 0.0015
 MARGIN = 0.0012
 """Along the wound beside a hole, where the skin still lies on the boxes [m]."""
 BESIDE, FLAT_ROWS, STRIP = 8, 7, 0.0005
-"""Points across the flat tissue on each side of the ridge, rows before and behind it (lighting is per point), and the
-length of the row next to it [m]."""
+"""Points across the flat tissue on each side of the ridge, rows before and behind it (lighting is
+per point), and the length of the row next to it [m]."""
 
 
 def add_skin(spec: mujoco.MjSpec, layout: str) -> None:
@@ -72,7 +72,10 @@ def _profile(pair: HolePair) -> Array:
     edge = SIZE[0] / 2
     sides = []
     for flank, end in ((left, ORIGIN[0] - edge), (right, ORIGIN[0] + edge)):
-        foot, above = flank[0], flank[0] + (flank[1] - flank[0]) * FILLET / np.linalg.norm(flank[1] - flank[0])
+        foot, above = (
+            flank[0],
+            flank[0] + (flank[1] - flank[0]) * FILLET / np.linalg.norm(flank[1] - flank[0]),
+        )
         flat = np.linspace((end, SURFACE), (foot[0] + math.copysign(FILLET, end), SURFACE), BESIDE)
         share = np.linspace(0.0, 1.0, 5)[1:, None]
         fillet = (1 - share) ** 2 * flat[-1] + 2 * share * (1 - share) * foot + share**2 * above
@@ -91,13 +94,23 @@ def _rows(pairs: Sequence[HolePair], profiles: Sequence[Array]) -> list[tuple[fl
     for pair, profile in zip(pairs, profiles, strict=True):
         y = pair.entry.centre[1]
         reach = OPENING / 2 + MARGIN
-        for shift, opens in ((reach, False), (OPENING / 2, True), (-OPENING / 2, False), (-reach, False)):
+        for shift, opens in (
+            (reach, False),
+            (OPENING / 2, True),
+            (-OPENING / 2, False),
+            (-reach, False),
+        ):
             rows.append((y + shift, profile, opens))
     first, last = _flattened(profiles[0]), _flattened(profiles[-1])
     far = [ORIGIN[1] + SIZE[1] / 2, ORIGIN[1] - SIZE[1] / 2]
     # A short strip beside the ridge's end keeps its slope out of the flat tissue's normals.
-    head = [(y, first, False) for y in (*np.linspace(far[0], edges[0] + STRIP, FLAT_ROWS - 1), edges[0])]
-    tail = [(y, last, False) for y in (edges[-1], *np.linspace(edges[-1] - STRIP, far[1], FLAT_ROWS - 1))]
+    head = [
+        (y, first, False) for y in (*np.linspace(far[0], edges[0] + STRIP, FLAT_ROWS - 1), edges[0])
+    ]
+    tail = [
+        (y, last, False)
+        for y in (edges[-1], *np.linspace(edges[-1] - STRIP, far[1], FLAT_ROWS - 1))
+    ]
     full = [(edges[0] - RAMP, profiles[0], False)], [(edges[-1] + RAMP, profiles[-1], False)]
     return head + full[0] + rows + full[1] + tail
 
@@ -110,7 +123,9 @@ def _flattened(profile: Array) -> Array:
 
 
 def _skin(pairs: tuple[HolePair, ...]) -> Mesh:
-    """Return the outer surface with the openings left out; the texture runs along it without stretching."""
+    """Return the outer surface with the openings left out; the texture runs along it without
+    stretching.
+    """
     rows = _rows(pairs, [_profile(pair) for pair in pairs])
     points = np.stack([np.insert(section, 1, y, axis=1) for y, section, _ in rows])
     steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
@@ -127,7 +142,9 @@ def _skin(pairs: tuple[HolePair, ...]) -> Mesh:
 
 
 def _inside(pairs: tuple[HolePair, ...]) -> Mesh:
-    """Return what shows through the holes: the walls of the openings and the flanks' inner faces."""
+    """Return what shows through the holes: the walls of the openings and the flanks' inner
+    faces.
+    """
     mesh = Mesh()
     sections = []
     for pair in pairs:
@@ -137,8 +154,11 @@ def _inside(pairs: tuple[HolePair, ...]) -> Mesh:
         sections.append(np.concatenate([inner[0], _crest(pair, height, -WALL, 1), inner[1][::-1]]))
         for near, far in zip(outer, inner, strict=True):
             _add_walls(mesh, near[1:3], far[1:3], pair.entry.centre[1])
-    # Column 1 of `_flank` is the lower edge of a hole: 1..2 on the left, 6..7 on the right of nine points.
-    rows = [(y, section, opens) for y, section, opens in _rows(pairs, sections)[FLAT_ROWS:-FLAT_ROWS]]
+    # Column 1 of `_flank` is the lower edge of a hole: 1..2 on the left, 6..7 on the right of nine
+    # points.
+    rows = [
+        (y, section, opens) for y, section, opens in _rows(pairs, sections)[FLAT_ROWS:-FLAT_ROWS]
+    ]
     points = np.stack([np.insert(section, 1, y, axis=1) for y, section, _ in rows])
     keep = np.ones((len(rows) - 1, points.shape[1] - 1), bool)
     for index, (_, _, opens) in enumerate(rows[:-1]):
@@ -149,11 +169,18 @@ def _inside(pairs: tuple[HolePair, ...]) -> Mesh:
 
 
 def _add_walls(mesh: Mesh, near: Array, far: Array, y: float) -> None:
-    """Add the four walls of one opening between its outer and inner edges, (2, 2) each: lower and upper x, z."""
+    """Add the four walls of one opening between its outer and inner edges, (2, 2) each: lower and
+    upper x, z.
+    """
     reach = OPENING / 2
     loop = ((0, -reach), (1, -reach), (1, reach), (0, reach), (0, -reach))
-    grid = np.array([[[edge[i, 0], y + shift, edge[i, 1]] for i, shift in loop] for edge in (near, far)])
-    for walls in (grid, grid[:, ::-1]):  # seen from either side: the entry's order is the exit's reversed
+    grid = np.array(
+        [[[edge[i, 0], y + shift, edge[i, 1]] for i, shift in loop] for edge in (near, far)]
+    )
+    for walls in (
+        grid,
+        grid[:, ::-1],
+    ):  # seen from either side: the entry's order is the exit's reversed
         mesh.add_grid(walls)
 
 
@@ -166,6 +193,11 @@ def _ink(pairs: tuple[HolePair, ...]) -> Mesh:
     for pair in pairs:
         for hole in (pair.entry, pair.exit):
             across, along, normal = hole.rotation.T
-            grid = np.asarray(hole.centre) + reach[:, None, None] * across + reach[:, None] * along + INK_LIFT * normal
+            grid = (
+                np.asarray(hole.centre)
+                + reach[:, None, None] * across
+                + reach[:, None] * along
+                + INK_LIFT * normal
+            )
             mesh.add_grid(grid, keep=keep)
     return mesh

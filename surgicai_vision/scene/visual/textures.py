@@ -1,8 +1,9 @@
 """Textures: tissue and cloth, drawn from numbers alone, the same bytes on every machine.
 
-Noise uses seeded integers and additions and products of floats only, which IEEE fixes to the last bit; a sine or
-an exponential differs between processors, and with it the scene's hash. The textures reach MuJoCo as PNG files in
-memory, named by their content, so that the hash over the scene's XML covers them.
+Noise uses seeded integers and additions and products of floats only, which IEEE fixes to the last
+bit; a sine or an exponential differs between processors, and with it the scene's hash. The textures
+reach MuJoCo as PNG files in memory, named by their content, so that the hash over the scene's XML
+covers them.
 """
 
 import hashlib
@@ -29,14 +30,16 @@ def tissue(height: int = 768, width: int = 384, seed: int = 1) -> Image:
     """Return wet tissue: pink, mottled, with two layers of fine vessels, (height, width, 3)."""
     rng = np.random.default_rng(seed)
     aspect = height // width
-    mottle = 0.6 * noise(rng, height, width, 4 * aspect, 4) + 0.4 * noise(rng, height, width, 16 * aspect, 16)
+    mottle = 0.6 * noise(rng, height, width, 4 * aspect, 4) + 0.4 * noise(
+        rng, height, width, 16 * aspect, 16
+    )
     grain = noise(rng, height, width, height // 2, width // 2) - 0.5
     arteries = _filaments(rng, height, width, 6 * aspect, 6)
     capillaries = _filaments(rng, height, width, 20 * aspect, 20)
-    picture = _blend(np.array([224.0, 164.0, 152.0]), np.array([190.0, 108.0, 102.0]), mottle)
-    picture = _blend(picture, np.array([150.0, 40.0, 52.0]), 0.42 * arteries)
-    picture = _blend(picture, np.array([164.0, 52.0, 60.0]), 0.24 * capillaries)
-    return _bytes(picture + 14.0 * grain[..., None])
+    image = _blend(np.array([224.0, 164.0, 152.0]), np.array([190.0, 108.0, 102.0]), mottle)
+    image = _blend(image, np.array([150.0, 40.0, 52.0]), 0.42 * arteries)
+    image = _blend(image, np.array([164.0, 52.0, 60.0]), 0.24 * capillaries)
+    return _bytes(image + 14.0 * grain[..., None])
 
 
 def cloth(size: int = 256, seed: int = 2) -> Image:
@@ -44,12 +47,16 @@ def cloth(size: int = 256, seed: int = 2) -> Image:
     rng = np.random.default_rng(seed)
     weft, warp = (np.arange(size) % 4 < 2)[:, None], (np.arange(size) % 4 < 2)[None, :]
     weave = np.where(weft ^ warp, 1.0, 0.0)
-    shade = 0.5 * noise(rng, size, size, 8, 8) + 0.25 * weave + 0.25 * noise(rng, size, size, 64, 64)
+    shade = (
+        0.5 * noise(rng, size, size, 8, 8) + 0.25 * weave + 0.25 * noise(rng, size, size, 64, 64)
+    )
     return _bytes(_blend(np.array([22.0, 84.0, 96.0]), np.array([50.0, 128.0, 138.0]), shade))
 
 
 def noise(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Field:
-    """Return smooth noise in [0, 1), (height, width), with `rows` × `columns` random knots; it tiles."""
+    """Return smooth noise in [0, 1), (height, width), with `rows` × `columns` random knots; it
+    tiles.
+    """
     knots = rng.integers(0, 65536, size=(rows, columns)) / 65536.0
     first, second, share = _knots(height, rows)
     along = knots[first] * (1.0 - share)[:, None] + knots[second] * share[:, None]
@@ -67,9 +74,13 @@ def _knots(length: int, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64
 
 
 def _filaments(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Field:
-    """Return thin winding lines: 1 where smooth noise crosses its middle, falling steeply beside it."""
+    """Return thin winding lines: 1 where smooth noise crosses its middle, falling steeply beside
+    it.
+    """
     octaves = ((0.6, 1), (0.28, 2), (0.12, 4))
-    field = sum(weight * noise(rng, height, width, rows * fine, columns * fine) for weight, fine in octaves)
+    field = sum(
+        weight * noise(rng, height, width, rows * fine, columns * fine) for weight, fine in octaves
+    )
     folded: Field = 1.0 - np.abs(2.0 * field - 1.0)
     for _ in range(4):
         folded = folded * folded
@@ -82,12 +93,14 @@ def _blend(low: Field, high: Field, share: Field) -> Field:
     return mixed
 
 
-def _bytes(picture: Field) -> Image:
-    return np.clip(picture + 0.5, 0.0, 255.0).astype(np.uint8)
+def _bytes(image: Field) -> Image:
+    return np.clip(image + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
 def png(image: Image) -> bytes:
-    """Return an (H, W, 3) picture as a PNG file, stored without compression so that its bytes depend on nothing."""
+    """Return an (H, W, 3) image as a PNG file, stored without compression so that its bytes depend
+    on nothing.
+    """
     height, width, _ = image.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)

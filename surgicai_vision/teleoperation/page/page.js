@@ -1,4 +1,4 @@
-// What is held and pressed goes out, pictures and status come in. Codes are KeyboardEvent.code.
+// What is held and pressed goes out, images and status come in. Codes are KeyboardEvent.code.
 "use strict";
 
 const HEARTBEAT = 100; // ms between messages while something is held: the server lets go after 500 ms of silence
@@ -106,9 +106,9 @@ setInterval(send, 20);
 
 // -- eyes -------------------------------------------------------------------------------------------------------------
 
-async function draw(figure, picture) {
+async function draw(figure, image) {
   const view = figure.dataset.view;
-  const answer = await fetch(`view/${view}.jpg?n=${picture}`);
+  const answer = await fetch(`view/${view}.jpg?n=${image}`);
   if (!answer.ok) return;
   const image = await createImageBitmap(await answer.blob());
   const canvas = figure.querySelector("canvas");
@@ -144,9 +144,9 @@ async function watch() {
       if (status.state && status.number !== seen) {
         seen = status.number;
         tell(status);
-        if (status.picture !== shown) {
-          await Promise.all([...document.querySelectorAll("figure")].map((figure) => draw(figure, status.picture)));
-          shown = status.picture;
+        if (status.image !== shown) {
+          await Promise.all([...document.querySelectorAll("figure")].map((figure) => draw(figure, status.image)));
+          shown = status.image;
         }
       }
     } catch (error) {

@@ -1,9 +1,11 @@
-"""BagConfig: how a bag is read. Where the poses are, in which frames and units, and how it becomes episodes.
+"""BagConfig: how a bag is read. Where the poses are, in which frames and units, and how it becomes
+episodes.
 
-Two conventions set what is not given. Sources: `dvrk` is the da Vinci Research Kit's CRTK interface; its needle
-drivers' tip frame lies on the wrist's yaw axis and is turned like ours (`tooltip-offset` of its tool files 400006 and
-420006), and its jaw is the angle between the fingers, twice ours. `ambf` is the CRTK interface of the surgical
-robotics challenge: the same tip, one finger's angle as the jaw, of which only the command is published.
+Two conventions set what is not given. Sources: `dvrk` is the da Vinci Research Kit's CRTK
+interface; its needle drivers' tip frame lies on the wrist's yaw axis and is turned like ours
+(`tooltip-offset` of its tool files 400006 and 420006), and its jaw is the angle between the
+fingers, twice ours. `ambf` is the CRTK interface of the surgical robotics challenge: the same tip,
+one finger's angle as the jaw, of which only the command is published.
 """
 
 import dataclasses
@@ -42,7 +44,9 @@ LABELS: Mapping[str, str] = MappingProxyType(
 
 
 def clean(text: object, longest: int = 80) -> str:
-    """Return what a bag says as something that can be shown: one line, printable, of limited length."""
+    """Return what a bag says as something that can be shown: one line, printable, of limited
+    length.
+    """
     whole = "".join(letter if letter.isprintable() else "?" for letter in str(text)[: longest + 1])
     return whole if len(whole) <= longest else f"{whole[: longest - 1]}…"
 
@@ -69,7 +73,9 @@ def is_bag(path: Path) -> bool:
 
 
 def bags_in(path: Path) -> list[Path]:
-    """Return the bag at `path`, or the bags in the folder `path`, by name; none where there are none."""
+    """Return the bag at `path`, or the bags in the folder `path`, by name; none where there are
+    none.
+    """
     if is_bag(path) or not path.is_dir():
         return [path] if is_bag(path) else []
     return sorted(child for child in path.iterdir() if is_bag(child))
@@ -99,16 +105,22 @@ class Topics:
     def __post_init__(self) -> None:
         for role, topic in self.given().items():
             if not topic.startswith("/") or not topic.strip("/"):
-                raise InputError(f"topic of {role} is '{topic}'; a topic begins with '/', like /PSM1/measured_cp.")
+                raise InputError(
+                    f"topic of {role} is '{topic}'; a topic begins with '/', like /PSM1/measured_cp."
+                )
 
     def given(self) -> dict[str, str]:
         """Return the topics that are not None."""
-        return {role: topic for role, topic in dataclasses.asdict(self).items() if topic is not None}
+        return {
+            role: topic for role, topic in dataclasses.asdict(self).items() if topic is not None
+        }
 
 
 @dataclass(frozen=True)
 class Convention:
-    """What one kind of system publishes: its topics, and the jaw's angle as a multiple of one finger's."""
+    """What one kind of system publishes: its topics, and the jaw's angle as a multiple of one
+    finger's.
+    """
 
     topics: Mapping[str, str]
     jaw_scale: float
@@ -131,13 +143,15 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Frames:
-    """Where the recording's frames lie, each x y z [m] and a quaternion w x y z; empty: where ours do.
+    """Where the recording's frames lie, each x y z [m] and a quaternion w x y z; empty: where ours
+    do.
 
     Attributes:
         psm1, psm2: T_base_frame, the frame of the arm's poses in the arm's base.
         tip: T_tip_recorded, the recorded tip frame in ours.
         needle: T_world_frame, the frame of the needle's poses in world.
-        needle_offset: T_needle_recorded, the recorded needle frame in ours (the arc's centre, base at -x, +z normal).
+        needle_offset: T_needle_recorded, the recorded needle frame in ours (the arc's centre, base
+            at -x, +z normal).
     """
 
     psm1: tuple[float, ...] = ()
@@ -150,7 +164,11 @@ class Frames:
         for name, pose in dataclasses.asdict(self).items():
             if not pose:
                 continue
-            if len(pose) != 7 or not all(map(math.isfinite, pose)) or abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
+            if (
+                len(pose) != 7
+                or not all(map(math.isfinite, pose))
+                or abs(math.hypot(*pose[3:]) - 1.0) > 1e-3
+            ):
                 raise InputError(
                     f"frames: {name} is {list(pose)}; "
                     "it must be seven numbers, x y z [m] and a unit quaternion w x y z."
@@ -166,11 +184,12 @@ class BagConfig:
         topics: topics that differ from the convention's.
         frames: frames that differ from ours.
         jaw_scale: one finger's angle over the recorded one; None takes the convention's.
-        length_scale: metres in the recording's unit of length, of the arms' poses and of joint insertions.
-        needle_scale: the same of the needle's poses; None: 0.1 of AMBF's own states, whose scenes are ten times
-            as large, or else 1.
-        segmentation: "labels", "events" (contact and holes; needs the needle), "none" (the whole recording is one
-            episode), or "auto": the first of these that the recording allows.
+        length_scale: metres in the recording's unit of length, of the arms' poses and of joint
+            insertions.
+        needle_scale: the same of the needle's poses; None: 0.1 of AMBF's own states, whose scenes
+            are ten times as large, or else 1.
+        segmentation: "labels", "events" (contact and holes; needs the needle), "none" (the whole
+            recording is one episode), or "auto": the first of these that the recording allows.
         labels: further labels → subtask, or "none".
         clock: "stamp" (headers), "bag" (when received), or "auto": stamps where there are any.
         max_gap: longest time between two messages that is bridged [s].

@@ -2,12 +2,14 @@
 
     summaries = import_bags([Path("trial.bag")], task=None, out=Path("demos"))
 
-Read (`foreign`, `bags`), put on the control rate (`recording`), cut into subtasks (`segments`), leave out the pauses
-(`bag_pieces`), replay (`replay`), write. What was measured there is where everything stands here; actions are the
-motions between. Success is judged as the envs do, with one leniency: the jaws' contact may be that of the geometry
-(`segments.held`), because a foreign needle never lies between our pads to a tenth of a millimetre.
+Read (`foreign`, `bags`), put on the control rate (`recording`), cut into subtasks (`segments`),
+leave out the pauses (`bag_pieces`), replay (`replay`), write. What was measured there is where
+everything stands here; actions are the motions between. Success is judged as the envs do, with one
+leniency: the jaws' contact may be that of the geometry (`segments.held`), because a foreign needle
+never lies between our pads to a tenth of a millimetre.
 
-Without a needle in the bag it lies where the task's definition puts it, as in SurgicAI's recordings (`replay`).
+Without a needle in the bag it lies where the task's definition puts it, as in SurgicAI's recordings
+(`replay`).
 """
 
 import dataclasses
@@ -28,7 +30,14 @@ from surgicai_vision.demos.imports.rosbag.config import BagConfig
 from surgicai_vision.demos.imports.rosbag.segments import held
 from surgicai_vision.demos.imports.rosbag.tracks import Piece, take_apart
 from surgicai_vision.demos.record import finished
-from surgicai_vision.demos.store import MARKER, Demo, list_demos, read_marker, write_demo, write_marker
+from surgicai_vision.demos.store import (
+    MARKER,
+    Demo,
+    list_demos,
+    read_marker,
+    write_demo,
+    write_marker,
+)
 
 Row = Mapping[str, Any]
 
@@ -46,7 +55,8 @@ class BagSummary:
         clipped: steps faster than the preset allows, whose action was clipped to [-1, 1].
         pauses: samples left out because the arm rested.
         succeeded: demonstrations whose last state meets the task's tolerances in our scene.
-        skipped: parts that could not be replayed, {"bag", "task", "from", "to", "reason"}; times in seconds.
+        skipped: parts that could not be replayed, {"bag", "task", "from", "to", "reason"}; times in
+            seconds.
     """
 
     task: str
@@ -73,19 +83,24 @@ def import_bags(
 
     Args:
         bags: bag files and ROS 2 folders.
-        task: the subtask that is wanted, into `out`; None: every one that is found, into `out`/<task>.
+        task: the subtask that is wanted, into `out`; None: every one that is found, into
+            `out`/<task>.
         out: folder to make; the same import of the same bags finds it finished.
         config: how to read them.
         env: fields of `TaskConfig`, among them the scene with its hole pair and instrument.
-        progress: called with (bags read, bags, "bags"), then (demonstrations done, demonstrations, "demonstrations").
+        progress: called with (bags read, bags, "bags"), then (demonstrations done, demonstrations,
+            "demonstrations").
 
     Raises:
         UnknownName: an unknown task.
         BadFile: an unreadable bag.
-        InputError: topics that are not there, nothing to segment by, nothing found, nothing that can be replayed.
+        InputError: topics that are not there, nothing to segment by, nothing found, nothing that
+            can be replayed.
         OutputExists: `out` holds something else.
     """
-    base = from_mapping(TaskConfig, {**(env or {}), "task": check_name("subtask", task or "grasp", names.SUBTASKS)})
+    base = from_mapping(
+        TaskConfig, {**(env or {}), "task": check_name("subtask", task or "grasp", names.SUBTASKS)}
+    )
     if task:
         check_output(out, may_resume=MARKER)
     pieces: list[Piece] = []
@@ -97,7 +112,11 @@ def import_bags(
         pieces, skipped = pieces + found, [*skipped, *unusable]
     if not pieces:
         raise InputError(f"Nothing can be imported: {skipped[0]['task']}: {skipped[0]['reason']}.")
-    request = {"bags": [_digests(bag) for bag in bags], "bag": to_mapping(config), "env": dict(env or {})}
+    request = {
+        "bags": [_digests(bag) for bag in bags],
+        "bag": to_mapping(config),
+        "env": dict(env or {}),
+    }
     summaries, done = [], 0
     for name in names.SUBTASKS:
         some = [piece for piece in pieces if piece.task == name]
@@ -108,7 +127,15 @@ def import_bags(
         check_output(folder, may_resume=MARKER)
         if not finished(folder, asked):
             tell = _told(progress, done, len(pieces))
-            _build(folder, some, [row for row in skipped if row["task"] == name], base, config, asked, tell)
+            _build(
+                folder,
+                some,
+                [row for row in skipped if row["task"] == name],
+                base,
+                config,
+                asked,
+                tell,
+            )
         done += len(some)
         marker = read_marker(folder)
         notes = {**marker["notes"], "skipped": tuple(marker["skipped"])}
@@ -140,7 +167,9 @@ def _build(
     task = pieces[0].task
     longest = max(len(piece.track.needle) - 1 for piece in pieces)
     step = config.step or fastest(task, [piece.track for piece in pieces])
-    task_config = dataclasses.replace(base, task=task, step=step, max_steps=max(base.max_steps, longest))
+    task_config = dataclasses.replace(
+        base, task=task, step=step, max_steps=max(base.max_steps, longest)
+    )
     replay, rows = Replay(task_config), list(skipped)
     counts = {"steps": 0, "clipped": 0, "pauses": 0, "succeeded": 0}
     count = 0
@@ -153,22 +182,35 @@ def _build(
             else:
                 write_demo(folder, count, demo)
                 count += 1
-                more = {"steps": len(demo), "clipped": clipped, "pauses": piece.pauses, "succeeded": demo.success[-1]}
+                more = {
+                    "steps": len(demo),
+                    "clipped": clipped,
+                    "pauses": piece.pauses,
+                    "succeeded": demo.success[-1],
+                }
                 counts = {key: counts[key] + int(value) for key, value in more.items()}
             tell(number)
         if not count:
             raise InputError(f"No {task} can be replayed in our scene: {rows[-1]['reason']}")
-        details = {"request": request, "skipped": rows, "episodes": count, "notes": {"step": step, **counts}}
+        details = {
+            "request": request,
+            "skipped": rows,
+            "episodes": count,
+            "notes": {"step": step, **counts},
+        }
         write_marker(folder, task, "bag", code=code_version(), **details)
 
 
 def fastest(task: str, tracks: Sequence[Track]) -> str:
-    """Return the smallest step preset that nearly all steps of some tracks fit into, or the one that most fit into."""
+    """Return the smallest step preset that nearly all steps of some tracks fit into, or the one
+    that most fit into.
+    """
     arm = names.ACTIVE_ARM[task]
     total = sum(len(track.needle) - 1 for track in tracks)
     clipped = {step: sum(moves(*track.arms[arm], step)[1] for track in tracks) for step in STEPS}
     return next(
-        (step for step in STEPS if clipped[step] <= MOST_CLIPPED * total), min(STEPS, key=lambda s: clipped[s])
+        (step for step in STEPS if clipped[step] <= MOST_CLIPPED * total),
+        min(STEPS, key=lambda s: clipped[s]),
     )
 
 
@@ -188,10 +230,14 @@ def demonstration(replay: Replay, track: Track) -> tuple[Demo, int]:
     contact = np.array([info["contact"] for info in infos]) | held(arm, tip, jaw, track.needle)
     success = np.array([info["is_success"] for info in infos])
     if subtask.demands[config.tolerance].contact:
-        distance, angle = (np.array([info[key] for info in infos]) for key in ("d_trans", "d_angle"))
+        distance, angle = (
+            np.array([info[key] for info in infos]) for key in ("d_trans", "d_angle")
+        )
         near = subtask.tolerances[config.tolerance]
         success |= (distance <= near.distance) & (angle <= near.angle) & contact
-    reward = [replay.reward(bool(good), info) for good, info in zip(success[1:], infos[1:], strict=True)]
+    reward = [
+        replay.reward(bool(good), info) for good, info in zip(success[1:], infos[1:], strict=True)
+    ]
     demo = replay.as_demo(
         "bag",
         states,

@@ -1,8 +1,10 @@
-"""ROS messages: the few types that describe a demonstration, decoded from bytes without running a line of theirs.
+"""ROS messages: the few types that describe a demonstration, decoded from bytes without running a
+line of theirs.
 
-`rosbags` would turn a bag's message definitions into Python code and run it. Here a definition is data: a table of
-fields that a cursor follows. The tables below are the published ones (common_interfaces, ambf_msgs); only of AMBF's
-own types, which changed between its versions, is the bag's text read, and it may name nothing but what stands here.
+`rosbags` would turn a bag's message definitions into Python code and run it. Here a definition is
+data: a table of fields that a cursor follows. The tables below are the published ones
+(common_interfaces, ambf_msgs); only of AMBF's own types, which changed between its versions, is the
+bag's text read, and it may name nothing but what stands here.
 
     layout = layout_of("geometry_msgs/PoseStamped", ros1=True)
     decode(data, layout, ros1=True)["pose.position.x"]
@@ -71,7 +73,9 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
         ),
     }
 )
-"""Message type → its fields, one "type name" a line. ROS 1 headers have a counter before the stamp: `_flatten`."""
+"""Message type → its fields, one "type name" a line. ROS 1 headers have a counter before the stamp:
+`_flatten`.
+"""
 AMBF = ("ambf_msgs/RigidBodyState", "ambf_msgs/ObjectState")
 MAX_FIELDS, MAX_TEXT = 200, 20_000
 """Fields of a definition, and characters of its text, that are read."""
@@ -98,10 +102,13 @@ def layout_of(kind: str, *, ros1: bool, text: str = "") -> Layout:
         text: the definition in the bag; read for AMBF's types alone.
 
     Raises:
-        BadFile: an unknown type, or a definition of AMBF's with fields that are not among the known types.
+        BadFile: an unknown type, or a definition of AMBF's with fields that are not among the known
+            types.
     """
     if kind not in DEFINITIONS:
-        raise BadFile(f"messages of type {clean(kind)} are not read; known are {', '.join(sorted(DEFINITIONS))}.")
+        raise BadFile(
+            f"messages of type {clean(kind)} are not read; known are {', '.join(sorted(DEFINITIONS))}."
+        )
     own = text.split("\n====", 1)[0] if kind in AMBF else ""
     return tuple(_flatten(own if own.strip() else DEFINITIONS[kind], "", ros1))
 
@@ -119,23 +126,31 @@ def _flatten(text: str, prefix: str, ros1: bool) -> list[Field]:
                 fields.append(Field(f"{prefix}{name}.seq", "uint32", False))
             fields += _flatten(DEFINITIONS[plain], f"{prefix}{name}.", ros1)
         else:
-            raise BadFile(f"a message definition has a field of type {clean(kind)}, which is not read.")
+            raise BadFile(
+                f"a message definition has a field of type {clean(kind)}, which is not read."
+            )
     if len(fields) > MAX_FIELDS:
-        raise BadFile(f"a message definition has {len(fields)} fields; above {MAX_FIELDS} are not read.")
+        raise BadFile(
+            f"a message definition has {len(fields)} fields; above {MAX_FIELDS} are not read."
+        )
     return fields
 
 
 def _lines(text: str) -> list[tuple[str, str]]:
     """Return (type, name) of each field of a definition; comments and constants are left out."""
     if len(text) > MAX_TEXT:
-        raise BadFile(f"a message definition has {len(text)} characters; above {MAX_TEXT} are not read.")
+        raise BadFile(
+            f"a message definition has {len(text)} characters; above {MAX_TEXT} are not read."
+        )
     pairs = []
     for line in text.splitlines():
         words = line.split("#", 1)[0].split()
         if not words or any("=" in word for word in words):
             continue
         if len(words) < 2 or not words[1].isidentifier():
-            raise BadFile(f"a message definition has the line '{clean(line.strip())}', which is no 'type name'.")
+            raise BadFile(
+                f"a message definition has the line '{clean(line.strip())}', which is no 'type name'."
+            )
         pairs.append((words[0], words[1]))
     return pairs
 
@@ -171,7 +186,11 @@ class _Cursor:
     def take(self, field: Field) -> Any:
         """Return the next field's value: a number, a text, or a tuple of them."""
         if not field.many:
-            return self._text() if field.kind == STRING else self._numbers(PRIMITIVES[field.kind], 1)[0]
+            return (
+                self._text()
+                if field.kind == STRING
+                else self._numbers(PRIMITIVES[field.kind], 1)[0]
+            )
         count = self._numbers("I", 1)[0]
         if count > len(self._data) - self._place:
             raise ValueError(f"a sequence of {count} in {len(self._data)} bytes")

@@ -1,15 +1,18 @@
-"""Bags as arrays: what ROS 1 and ROS 2 recorded on a few topics, before anything is believed about it.
+"""Bags as arrays: what ROS 1 and ROS 2 recorded on a few topics, before anything is believed about
+it.
 
-    arrays = read(Path("trial.bag"), {"psm2_pose": "/PSM2/measured_cp", "needle": "/needle/measured_cp"})
+    arrays = read(Path("trial.bag"), {"psm2_pose": "/PSM2/measured_cp", "needle":
+    "/needle/measured_cp"})
 
-The library `rosbags` opens the containers: `.bag`, a ROS 2 folder (`metadata.yaml` with sqlite3 or mcap storage), a
-single `.db3` or `.mcap`. Messages are decoded by `ros_messages`, never by code made from the bag's own definitions.
-Runs where `foreign` puts it.
+The library `rosbags` opens the containers: `.bag`, a ROS 2 folder (`metadata.yaml` with sqlite3 or
+mcap storage), a single `.db3` or `.mcap`. Messages are decoded by `ros_messages`, never by code
+made from the bag's own definitions. Runs where `foreign` puts it.
 
-Returned is `topics`, what there is, and per role whose topic is there, of N messages in the order of the bag:
-`<role>.time` when received and `<role>.stamp` in the header (0 where there is none), both (N,) int64 [ns];
-`<role>.value`; `<role>.type` and `<role>.frame`, one text each. Values: poses (N, 7), x y z in the recording's unit
-and a unit quaternion w x y z; joints (N, 6); jaw (N,); label (N,) texts.
+Returned is `topics`, what there is, and per role whose topic is there, of N messages in the order
+of the bag: `<role>.time` when received and `<role>.stamp` in the header (0 where there is none),
+both (N,) int64 [ns]; `<role>.value`; `<role>.type` and `<role>.frame`, one text each. Values: poses
+(N, 7), x y z in the recording's unit and a unit quaternion w x y z; joints (N, 6); jaw (N,); label
+(N,) texts.
 """
 
 import bz2
@@ -32,7 +35,13 @@ from rosbags.rosbag2 import storage_mcap
 
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.demos.imports.rosbag.config import ENDINGS, METADATA, clean, is_bag, listed
-from surgicai_vision.demos.imports.rosbag.messages import AMBF, WHOLE_NUMBERS, Layout, decode, layout_of
+from surgicai_vision.demos.imports.rosbag.messages import (
+    AMBF,
+    WHOLE_NUMBERS,
+    Layout,
+    decode,
+    layout_of,
+)
 
 POSES = (
     "geometry_msgs/PoseStamped",
@@ -50,11 +59,21 @@ KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """What a role's last word means → the message types that can say it."""
-ROLES = ("psm1_pose", "psm1_jaw", "psm1_joints", "psm2_pose", "psm2_jaw", "psm2_joints", "needle", "label")
+ROLES = (
+    "psm1_pose",
+    "psm1_jaw",
+    "psm1_joints",
+    "psm2_pose",
+    "psm2_jaw",
+    "psm2_joints",
+    "needle",
+    "label",
+)
 
 MAX_MESSAGES, MAX_MESSAGE, MAX_CHUNK, MAX_METADATA, MAX_DEPTH = 5_000_000, 2**20, 2**26, 2**18, 20
-"""What is read at most: messages of all roles, bytes of a message, of an unpacked chunk, of the text that describes a
-ROS 2 folder, and how deep its brackets go. ROS packs chunks of 768 KB; one picture makes them larger."""
+"""What is read at most: messages of all roles, bytes of a message, of an unpacked chunk, of the
+text that describes a ROS 2 folder, and how deep its brackets go. ROS packs chunks of 768 KB; one
+image makes them larger."""
 MAX_LISTED = 1000
 """Topics of a bag that are looked at to be named."""
 UNIT = 0.01
@@ -67,7 +86,9 @@ _POSE_FIELDS = (
 )
 
 
-def read(path: Path, topics: Mapping[str, str], needed: Collection[str] = ()) -> dict[str, np.ndarray]:
+def read(
+    path: Path, topics: Mapping[str, str], needed: Collection[str] = ()
+) -> dict[str, np.ndarray]:
     """Read the messages of some topics.
 
     Args:
@@ -76,7 +97,8 @@ def read(path: Path, topics: Mapping[str, str], needed: Collection[str] = ()) ->
         needed: roles whose topic must be there; the others may be missing.
 
     Raises:
-        InputError: a needed topic is not there, or of a type that cannot be its role's; names what there is.
+        InputError: a needed topic is not there, or of a type that cannot be its role's; names what
+            there is.
         BadFile: missing, damaged, malicious, or with numbers that are not finite.
     """
     try:
@@ -85,24 +107,36 @@ def read(path: Path, topics: Mapping[str, str], needed: Collection[str] = ()) ->
             return _read(reader, path, topics, needed)
     except InputError as error:
         raise error if str(path) in str(error) else type(error)(f"{path}: {error}") from None
-    except Exception as error:  # a damaged bag can fail in any way, and ask for any amount of memory
+    except (
+        Exception
+    ) as error:  # a damaged bag can fail in any way, and ask for any amount of memory
         line = clean((str(error).splitlines() or ["it asks for too much"])[0], 160)
         raise BadFile(f"{path} is not a readable bag ({type(error).__name__}: {line}).") from None
 
 
-def _read(reader: Any, path: Path, topics: Mapping[str, str], needed: Collection[str]) -> dict[str, np.ndarray]:
+def _read(
+    reader: Any, path: Path, topics: Mapping[str, str], needed: Collection[str]
+) -> dict[str, np.ndarray]:
     ros1 = isinstance(reader, Reader1)
     there = {connection.topic: _plain(connection.msgtype) for connection in reader.connections}
-    known = [f"{clean(topic)} ({clean(kind)})" for topic, kind in sorted(there.items())[:MAX_LISTED]]
+    known = [
+        f"{clean(topic)} ({clean(kind)})" for topic, kind in sorted(there.items())[:MAX_LISTED]
+    ]
     missing = [role for role in needed if topics[role] not in there]
     if missing:
         wanted_topic = topics[missing[0]]
-        raise InputError(f"{path} has no topic {wanted_topic} ({missing[0]}); it has {listed(known, wanted_topic)}.")
-    wanted = [connection for connection in reader.connections if connection.topic in topics.values()]
+        raise InputError(
+            f"{path} has no topic {wanted_topic} ({missing[0]}); it has {listed(known, wanted_topic)}."
+        )
+    wanted = [
+        connection for connection in reader.connections if connection.topic in topics.values()
+    ]
     layouts = {}
     for connection in wanted:
         _check_kind(connection, topics)
-        layouts[connection.topic] = layout_of(_plain(connection.msgtype), ros1=ros1, text=connection.msgdef.data)
+        layouts[connection.topic] = layout_of(
+            _plain(connection.msgtype), ros1=ros1, text=connection.msgdef.data
+        )
     columns = {role: _Column(role, topic, path) for role, topic in topics.items() if topic in there}
     if wanted:
         _fill(reader, wanted, layouts, columns, ros1)
@@ -116,7 +150,11 @@ def _read(reader: Any, path: Path, topics: Mapping[str, str], needed: Collection
 
 
 def _fill(
-    reader: Any, wanted: list[Any], layouts: Mapping[str, Layout], columns: Mapping[str, "_Column"], ros1: bool
+    reader: Any,
+    wanted: list[Any],
+    layouts: Mapping[str, Layout],
+    columns: Mapping[str, "_Column"],
+    ros1: bool,
 ) -> None:
     """Read the messages of the wanted connections into the columns of their roles."""
     heard: dict[str, list[_Column]] = {}
@@ -124,7 +162,9 @@ def _fill(
         heard.setdefault(column.topic, []).append(column)
     for number, (connection, time, data) in enumerate(reader.messages(wanted)):
         if number >= MAX_MESSAGES or len(data) > MAX_MESSAGE:
-            raise BadFile(f"it has over {MAX_MESSAGES} messages, or one over {MAX_MESSAGE >> 20} MB.")
+            raise BadFile(
+                f"it has over {MAX_MESSAGES} messages, or one over {MAX_MESSAGE >> 20} MB."
+            )
         try:
             message = decode(data, layouts[connection.topic], ros1=ros1)
         except ValueError as error:
@@ -140,7 +180,9 @@ def _check_kind(connection: Any, topics: Mapping[str, str]) -> None:
     for role, topic in topics.items():
         allowed = KINDS[role.rsplit("_", 1)[-1]]
         if topic == connection.topic and kind not in allowed:
-            raise InputError(f"{topic} ({role}) holds {clean(kind)}; {role} is read from {', '.join(allowed)}.")
+            raise InputError(
+                f"{topic} ({role}) holds {clean(kind)}; {role} is read from {', '.join(allowed)}."
+            )
 
 
 class _Column:
@@ -165,12 +207,16 @@ class _Column:
         try:
             value = self._read(message)
         except (IndexError, KeyError):
-            raise InputError(f"{self._where} has messages without the values that {self._name} needs.") from None
+            raise InputError(
+                f"{self._where} has messages without the values that {self._name} needs."
+            ) from None
         self.times.append(time)
         self._stamps.append(message.get("header.sec", 0) * 10**9 + message.get("header.nanosec", 0))
         self._frames.add(str(message.get("header.frame_id", "")))
         if len(self._frames) > 1:
-            raise InputError(f"{self._where} changes its frame: {clean(', '.join(sorted(self._frames)), 160)}.")
+            raise InputError(
+                f"{self._where} changes its frame: {clean(', '.join(sorted(self._frames)), 160)}."
+            )
         if isinstance(value, str):
             self._texts.append(value)
         else:
@@ -183,7 +229,11 @@ class _Column:
         Raises:
             BadFile: numbers that are not finite, rotations that are none.
         """
-        value = np.array(self._texts) if self._texts else np.array(self._numbers).reshape(-1, self._width)
+        value = (
+            np.array(self._texts)
+            if self._texts
+            else np.array(self._numbers).reshape(-1, self._width)
+        )
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             raise BadFile(f"{self._where} holds numbers that are not finite.")
         if self._width == 7:
@@ -203,7 +253,9 @@ class _Column:
 def _pose(message: Mapping[str, Any]) -> list[float]:
     for place, turn in _POSE_FIELDS:
         if f"{place}.x" in message:
-            return [message[f"{place}.{axis}"] for axis in "xyz"] + [message[f"{turn}.{axis}"] for axis in "wxyz"]
+            return [message[f"{place}.{axis}"] for axis in "xyz"] + [
+                message[f"{turn}.{axis}"] for axis in "wxyz"
+            ]
     raise KeyError("pose")
 
 
@@ -218,7 +270,9 @@ def _jaw(message: Mapping[str, Any]) -> list[float]:
     if "data" in message:
         return [float(message["data"])]
     # AMBF's state of a PSM has its two fingers behind the six joints.
-    return [float(message["position"][0] if "position" in message else message["joint_positions"][6])]
+    return [
+        float(message["position"][0] if "position" in message else message["joint_positions"][6])
+    ]
 
 
 _VALUES: Mapping[str, Callable[[Mapping[str, Any]], Any]] = MappingProxyType(
@@ -237,23 +291,31 @@ def _plain(kind: str) -> str:
     return kind.replace("/msg/", "/")
 
 
-# -- before rosbags sees it -------------------------------------------------------------------------------------------
+# -- before rosbags sees it ------------------------------------------------------------------------
 
 
 def _inspect(path: Path) -> None:
-    """Refuse what `rosbags` would follow too far: what is no bag, files of packed files, databases with programs."""
+    """Refuse what `rosbags` would follow too far: what is no bag, files of packed files, databases
+    with programs.
+    """
     if not path.exists():
         raise BadFile(f"Cannot read {path}: no such file.")
     if not is_bag(path):
-        raise BadFile(f"{path} is no bag; a bag is a file ending in {', '.join(ENDINGS)} or a folder with {METADATA}.")
+        raise BadFile(
+            f"{path} is no bag; a bag is a file ending in {', '.join(ENDINGS)} or a folder with {METADATA}."
+        )
     if path.is_dir():
         _inspect_metadata(path / METADATA)
-    for database in [path] if path.suffix == ".db3" else sorted(path.glob("*.db3")) if path.is_dir() else []:
+    for database in (
+        [path] if path.suffix == ".db3" else sorted(path.glob("*.db3")) if path.is_dir() else []
+    ):
         _inspect_database(database)
 
 
 def _inspect_metadata(path: Path) -> None:
-    """Look at a folder's description before `rosbags` parses it: a YAML parser takes seconds over deep brackets."""
+    """Look at a folder's description before `rosbags` parses it: a YAML parser takes seconds over
+    deep brackets.
+    """
     size = path.stat().st_size
     if size > MAX_METADATA:
         raise BadFile(f"{path} has {size} bytes; above {MAX_METADATA} are not read.")
@@ -262,7 +324,9 @@ def _inspect_metadata(path: Path) -> None:
     if "rosbag2_bagfile_information:" not in text or max(opened, default=0) > MAX_DEPTH:
         raise BadFile(f"{path} is no description of a ROS 2 bag.")
     if re.search(r"compression_mode\W+file\b", text, re.IGNORECASE):
-        raise BadFile(f"{path.parent} is packed file by file; unpack it first (zstd -d, then `ros2 bag reindex`).")
+        raise BadFile(
+            f"{path.parent} is packed file by file; unpack it first (zstd -d, then `ros2 bag reindex`)."
+        )
 
 
 def _inspect_database(path: Path) -> None:
@@ -273,8 +337,14 @@ def _inspect_database(path: Path) -> None:
     finally:
         connection.close()
     for kind, name, sql in rows:
-        if kind not in ("table", "index") or "VIRTUAL" in str(sql).upper() or "GENERATED" in str(sql).upper():
-            raise BadFile(f"{path} has a {clean(kind)} '{clean(name, 40)}', which no ROS 2 bag has; it is not read.")
+        if (
+            kind not in ("table", "index")
+            or "VIRTUAL" in str(sql).upper()
+            or "GENERATED" in str(sql).upper()
+        ):
+            raise BadFile(
+                f"{path} has a {clean(kind)} '{clean(name, 40)}', which no ROS 2 bag has; it is not read."
+            )
 
 
 def _bounded(whole: bytes) -> bytes:
@@ -306,5 +376,7 @@ class _Zstd:
 
 # `rosbags` unpacks a chunk however large it becomes; here it stops at `MAX_CHUNK`.
 ros1_reader.decompressors.update({"bz2": _bz2, "lz4": _lz4})
-storage_mcap.DECOMPRESSORS.update({"lz4": lambda data, _: _lz4(data), "zstd": lambda data, _: _zstd(data)})
+storage_mcap.DECOMPRESSORS.update(
+    {"lz4": lambda data, _: _lz4(data), "zstd": lambda data, _: _zstd(data)}
+)
 setattr(ros2_reader, "zstd", _Zstd)  # noqa: B010  # typed as a module

@@ -2,11 +2,11 @@
 
     recording = recording_of(read_foreign(path, "bag", topics=config.all_topics), config)
 
-Each topic has its own times, with jitter and messages lost. Times are those of the headers where there are headers
-(shifted by the median delay, so that they agree with topics that have none), or else those of reception. Positions,
-joints and jaws are interpolated linearly between the two messages around a sample, rotations by slerp; labels and
-commands (a jaw from `servo_jp`) are those last heard. A sample between two messages further apart than `max_gap` is
-not `valid`.
+Each topic has its own times, with jitter and messages lost. Times are those of the headers where
+there are headers (shifted by the median delay, so that they agree with topics that have none), or
+else those of reception. Positions, joints and jaws are interpolated linearly between the two
+messages around a sample, rotations by slerp; labels and commands (a jaw from `servo_jp`) are those
+last heard. A sample between two messages further apart than `max_gap` is not `valid`.
 """
 
 from collections.abc import Mapping
@@ -37,7 +37,9 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm's motion: T_base_tip (N, 4, 4), and one finger's angle (N,) [rad] or None where nothing says it."""
+    """One arm's motion: T_base_tip (N, 4, 4), and one finger's angle (N,) [rad] or None where
+    nothing says it.
+    """
 
     tip: np.ndarray
     jaw: np.ndarray | None
@@ -77,7 +79,8 @@ def recording_of(arrays: Arrays, config: BagConfig, instrument: str) -> Recordin
         instrument: the instrument whose joints these are, where there are joints and no pose.
 
     Raises:
-        InputError: no arm, no time in which all topics overlap, poses in a frame that is not the arm's base.
+        InputError: no arm, no time in which all topics overlap, poses in a frame that is not the
+            arm's base.
     """
     times = _times(arrays, config)
     roles = _roles(arrays, config)
@@ -109,7 +112,9 @@ def recording_of(arrays: Arrays, config: BagConfig, instrument: str) -> Recordin
 
 
 def _told(role: str, config: BagConfig) -> bool:
-    """Say whether a role's topic has commands, which come when something changes and hold until the next."""
+    """Say whether a role's topic has commands, which come when something changes and hold until the
+    next.
+    """
     return role.endswith("_jaw") and config.all_topics[role].rsplit("/", 1)[-1] in COMMANDS
 
 
@@ -119,23 +124,33 @@ def _last(track: "Track", grid: np.ndarray) -> np.ndarray:
     return values[np.maximum(np.searchsorted(times, grid, side="right") - 1, 0)]
 
 
-def _jaw(role: str, tracks: Mapping[str, "Track"], grid: np.ndarray, config: BagConfig) -> np.ndarray | None:
+def _jaw(
+    role: str, tracks: Mapping[str, "Track"], grid: np.ndarray, config: BagConfig
+) -> np.ndarray | None:
     """Return one finger's angle (N,) [rad]; None where it is not on record."""
     if role not in tracks:
         return None
-    return config.jaw * (_last(tracks[role], grid) if _told(role, config) else np.interp(grid, *tracks[role]))
+    return config.jaw * (
+        _last(tracks[role], grid) if _told(role, config) else np.interp(grid, *tracks[role])
+    )
 
 
 def _roles(arrays: Arrays, config: BagConfig) -> list[str]:
-    """Return the roles that are interpolated: of each arm its pose or else its joints, its jaw, and the needle."""
+    """Return the roles that are interpolated: of each arm its pose or else its joints, its jaw, and
+    the needle.
+    """
     roles: list[str] = []
     for arm in names.ARMS:
-        placed = [role for role in (f"{arm}_pose", f"{arm}_joints") if f"{role}.value" in arrays][:1]
+        placed = [role for role in (f"{arm}_pose", f"{arm}_joints") if f"{role}.value" in arrays][
+            :1
+        ]
         roles += placed + [role for role in (f"{arm}_jaw",) if placed and f"{role}.value" in arrays]
     if not roles:
         wanted = ", ".join(config.all_topics[f"{arm}_pose"] for arm in names.ARMS)
         there = listed(arrays["topics"].tolist(), wanted)
-        raise InputError(f"The recording has the pose of no arm: none of {wanted}. The topics are {there}.")
+        raise InputError(
+            f"The recording has the pose of no arm: none of {wanted}. The topics are {there}."
+        )
     return [*roles, "needle"] if "needle.value" in arrays else roles
 
 
@@ -154,7 +169,9 @@ def _times(arrays: Arrays, config: BagConfig) -> dict[str, np.ndarray]:
 
 
 def _distinct(times: np.ndarray, values: np.ndarray, begin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return times since `begin` [ns] in order and once each, with their values; of a repeated time the last."""
+    """Return times since `begin` [ns] in order and once each, with their values; of a repeated time
+    the last.
+    """
     order = np.argsort(times, kind="stable")
     since, values = (times[order] - begin).astype(np.float64), values[order]
     last = np.append(np.diff(since) > 0, True)
@@ -175,20 +192,26 @@ def resampled(times: np.ndarray, poses: np.ndarray, grid: np.ndarray) -> np.ndar
         found[:, axis, 3] = np.interp(grid, times, poses[:, axis])
     turns = Rotation.from_quat(poses[:, 3:], scalar_first=True)
     inside = np.clip(grid, times[0], times[-1])
-    found[:, :3, :3] = (Slerp(times, turns)(inside) if len(times) > 1 else turns[[0] * len(grid)]).as_matrix()
+    found[:, :3, :3] = (
+        Slerp(times, turns)(inside) if len(times) > 1 else turns[[0] * len(grid)]
+    ).as_matrix()
     return found
 
 
 def as_matrix(pose: tuple[float, ...]) -> np.ndarray:
     """Return x y z [m] and a quaternion w x y z as a pose (4, 4); the identity of nothing."""
-    return resampled(np.zeros(1), np.array([pose], dtype=float), np.zeros(1))[0] if pose else np.eye(4)
+    return (
+        resampled(np.zeros(1), np.array([pose], dtype=float), np.zeros(1))[0] if pose else np.eye(4)
+    )
 
 
 Track = tuple[np.ndarray, np.ndarray]
 """Times [ns] and values."""
 
 
-def _tip(role: str, track: Track, grid: np.ndarray, arrays: Arrays, config: BagConfig, instrument: str) -> np.ndarray:
+def _tip(
+    role: str, track: Track, grid: np.ndarray, arrays: Arrays, config: BagConfig, instrument: str
+) -> np.ndarray:
     """Return an arm's T_base_tip (N, 4, 4) from its poses or its joints."""
     arm, kind = role.split("_")
     times, values = track
@@ -205,11 +228,19 @@ def _tip(role: str, track: Track, grid: np.ndarray, arrays: Arrays, config: BagC
             f"(dVRK: /{arm.upper()}/local/measured_cp), or give the frame's place in the base as frames: {arm}."
         )
     scaled = values * np.array([config.length_scale] * 3 + [1.0] * 4)
-    return as_matrix(placed) @ resampled(times, scaled, grid) @ np.linalg.inv(as_matrix(config.frames.tip))
+    return (
+        as_matrix(placed)
+        @ resampled(times, scaled, grid)
+        @ np.linalg.inv(as_matrix(config.frames.tip))
+    )
 
 
 def _needle(track: Track, grid: np.ndarray, arrays: Arrays, config: BagConfig) -> np.ndarray:
     """Return T_world_needle (N, 4, 4)."""
     scale = config.needle_scale or (AMBF_UNIT if str(arrays["needle.type"]) in AMBF else 1.0)
     poses = resampled(track[0], track[1] * np.array([scale] * 3 + [1.0] * 4), grid)
-    return as_matrix(config.frames.needle) @ poses @ np.linalg.inv(as_matrix(config.frames.needle_offset))
+    return (
+        as_matrix(config.frames.needle)
+        @ poses
+        @ np.linalg.inv(as_matrix(config.frames.needle_offset))
+    )

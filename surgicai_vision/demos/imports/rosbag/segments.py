@@ -10,10 +10,11 @@ By labels: the longest runs of one subtask. By events, in the order of the proce
     handoff  until PSM1 holds the needle
     pullout  until the needle's last move in PSM1's jaws, after it has left the exit
 
-An arm holds the needle when its jaw is closed (0.2 rad, where the surgical robotics challenge grasps) with the needle
-within reach of its pads, for 0.1 s. Holes are passed by the very test of the envs (`envs.passage`). A recording that
-starts late starts with the subtask that is then under way, and a needle that is held as near to the entry as an
-insertion starts (5.5 mm, 12°) is inserted, not placed.
+An arm holds the needle when its jaw is closed (0.2 rad, where the surgical robotics challenge
+grasps) with the needle within reach of its pads, for 0.1 s. Holes are passed by the very test of
+the envs (`envs.passage`). A recording that starts late starts with the subtask that is then under
+way, and a needle that is held as near to the entry as an insertion starts (5.5 mm, 12°) is
+inserted, not placed.
 """
 
 import itertools
@@ -39,8 +40,8 @@ from surgicai_vision.scene.kinematics import Pose
 from surgicai_vision.scene.rotations import geodesic_angle
 
 HOLD_JAW, HOLD_REACH, STILL = 0.2, 0.003, 0.02
-"""An arm holds the needle with its finger below this angle [rad], the needle this near its grasp point [m], and the
-finger not closing by more than this in the next 0.2 s [rad]."""
+"""An arm holds the needle with its finger below this angle [rad], the needle this near its grasp
+point [m], and the finger not closing by more than this in the next 0.2 s [rad]."""
 SUSTAINED = 5
 """Samples an event must last: 0.1 s."""
 SHORTEST = 10
@@ -50,7 +51,9 @@ ARRIVED, ARRIVED_TURN = 0.0005, np.radians(2.0)
 SLOW, SLOW_TURN, SLOW_JAW = 0.2e-3, np.radians(0.1), np.radians(1.0)
 """Below these speeds an arm rests [m/s, rad/s]; the first two are the paper's."""
 WINDOW = 5
-"""Speeds are taken over this many samples to either side, 0.2 s in all: less would be the sensors' noise."""
+"""Speeds are taken over this many samples to either side, 0.2 s in all: less would be the sensors'
+noise.
+"""
 DRIFT, DRIFT_TURN = 0.25e-3, np.radians(1.0)
 """A resting arm's sample is kept once it has crept this far from the last one kept: half a step."""
 
@@ -64,36 +67,51 @@ class Segment:
     stop: int
 
 
-def segments(recording: Recording, pair: HolePair, config: BagConfig, task: str | None) -> list[Segment]:
+def segments(
+    recording: Recording, pair: HolePair, config: BagConfig, task: str | None
+) -> list[Segment]:
     """Return the segments of a recording, or those of one task, in order.
 
     Args:
         recording: the recording.
         pair: the holes the needle goes through.
         config: how to segment it.
-        task: the subtask that is wanted, and what a recording without labels and needle shows; None for all.
+        task: the subtask that is wanted, and what a recording without labels and needle shows; None
+            for all.
 
     Raises:
         InputError: nothing to segment by, an unknown label, or nothing found.
     """
     way = config.segmentation
     if way == "auto":
-        way = "labels" if recording.label is not None else "events" if recording.needle is not None else NOTHING
+        way = (
+            "labels"
+            if recording.label is not None
+            else "events"
+            if recording.needle is not None
+            else NOTHING
+        )
     if way == NOTHING:
         if task is None:
-            raise InputError("The recording has no labels and no needle to segment it by: say what it shows (--task).")
+            raise InputError(
+                "The recording has no labels and no needle to segment it by: say what it shows (--task)."
+            )
         return [Segment(task, 0, len(recording) - 1)]
     found = _by_labels(recording, config) if way == "labels" else _by_events(recording, pair)
     wanted = [segment for segment in found if task in (None, segment.task)]
     if not wanted:
         listed = ", ".join(sorted({segment.task for segment in found})) or "none"
-        raise InputError(f"The recording shows no {task or 'subtask'}; segmented by {way} it shows {listed}.")
+        raise InputError(
+            f"The recording shows no {task or 'subtask'}; segmented by {way} it shows {listed}."
+        )
     return wanted
 
 
 def _by_labels(recording: Recording, config: BagConfig) -> list[Segment]:
     if recording.label is None:
-        raise InputError(f"The recording has no labels; wanted is the topic {config.all_topics['label']}.")
+        raise InputError(
+            f"The recording has no labels; wanted is the topic {config.all_topics['label']}."
+        )
     meaning = {label: config.subtask_of(str(label)) for label in np.unique(recording.label)}
     subtasks = np.array([meaning[label] for label in recording.label])
     edges = [0, *(np.flatnonzero(subtasks[1:] != subtasks[:-1]) + 1), len(subtasks)]
@@ -105,12 +123,14 @@ def _by_labels(recording: Recording, config: BagConfig) -> list[Segment]:
     return [run for run in runs if run.task != NOTHING and run.stop - run.start >= SHORTEST]
 
 
-# -- events -----------------------------------------------------------------------------------------------------------
+# -- events ----------------------------------------------------------------------------------------
 
 
 def _by_events(recording: Recording, pair: HolePair) -> list[Segment]:
     if recording.needle is None:
-        raise InputError("Contact and hole events need the needle's pose; the recording has none. Segment by labels.")
+        raise InputError(
+            "Contact and hole events need the needle's pose; the recording has none. Segment by labels."
+        )
     lying, last = recording.needle, len(recording) - 1
     passed = holes_passed(lying, pair)
     inside = (passed == 1.0) | (passed == 2.0)
@@ -120,7 +140,11 @@ def _by_events(recording: Recording, pair: HolePair) -> list[Segment]:
     while start < last:
         taken = _next(second | inside, start)
         entered = _next(inside, taken)
-        placed = taken if entered > taken and inside[entered] and _near_entry(lying[taken], pair) else entered
+        placed = (
+            taken
+            if entered > taken and inside[entered] and _near_entry(lying[taken], pair)
+            else entered
+        )
         given = _next(first, _next(passed >= 2.0, placed))
         there = _arrival(lying, placed, given) if first[given] else given
         end = _release(first, lying, given) if first[given] else given
@@ -128,7 +152,9 @@ def _by_events(recording: Recording, pair: HolePair) -> list[Segment]:
         happened = [second[taken] or inside[taken], True, True, first[given], True]
         found += [
             Segment(task, begin, stop)
-            for task, begin, stop, done in zip(names.SUBTASKS, cuts[:-1], cuts[1:], happened, strict=True)
+            for task, begin, stop, done in zip(
+                names.SUBTASKS, cuts[:-1], cuts[1:], happened, strict=True
+            )
             if done and stop - begin >= SHORTEST
         ]
         start = _next(~first, max(end, start + 1))
@@ -150,20 +176,29 @@ def holds(recording: Recording, arm: str) -> np.ndarray:
 
 
 def held(arm: str, tip: np.ndarray, jaw: np.ndarray, lying: np.ndarray) -> np.ndarray:
-    """Say whether an arm holds the needle: T_base_tip and T_world_needle (N, 4, 4), jaw (N,) [rad] → (N,) bool."""
+    """Say whether an arm holds the needle: T_base_tip and T_world_needle (N, 4, 4), jaw (N,) [rad]
+    → (N,) bool.
+    """
     tips = kinematics.base_in_world(arm) @ tip
     grasps = tips[:, :3, 3] + GRASP_DEPTH * tips[:, :3, 2]
-    # In the needle's frame, clamped to its arc: the distance from a point to the nearest point of the needle.
+    # In the needle's frame, clamped to its arc: the distance from a point to the nearest point of
+    # the needle.
     x, y, z = np.einsum("nji,nj->in", lying[:, :3, :3], grasps - lying[:, :3, 3])
     angle = np.clip(np.arctan2(y, -x), 0.0, needle.TIP_ANGLE)
-    away = np.sqrt((x + needle.RADIUS * np.cos(angle)) ** 2 + (y - needle.RADIUS * np.sin(angle)) ** 2 + z**2)
+    away = np.sqrt(
+        (x + needle.RADIUS * np.cos(angle)) ** 2 + (y - needle.RADIUS * np.sin(angle)) ** 2 + z**2
+    )
     # A jaw that goes on closing has not closed on anything yet.
-    later = np.stack([np.pad(jaw, (0, shift), mode="edge")[shift:] for shift in range(2 * WINDOW)]).min(axis=0)
+    later = np.stack(
+        [np.pad(jaw, (0, shift), mode="edge")[shift:] for shift in range(2 * WINDOW)]
+    ).min(axis=0)
     return sustained((jaw < HOLD_JAW) & (jaw <= later + STILL) & (away < HOLD_REACH))
 
 
 def sustained(event: np.ndarray) -> np.ndarray:
-    """Return an event (N,) bool without its runs shorter than `SUSTAINED`, save one that the recording cuts short."""
+    """Return an event (N,) bool without its runs shorter than `SUSTAINED`, save one that the
+    recording cuts short.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[0], event.astype(int), [0]])))
     kept = np.zeros(len(event), bool)
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
@@ -221,7 +256,10 @@ def _arrival(lying: np.ndarray, start: int, stop: int) -> int:
     """Return the sample in [start, stop] from which the needle stays where it is at `stop`."""
     there = lying[stop]
     away = np.linalg.norm(lying[start : stop + 1, :3, 3] - there[:3, 3], axis=1) > ARRIVED
-    turn = Rotation.from_matrix(lying[start : stop + 1, :3, :3]) * Rotation.from_matrix(there[:3, :3]).inv()
+    turn = (
+        Rotation.from_matrix(lying[start : stop + 1, :3, :3])
+        * Rotation.from_matrix(there[:3, :3]).inv()
+    )
     far = np.flatnonzero(away | (turn.magnitude() > ARRIVED_TURN))
     return start + int(far[-1]) + 1 if len(far) else start
 
@@ -233,7 +271,7 @@ def _release(first: np.ndarray, lying: np.ndarray, given: int) -> int:
     return max(_arrival(lying, given, end), given)
 
 
-# -- pauses -----------------------------------------------------------------------------------------------------------
+# -- pauses ----------------------------------------------------------------------------------------
 
 
 def moving(tip: np.ndarray, jaw: np.ndarray) -> np.ndarray:
@@ -250,7 +288,11 @@ def moving(tip: np.ndarray, jaw: np.ndarray) -> np.ndarray:
     turns = Rotation.from_matrix(tip[:, :3, :3])
     speed = np.linalg.norm(tip[after, :3, 3] - tip[before, :3, 3], axis=1) / time
     turning = (turns[after] * turns[before].inv()).magnitude() / time
-    active = (speed >= SLOW) | (turning >= SLOW_TURN) | (np.abs(jaw[after] - jaw[before]) / time >= SLOW_JAW)
+    active = (
+        (speed >= SLOW)
+        | (turning >= SLOW_TURN)
+        | (np.abs(jaw[after] - jaw[before]) / time >= SLOW_JAW)
+    )
     kept = [0]
     for index in range(1, count):
         last = tip[kept[-1]]

@@ -24,10 +24,12 @@ from surgicai_vision.scene.holes import PAIRS
 from surgicai_vision.scene.rotations import matrix_to_rpy
 
 CLOSED = ("place", "insert", "pullout")
-"""Subtasks whose arm holds the needle from beginning to end: without a jaw on record it is closed."""
+"""Subtasks whose arm holds the needle from beginning to end: without a jaw on record it is
+closed.
+"""
 SLACK = 0.005
-"""Furthest an inferred needle may lie outside the jaws that hold it [m]: the paper lets place and insert end that far
-from their goals."""
+"""Furthest an inferred needle may lie outside the jaws that hold it [m]: the paper lets place and
+insert end that far from their goals."""
 START_JAW = kinematics.PSM1_START[6]
 """Jaw of an arm that does not hold the needle and whose jaw is not on record [rad]."""
 
@@ -63,7 +65,8 @@ class Piece:
 def take_apart(
     bag: Path, task: str | None, config: BagConfig, base: TaskConfig
 ) -> tuple[list[Piece], list[dict[str, Any]]]:
-    """Return the pieces of a bag, and the parts that cannot be used, {"bag", "task", "from", "to", "reason"}.
+    """Return the pieces of a bag, and the parts that cannot be used, {"bag", "task", "from", "to",
+    "reason"}.
 
     Args:
         bag: the bag.
@@ -95,18 +98,31 @@ def take_apart(
 
 
 def _row(bag: str, task: str, begin: float, end: float, reason: str) -> dict[str, Any]:
-    return {"bag": bag, "task": task, "from": round(begin, 2), "to": round(end, 2), "reason": reason}
+    return {
+        "bag": bag,
+        "task": task,
+        "from": round(begin, 2),
+        "to": round(end, 2),
+        "reason": reason,
+    }
 
 
 def _track(
-    recording: Recording, passed: np.ndarray | None, segment: Segment, config: BagConfig, base: TaskConfig
+    recording: Recording,
+    passed: np.ndarray | None,
+    segment: Segment,
+    config: BagConfig,
+    base: TaskConfig,
 ) -> tuple[Track, int]:
     """Return a segment's track without its pauses, and how many samples were left out."""
     whole = slice(segment.start, segment.stop + 1)
     if not recording.valid[whole].all():
         raise Unusable(f"a topic is silent for over {config.max_gap:g} s")
     active = names.ACTIVE_ARM[segment.task]
-    arms = {arm: (motion.tip, _jaw(recording, arm, segment.task, config)) for arm, motion in recording.arms.items()}
+    arms = {
+        arm: (motion.tip, _jaw(recording, arm, segment.task, config))
+        for arm, motion in recording.arms.items()
+    }
     if active not in arms:
         wanted = config.all_topics[f"{active}_pose"]
         raise InputError(
@@ -114,12 +130,18 @@ def _track(
             f"The topics are {listed(recording.topics, wanted)}."
         )
     tip, jaw = arms[active]
-    kept = moving(tip[whole], jaw[whole]) if config.drop_pauses else np.arange(segment.stop - segment.start + 1)
+    kept = (
+        moving(tip[whole], jaw[whole])
+        if config.drop_pauses
+        else np.arange(segment.stop - segment.start + 1)
+    )
     index = segment.start + kept
     if len(index) < 3:
         raise Unusable("the arm does not move")
     lying = (
-        _inferred(tip[index], jaw[index], segment.task, base) if recording.needle is None else recording.needle[index]
+        _inferred(tip[index], jaw[index], segment.task, base)
+        if recording.needle is None
+        else recording.needle[index]
     )
     return Track(
         {arm: (poses[index], angles[index]) for arm, (poses, angles) in arms.items()},
@@ -146,15 +168,21 @@ def _jaw(recording: Recording, arm: str, task: str, config: BagConfig) -> np.nda
 
 
 def _grasp_angle(arm: str, tip: np.ndarray, lying: np.ndarray) -> float:
-    """Return the needle's point that lies nearest to an arm's jaws [rad]: the grasp that was shown."""
+    """Return the needle's point that lies nearest to an arm's jaws [rad]: the grasp that was
+    shown.
+    """
     x, y, _ = (np.linalg.inv(lying) @ kinematics.base_in_world(arm) @ tip)[:3, 3]
     return float(np.clip(np.arctan2(y, -x), 0.0, needle.TIP_ANGLE))
 
 
 def _inferred(tip: np.ndarray, jaw: np.ndarray, task: str, base: TaskConfig) -> np.ndarray:
-    """Return T_world_needle (T + 1, 4, 4) of a piece that has no needle: where the task's definition puts it."""
+    """Return T_world_needle (T + 1, 4, 4) of a piece that has no needle: where the task's
+    definition puts it.
+    """
     if (base.scene.layout, base.scene.hole_pair) != ("simple", 1):
-        raise InputError("A bag without the needle's pose can be replayed at hole pair 1 of layout simple alone.")
+        raise InputError(
+            "A bag without the needle's pose can be replayed at hole pair 1 of layout simple alone."
+        )
     rpy = np.unwrap([matrix_to_rpy(pose[:3, :3]) for pose in tip], axis=0)
     poses = np.column_stack([tip[:, :3, 3], rpy, jaw])
     nothing = np.zeros(len(poses) - 1)

@@ -1,4 +1,4 @@
-"""Pictures and encoders as LeRobot sees them: float tensors in, frozen features out."""
+"""Images and encoders as LeRobot sees them: float tensors in, frozen features out."""
 
 import functools
 import hashlib
@@ -22,9 +22,15 @@ def load_encoder(name: str, weights: str | None, pool: str) -> Any:
 
 
 def identity(encoder: Any) -> str:
-    """sha256 (hex) over an encoder's weights, preprocessing and pool: what a policy trained on it depends on."""
+    """sha256 (hex) over an encoder's weights, preprocessing and pool: what a policy trained on it
+    depends on.
+    """
     card = to_mapping(encoder.card)
-    plain = {"weights": encoder.weights_sha256, "pool": encoder.pool, **{key: card[key] for key in SEEN}}
+    plain = {
+        "weights": encoder.weights_sha256,
+        "pool": encoder.pool,
+        **{key: card[key] for key in SEEN},
+    }
     return digest(plain)
 
 
@@ -42,30 +48,36 @@ def check_identity(encoder: Any, weights_sha256: str, wanted: str, where: str) -
         )
 
 
-def as_uint8(pictures: torch.Tensor) -> np.ndarray:
-    """Return (B, 3, H, W) float pictures in [0, 1] as (B, H, W, 3) uint8; exact for pictures that were uint8."""
-    rounded = (pictures.detach().float() * 255).round().clamp(0, 255).to(torch.uint8)
+def as_uint8(images: torch.Tensor) -> np.ndarray:
+    """Return (B, 3, H, W) float images in [0, 1] as (B, H, W, 3) uint8; exact for images that were
+    uint8.
+    """
+    rounded = (images.detach().float() * 255).round().clamp(0, 255).to(torch.uint8)
     return rounded.permute(0, 2, 3, 1).contiguous().cpu().numpy()
 
 
 @final
 class Remembered:
-    """An encoder that encodes a picture once: LeRobot shows every picture anew in each epoch.
+    """An encoder that encodes an image once: LeRobot shows every image anew in each epoch.
 
-    A picture is known by the hash of its bytes, so another dataset or an augmented picture is never mistaken for it.
-    Features are kept as the float16 values they are (`encoders.base`), nothing is rounded.
+    An image is known by the hash of its bytes, so another dataset or an augmented image is never
+    mistaken for it. Features are kept as the float16 values they are (`encoders.base`), nothing is
+    rounded.
 
     Args:
-        encoder: (B, H, W, 3) uint8 → (B, dim) float32, the same for a picture in any batch.
-        limit: bytes of features to keep; pictures beyond it are encoded each time.
+        encoder: (B, H, W, 3) uint8 → (B, dim) float32, the same for an image in any batch.
+        limit: bytes of features to keep; images beyond it are encoded each time.
     """
 
     def __init__(self, encoder: Any, limit: int = 2 << 30):
         self._encoder, self._rows, self._left = encoder, dict[bytes, np.ndarray](), limit
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
-        """Return the features (B, dim) float32 of pictures (B, H, W, 3) uint8."""
-        keys = [hashlib.blake2b(np.ascontiguousarray(frame).data, digest_size=16).digest() for frame in frames]
+        """Return the features (B, dim) float32 of images (B, H, W, 3) uint8."""
+        keys = [
+            hashlib.blake2b(np.ascontiguousarray(frame).data, digest_size=16).digest()
+            for frame in frames
+        ]
         new = {key: at for at, key in enumerate(keys) if key not in self._rows}
         fresh: dict[bytes, np.ndarray] = {}
         if new:
@@ -74,9 +86,13 @@ class Remembered:
             for key, row in fresh.items():
                 if self._left >= row.nbytes:
                     self._rows[key], self._left = row.copy(), self._left - row.nbytes
-        return np.stack([fresh[key] if key in fresh else self._rows[key] for key in keys]).astype(np.float32)
+        return np.stack([fresh[key] if key in fresh else self._rows[key] for key in keys]).astype(
+            np.float32
+        )
 
 
 def encode(encoder: Any, batch: Mapping[str, torch.Tensor], views: Sequence[str]) -> np.ndarray:
     """Return the features of the views side by side, (B, views × dim) float32."""
-    return np.concatenate([encoder(as_uint8(batch[names.image_key(view)])) for view in views], axis=1)
+    return np.concatenate(
+        [encoder(as_uint8(batch[names.image_key(view)])) for view in views], axis=1
+    )
