@@ -25,7 +25,7 @@ from pathlib import Path
 from kill import RENDER, committed, finish, make_demos, start
 
 LOOPBACK = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
-"""As in `surgicai_vision.core.executor.ray_engine`; read when Ray is imported."""
+"""As in `surgicai_vision.core.executor.ray`; read when Ray is imported."""
 
 
 class TwoNodes:

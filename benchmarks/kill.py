@@ -27,10 +27,10 @@ RENDER = """
 import json, sys
 from pathlib import Path
 from surgicai_vision.dataset import open_dataset, render_demos
-from surgicai_vision.core.executor import Engine
+from surgicai_vision.core.executor import open_engine
 if __name__ == "__main__":
     demos, out, workers, size, address = sys.argv[1:]
-    engine = Engine("ray", address) if address else Engine()
+    engine = open_engine(f"ray,address={address}" if address else "local")
     options = {"size": int(size), "depth": True, "workers": int(workers), "engine": engine}
     summary = render_demos(Path(demos), Path(out), **options)
     print(json.dumps([summary.digest, open_dataset(Path(out)).fingerprint, summary.frames, summary.episodes]))

@@ -152,7 +152,7 @@ def main() -> int:
     good = good and row["local"]["good"] and not events
     if not arguments.skip_ray:
         with two_nodes() as cluster:
-            ray = Sweep(grid, root / "ray", "--executor", "ray", "--address", cluster.address)
+            ray = Sweep(grid, root / "ray", "--executor", f"ray,address={cluster.address}")
             kills = [functools.partial(cluster.kill_worker, moments)] * arguments.kills
             events = spread(
                 [*kills, cluster.lose_node, ray.kill_driver], arguments.cells - 1, moments

@@ -6,7 +6,6 @@ after a killed process, so the bytes are fetched here: into `<filename>.<identit
 ranges, renamed when whole.
 """
 
-import fcntl
 import os
 import re
 from collections.abc import Iterator
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from surgicai_vision.core.errors import BadFile, SurgicaiError
-from surgicai_vision.core.files import sha256_file
+from surgicai_vision.core.files import locked, sha256_file
 
 TIMEOUT = 20.0  # without a byte [s]
 FULL_REVISION = re.compile(r"[0-9a-f]{40}")
@@ -53,8 +52,7 @@ def fetch(source: str, revision: str, filename: str, sha256: str | None, folder:
     wanted = sha256 or (identity if len(identity) == 64 else None)
     folder.mkdir(parents=True, exist_ok=True)
     partial = folder / f"{filename}.{re.sub(r'[^0-9a-zA-Z]', '', identity)[:64]}.partial"
-    with open(partial, "ab") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # a second process waits, and then finds the file
+    with locked(folder / f".{filename}.lock"), open(partial, "ab") as file:
         if target.is_file():
             return target
         _complete(url, file, about.size, filename)

@@ -20,6 +20,8 @@ from types import MappingProxyType
 from typing import Any, Literal
 from urllib.parse import unquote, urlparse
 
+from surgicai_vision.core.processes import OFFLINE, start_module
+
 DISTRIBUTION = "surgicai-vision"
 PACKAGES = ("surgicai_vision", "encoders", "policies")
 GL_LINE = "sudo apt-get install --yes --no-install-recommends libegl1 libgl1"
@@ -209,17 +211,8 @@ def check_disk(folder: Path) -> Check:
 
 def start_probe(name: str) -> subprocess.Popen[str]:
     """Start a probe in its own process, off the network and with a headless GL."""
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1"}
-    environment.setdefault("MUJOCO_GL", "egl")
-    command = [sys.executable, "-m", "surgicai_vision.commands.doctor_checks", name]
-    return subprocess.Popen(
-        command,
-        env=environment,
-        text=True,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    variables = {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl"), **OFFLINE}
+    return start_module("surgicai_vision.commands.doctor_checks", name, variables=variables)
 
 
 def finish_probe(process: subprocess.Popen[str]) -> Finding:

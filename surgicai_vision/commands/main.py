@@ -1,14 +1,15 @@
 """The command line: `surgicai-vision VERB [options]`.
 
-Exit codes: 0 done, 1 the work failed or was interrupted, 2 wrong input. Errors made on purpose
-(`SurgicaiError`) are one line without a traceback. A verb's module, and what it needs, is imported
-only when that verb runs, so `--help` is instant.
+Exit codes: 0 done, 1 the work failed or was interrupted, 2 wrong input, 143 ended by SIGTERM.
+Errors made on purpose (`SurgicaiError`) are one line without a traceback. A verb's module, and what
+it needs, is imported only when that verb runs, so `--help` is instant.
 """
 
 import argparse
 import importlib
 import json
 import os
+import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,7 @@ from surgicai_vision.commands import VERBS, module_name
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import add_arguments, build, nearest_option
 from surgicai_vision.core.errors import InputError, SurgicaiError, UnknownName
+from surgicai_vision.core.processes import Terminated, raise_on_terminate
 
 PROGRAM = "surgicai-vision"
 TITLE = (
@@ -25,6 +27,8 @@ TITLE = (
     "scene → env → demos → dataset → features → policy → evaluation → report"
 )
 INTERRUPTED = "interrupted; run the same command again to continue"
+TERMINATED = 128 + signal.SIGTERM
+"""Exit code after SIGTERM, as a shell gives it."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -38,14 +42,15 @@ def main(argv: list[str] | None = None) -> int:
         os.environ.setdefault(
             name, "1"
         )  # the bars are ours; nothing of a run is reported to anyone
+    raise_on_terminate()
     try:
         return _dispatch(arguments)
     except SurgicaiError as error:
         print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return error.exit_code
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         print(f"{PROGRAM}: {INTERRUPTED}", file=sys.stderr)
-        return 1
+        return TERMINATED if isinstance(interrupt, Terminated) else 1
     except BrokenPipeError:
         os.dup2(
             os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()

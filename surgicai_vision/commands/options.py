@@ -140,12 +140,12 @@ def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
 
 
 def executor_option() -> Any:
-    """Declare `executor`: what runs a verb's jobs."""
+    """Declare `executor`: what runs a verb's jobs; `executor.open_engine` reads it."""
     return option(
         "local",
-        "what runs the processes: local, or ray",
-        check=one_of("executor", ("local", "ray")),
-        metavar="NAME",
+        "what runs the jobs: local, ray or slurm, with its options, such as ray,address=HOST:PORT or "
+        "slurm,partition=cpu,minutes=60",
+        metavar="NAME[,KEY=VALUE]",
     )
 
 
@@ -156,16 +156,6 @@ def weights_option() -> Any:
         "file with the encoder's pretrained weights; NAME=FILE for the encoder NAME alone, once for each encoder",
         metavar="[NAME=]FILE",
         repeat=True,
-    )
-
-
-def address_option() -> Any:
-    """Declare `address`: where `executor` finds a cluster."""
-    return option(
-        None,
-        "with --executor ray, a running cluster",
-        metavar="HOST:PORT",
-        default_text="one on this machine alone",
     )
 
 

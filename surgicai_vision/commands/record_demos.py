@@ -9,7 +9,6 @@ from typing import Any
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    address_option,
     config_only,
     executor_option,
     not_negative,
@@ -77,7 +76,6 @@ class Options:
     )
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     executor: str = executor_option()
-    address: str | None = address_option()
     out: str | None = option(
         None, "folder to make or to continue", metavar="DIR", default_text="outputs/demos/<task>"
     )
@@ -86,7 +84,7 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Record and say where the demonstrations are."""
-    from surgicai_vision.core.executor import Engine
+    from surgicai_vision.core.executor import open_engine
     from surgicai_vision.demos.record import record
     from surgicai_vision.demos.rollout import Disturbance
     from surgicai_vision.demos.store import MARKER, read_marker
@@ -96,7 +94,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         raise InputError(
             f"--noise-from is {options.noise_from:g}; it must be at most --noise, {options.noise:g}."
         )
-    engine = Engine(options.executor, options.address)
+    engine = open_engine(options.executor)
     config = task_config(options.task, options.env)
     out = Path(options.out) if options.out else folders.demos_folder(options.task)
     folders.check_folder(out, "demos.json")

@@ -8,7 +8,6 @@ from typing import Any
 from surgicai_vision.commands import folders, record_demos
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    address_option,
     config_only,
     executor_option,
     image_size,
@@ -75,7 +74,6 @@ class Options:
     )
     workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
     executor: str = executor_option()
-    address: str | None = address_option()
     out: str | None = option(
         None, "dataset to make", metavar="DIR", default_text="outputs/datasets/<task>"
     )
@@ -84,10 +82,10 @@ class Options:
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Record where that is asked for, render, and say where the dataset is."""
-    from surgicai_vision.core.executor import Engine
+    from surgicai_vision.core.executor import open_engine
     from surgicai_vision.dataset import render_demos
 
-    engine = Engine(options.executor, options.address)
+    engine = open_engine(options.executor)
     if options.demos and (options.task or options.episodes or options.env):
         raise InputError(
             "--task, --episodes and env say what to record; with --demos DIR nothing is recorded."
@@ -140,7 +138,6 @@ def _record(options: Options, task: str, console: Console) -> Path:
         seed=options.seed,
         workers=options.workers,
         executor=options.executor,
-        address=options.address,
         env=options.env,
     )
     return Path(record_demos.run(asked, console)["demos"])

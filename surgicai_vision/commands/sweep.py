@@ -7,13 +7,7 @@ from typing import Any
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import (
-    address_option,
-    executor_option,
-    option,
-    positive,
-    read_yaml,
-)
+from surgicai_vision.commands.options import executor_option, option, positive, read_yaml
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, UnknownName
 from surgicai_vision.core.files import configs_folder
@@ -57,19 +51,18 @@ class Options:
         3, "how often a cell is started whose process is killed", check=positive, metavar="N"
     )
     executor: str = executor_option()
-    address: str | None = address_option()
 
 
 def run(options: Options, console: Console) -> dict[str, Any]:
     """Run the sweep, or list its cells."""
-    from surgicai_vision.core.executor import Engine
+    from surgicai_vision.core.executor import open_engine
     from surgicai_vision.experiments.sweep import read_choice, run_sweep
 
     path = grid_file(options.grid)
     grid = read_grid(path)
     choice = read_choice(options.only or (), grid.cells)
     out = Path(options.out) if options.out else folders.OUTPUTS / "sweeps" / path.stem
-    engine = Engine(options.executor, options.address)
+    engine = open_engine(options.executor)
     if options.dry_run:
         return _list(grid, out, choice, options.workers, console)
     result = run_sweep(grid, out, console.stage, options.workers, engine, options.attempts, choice)

@@ -10,9 +10,9 @@ import hashlib
 import json
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 import yaml
@@ -20,7 +20,13 @@ import yaml
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnknownName, check_name
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 T = TypeVar("T")
+
+type JSON = bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None
+"""What JSON can hold."""
 
 STEPS: Mapping[str, tuple[float, float, float]] = types.MappingProxyType(
     {"paper": (0.5e-3, 2.0, 0.05), "released": (1.0e-3, 3.0, 0.05), "shipped": (1.5e-3, 3.0, 0.05)}
@@ -196,7 +202,7 @@ class Deviations:
 DEVIATIONS = tuple(switch.name for switch in dataclasses.fields(Deviations))
 
 
-def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str = "configuration") -> T:
+def from_mapping(cls: type[T], mapping: Mapping[str, object], where: str = "configuration") -> T:
     """Build the dataclass `cls` from plain data, nested dataclasses included.
 
     Raises:
@@ -205,20 +211,22 @@ def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str = "configu
     """
     if not isinstance(mapping, Mapping):
         raise InputError(f"{where}: expected a table of keys, got {type(mapping).__name__}.")
-    hints = typing.get_type_hints(cls)
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    types_by_name = typing.get_type_hints(cls)
+    hints = {field.name: types_by_name[field.name] for field in fields}
     values = {}
     for key, value in mapping.items():
         if key not in hints:
             raise UnknownName(f"key in {where}", key, hints)
         values[key] = _convert(hints[key], value, f"{where}: {key}")
     nothing = dataclasses.MISSING
-    for item in dataclasses.fields(cls):  # type: ignore[arg-type]
+    for item in fields:
         if item.name not in values and item.default is nothing and item.default_factory is nothing:
             raise InputError(f"{where}: '{item.name}' is missing.")
     return cls(**values)
 
 
-def _convert(hint: Any, value: Any, where: str) -> Any:
+def _convert(hint: object, value: object, where: str) -> object:
     """Return `value` as the type `hint` says, or raise `InputError`."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
@@ -226,7 +234,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
             return None
         return _convert(next(a for a in arguments if a is not type(None)), value, where)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return from_mapping(hint, value, where)
+        return from_mapping(hint, cast(Mapping[str, object], value), where)
     if origin is tuple:
         if isinstance(value, str) or not isinstance(value, (list, tuple)):
             raise InputError(f"{where}: expected a list, got {value!r}.")
@@ -240,23 +248,24 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     return value
 
 
-def to_mapping(config: Any) -> dict[str, Any]:
+def to_mapping(config: "DataclassInstance") -> dict[str, JSON]:
     """Return a frozen dataclass as plain JSON data."""
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
-def read_changes(texts: Iterable[str]) -> dict[str, Any]:
+def read_changes(texts: Iterable[str]) -> dict[str, JSON]:
     """Read `clock=false`, `epochs=10` as keys and their YAML values.
 
     Raises:
         InputError: a text of another form, or a key given twice.
     """
-    changes: dict[str, Any] = {}
+    changes: dict[str, JSON] = {}
     for text in texts:
         key, sign, value = text.partition("=")
         if not sign or not key or key in changes:
             raise InputError(
-                f"change '{text}' is not understood; give KEY=VALUE, each key once, such as clock=false."
+                f"change '{text}' is not understood; give KEY=VALUE, each key once, "
+                "such as clock=false."
             )
         try:
             changes[key] = yaml.safe_load(value)
@@ -265,7 +274,7 @@ def read_changes(texts: Iterable[str]) -> dict[str, Any]:
     return changes
 
 
-def digest(value: Any) -> str:
+def digest(value: object) -> str:
     """sha256 (hex) of the canonical JSON of a dataclass or of plain data."""
     plain = (
         dataclasses.asdict(value)
@@ -286,7 +295,8 @@ def check_frame_stride(frame_stride: int) -> None:
             str(number) for number in range(1, names.FPS + 1) if names.FPS % number == 0
         )
         raise InputError(
-            f"frame_stride is {frame_stride}; it must divide the {names.FPS} frames a second: {allowed}."
+            f"frame_stride is {frame_stride}; it must divide the {names.FPS} frames a second: "
+            f"{allowed}."
         )
 
 

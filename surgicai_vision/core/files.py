@@ -10,10 +10,12 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock
 
 from surgicai_vision import __version__
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists
@@ -37,7 +39,7 @@ def write_bytes(path: Path, content: bytes) -> None:
     sync_folder(path.parent)
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: object) -> None:
     """Write `value` as indented JSON, atomically."""
     write_bytes(path, (json.dumps(value, indent=2, sort_keys=True) + "\n").encode())
 
@@ -67,6 +69,24 @@ def whole_folder(path: Path) -> Iterator[Path]:
         sync_folder(path.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
+    """Hold the lock file `path`, which is removed at the end; a killed holder frees it.
+
+    Args:
+        path: the lock file; its folder exists.
+        wait: wait for another holder.
+
+    Raises:
+        filelock.Timeout: somebody holds it, and `wait` is false.
+    """
+    with FileLock(path, blocking=wait):
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def sync_tree(folder: Path) -> None:
@@ -114,7 +134,7 @@ def check_output(path: Path, *, may_resume: str | None = None) -> None:
         )
 
 
-def claim(path: Path, owner: dict[str, Any], what: str) -> None:
+def claim(path: Path, owner: Mapping[str, object], what: str) -> None:
     """Write whose folder this is into the file `path` in it; refuse a folder of somebody else.
 
     Args:

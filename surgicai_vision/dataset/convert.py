@@ -19,8 +19,9 @@ from typing import Any
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, check_name
-from surgicai_vision.core.executor import LOCAL, Engine, Progress, building, work_folder
+from surgicai_vision.core.executor import LOCAL, Engine, building, work_folder
 from surgicai_vision.core.files import check_output, read_json, whole_folder, write_json
+from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.metadata import (
     FILES_PER_CHUNK,

@@ -22,8 +22,9 @@ from typing import Any
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
-from surgicai_vision.core.executor import Progress, building
+from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output
+from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.metadata import CODEBASE_VERSION
 from surgicai_vision.dataset.reader import Dataset, open_dataset

@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, check_frame_stride, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name
-from surgicai_vision.core.executor import LOCAL, Engine, Job, Progress, building, run
+from surgicai_vision.core.executor import LOCAL, Engine, Job, RunContext, building, job, run
 from surgicai_vision.core.files import (
     check_output,
     code_version,
@@ -33,6 +33,7 @@ from surgicai_vision.core.files import (
     sha256_file,
     write_json,
 )
+from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.convert import DatasetSummary, check_video, finished, write_view
 from surgicai_vision.dataset.reader import open_dataset
@@ -113,7 +114,9 @@ def render_demos(
         for path, row in zip(paths, origins, strict=True)
     ]
     with building(out) as (store, result):
-        shards = run(jobs, store, workers=workers, progress=progress, unit="frames", engine=engine)
+        shards = run(
+            jobs, store, RunContext(workers, engine), progress=progress or silent, unit="frames"
+        )
         meta = _meta(
             sources, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins
         )
@@ -223,6 +226,7 @@ def _env(config: str, views: tuple[str, ...], size: int, depth: bool, segmentati
     )
 
 
+@job("render-episode", stages=("scene", "envs", "demos", "dataset"))
 def render_episode(
     folder: Path,
     demo: str,

@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from surgicai_vision.core import names
-from surgicai_vision.core.executor import LOCAL, Engine, Job, Progress, run
+from surgicai_vision.core.executor import LOCAL, Engine, Job, RunContext, job, run
 from surgicai_vision.core.files import read_json, write_json
+from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.metadata import video_path
 from surgicai_vision.dataset.reader import Dataset, open_dataset
@@ -82,7 +83,7 @@ def encode_views(
         for first, stop in blocks
     ]
     results = iter(
-        run(jobs, store, workers=workers, engine=engine, unit="frames", progress=progress)
+        run(jobs, store, RunContext(workers, engine), unit="frames", progress=progress or silent)
     )
     episodes: list[dict[str, Encoded]] = [{} for _ in bounds]
     for view in views:
@@ -114,6 +115,7 @@ def _dataset(folder: str) -> Dataset:
     return open_dataset(Path(folder))
 
 
+@job("encode-video", stages=("dataset",), packages=("numpy", "av"))
 def encode_block(folder: Path, dataset: str, video: str, view: str, first: int, stop: int) -> None:
     """Job "encode-video": encode a view of the episodes first … stop - 1, and compare each frame
     with its image.

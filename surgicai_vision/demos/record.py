@@ -23,7 +23,16 @@ from typing import Any
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, check_name
-from surgicai_vision.core.executor import LOCAL, Engine, Job, Progress, building, run, work_folder
+from surgicai_vision.core.executor import (
+    LOCAL,
+    Engine,
+    Job,
+    RunContext,
+    building,
+    job,
+    run,
+    work_folder,
+)
 from surgicai_vision.core.files import (
     check_output,
     code_version,
@@ -32,6 +41,7 @@ from surgicai_vision.core.files import (
     whole_folder,
     write_json,
 )
+from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.demos.rollout import CALM, Disturbance, Driver, roll
 from surgicai_vision.demos.store import (
     MARKER,
@@ -79,6 +89,7 @@ def _env(config: TaskConfig) -> Any:
     return envs.make(config)
 
 
+@job("record-episode", stages=("scene", "envs", "demos"))
 def record_episode(folder: Path, task: Mapping[str, Any], **how: Any) -> None:
     """Job "record-episode": roll one seed; `how` is the rest of `record_into`'s arguments."""
     record_into(folder, _env(from_mapping(TaskConfig, task)), **how)
@@ -177,10 +188,8 @@ def record(
     if finished(out, request):
         return list_demos(out)
     with building(out) as (store, result):
-        rolling = functools.partial(run, store=store, workers=workers, engine=engine)
-        kept, skipped = _take(
-            request, demos, learner, rolling, progress or (lambda done, total, unit: None)
-        )
+        rolling = functools.partial(run, store=store, context=RunContext(workers, engine))
+        kept, skipped = _take(request, demos, learner, rolling, progress or silent)
         with whole_folder(result) as folder:
             for index, path in enumerate(kept):
                 shutil.copyfile(path, folder / f"episode_{index:06d}.safetensors")
@@ -274,7 +283,9 @@ def _take(
     return kept, skipped
 
 
-def _report(progress: Progress, before: int, wanted: int, done: int, total: int, unit: str) -> None:
+def _report(
+    progress: Progress, before: int, wanted: int, done: int, total: int, unit: str = ""
+) -> None:
     """Pass on the progress of one wave of seeds as that of the whole."""
     progress(before + done, wanted, "episodes")
 

@@ -9,12 +9,11 @@ through shared memory. Trajectories, infos and autoreset are those of `SyncVecto
 number of workers: `benchmarks/speed.py --only workers` measures it.
 """
 
-import contextlib
 import itertools
-import multiprocessing
 import traceback
 from copy import deepcopy
 from multiprocessing.connection import Connection
+from multiprocessing.sharedctypes import RawArray
 from typing import Any
 
 import numpy as np
@@ -24,12 +23,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.core.processes import Child
 
 Tree = Any
 """Arrays, or dicts of trees."""
 Step = tuple[Tree, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
-PATIENCE = 10.0
-"""How long a worker may take to end before it is killed [s]."""
 
 
 def make_vector(
@@ -63,7 +61,7 @@ class SuturingVectorEnv(VectorEnv):
     """
 
     def __init__(self, num_envs: int, workers: int, mode: AutoresetMode, arguments: dict[str, Any]):
-        self._workers: list[tuple[multiprocessing.process.BaseProcess, Connection]] = []
+        self._workers: list[Child] = []
         self.num_envs = num_envs
         first = _make(arguments)
         self.single_observation_space, self.single_action_space = (
@@ -77,20 +75,22 @@ class SuturingVectorEnv(VectorEnv):
         first.close()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        context = multiprocessing.get_context(
-            "spawn"
-        )  # a GL context must be made in the process that uses it
-        self._memory = _reserve(self.observation_space, context)
+        self._memory = _reserve(self.observation_space)
         self._seen = _view(self.observation_space, self._memory)
         edges = [num_envs * index // workers for index in range(workers + 1)]
         self._shares = [slice(start, end) for start, end in itertools.pairwise(edges)]
         for share in self._shares:
-            ours, theirs = context.Pipe()
-            job = (theirs, share, arguments, mode, self.observation_space, self._memory)
-            process = context.Process(target=_work, args=job, daemon=True)
-            process.start()
-            theirs.close()
-            self._workers.append((process, ours))
+            self._workers.append(
+                Child(
+                    _work,
+                    share,
+                    arguments,
+                    mode,
+                    self.observation_space,
+                    self._memory,
+                    variables={},
+                )
+            )
         self._ask_all("ready", [()] * workers)
 
     def reset(
@@ -166,14 +166,8 @@ class SuturingVectorEnv(VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the workers."""
-        for process, connection in self._workers:
-            with contextlib.suppress(OSError):  # it may have ended already
-                connection.send(("close", ()))
-            process.join(PATIENCE)
-            if process.is_alive():
-                process.kill()
-                process.join()
-            connection.close()
+        for worker in self._workers:
+            worker.dismiss()
         self._workers = []
 
     def _check_open(self) -> None:
@@ -183,11 +177,11 @@ class SuturingVectorEnv(VectorEnv):
     def _ask_all(self, what: str, arguments: list[Any]) -> list[Any]:
         """Send each worker its part, then collect the answers; a worker's error ends all."""
         try:
-            for (_, connection), part in zip(self._workers, arguments, strict=True):
-                connection.send((what, part))
-            answers = [connection.recv() for _, connection in self._workers]
+            for worker, part in zip(self._workers, arguments, strict=True):
+                worker.connection.send((what, part))
+            answers = [worker.connection.recv() for worker in self._workers]
         except (EOFError, OSError) as error:
-            codes = [process.exitcode for process, _ in self._workers]
+            codes = [worker.exit_code for worker in self._workers]
             self.close()
             raise SurgicaiError(
                 f"A worker of the vector env died (exit codes {codes}); make a new one."
@@ -224,13 +218,11 @@ def _work(
     space: spaces.Space,
     memory: Tree,
 ) -> None:
-    """Serve one share of the envs until told to close, or until the other side is gone."""
+    """Serve one share of the envs until the other end is closed."""
     vector, seen = None, _view(space, memory)
     try:
         while True:
             what, part = connection.recv()
-            if what == "close":
-                break
             try:
                 if vector is None:
                     makers = [lambda: _make(arguments)] * (share.stop - share.start)
@@ -239,8 +231,6 @@ def _work(
             except Exception as error:
                 answer = _Failure(error)
             connection.send(answer)
-    except (EOFError, OSError, KeyboardInterrupt):
-        pass
     finally:
         if vector is not None:
             vector.close()
@@ -270,12 +260,12 @@ def _answer(vector: SyncVectorEnv, what: str, part: Any, seen: Tree, share: slic
 # -- trees of arrays -------------------------------------------------------------------------------
 
 
-def _reserve(space: spaces.Space, context: Any) -> Tree:
+def _reserve(space: spaces.Space) -> Tree:
     """Return shared memory for a batched space."""
     if isinstance(space, spaces.Dict):
-        return {key: _reserve(part, context) for key, part in space.spaces.items()}
+        return {key: _reserve(part) for key, part in space.spaces.items()}
     assert space.shape is not None and space.dtype is not None
-    return context.RawArray("b", int(np.prod(space.shape)) * space.dtype.itemsize)
+    return RawArray("b", int(np.prod(space.shape)) * space.dtype.itemsize)
 
 
 def _view(space: spaces.Space, memory: Tree) -> Tree:

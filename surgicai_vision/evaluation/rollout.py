@@ -19,6 +19,7 @@ from typing import Any, Protocol, final
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision.core import processes
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError, SurgicaiError
 from surgicai_vision.evaluation.metrics import EpisodeRow, failure_kind
@@ -125,6 +126,8 @@ def evaluate(
         results = [jobs[0](report=lambda done: progress(done, total) if progress else None)]
     else:
         results = _in_processes(jobs, progress, total)
+        if progress:
+            progress(total, total)
     by_seed = {episode.row.seed: episode for share in results for episode in share}
     return [by_seed[seed] for seed in seeds]
 
@@ -272,52 +275,18 @@ class _Slot:
         return Film(steps, np.stack([self.states[step] for step in steps]))
 
 
-def _in_processes(jobs: list[Any], progress: Progress | None, total: int) -> list[list[Episode]]:
-    """Run jobs in spawned processes (forking would copy a GL context and torch's threads)."""
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor, wait
-    from concurrent.futures.process import BrokenProcessPool
-
-    context = multiprocessing.get_context("spawn")
-    counts = context.Array("q", len(jobs))
-    with ProcessPoolExecutor(
-        len(jobs), context, initializer=_start_worker, initargs=(counts,)
-    ) as pool:
-        futures = [pool.submit(_run_job, job, index) for index, job in enumerate(jobs)]
-        try:
-            while wait(futures, timeout=0.25).not_done:
-                if progress:
-                    progress(sum(counts[:]), total)
-                for future in futures:
-                    if future.done():
-                        future.result()
-            results = [future.result() for future in futures]
-        except BrokenProcessPool:
-            raise SurgicaiError(
-                "A process of the evaluation was killed (out of memory?); run it again with --workers 1."
-            ) from None
-        except BaseException:
-            for process in list(pool._processes.values()):
-                process.terminate()
-            raise
-    if progress:
-        progress(total, total)
-    return results
-
-
-_counts: Any = None
-
-
-def _start_worker(counts: Any) -> None:
-    """Prepare a worker: one thread for each library, since there is a process for each core."""
-    global _counts
-    _counts = counts
-    os.environ["LP_NUM_THREADS"] = "0"
-
-
-def _run_job(job: Any, index: int) -> list[Episode]:
-    def report(done: int) -> None:
-        _counts[index] = done
-
-    episodes: list[Episode] = job(report=report)
-    return episodes
+def _in_processes(
+    shares: Sequence[Callable[..., list[Episode]]], progress: Progress | None, total: int
+) -> list[list[Episode]]:
+    """Run shares in processes of their own."""
+    try:
+        return processes.run_all(
+            shares,
+            "the evaluation",
+            lambda done: progress(sum(done), total) if progress else None,
+            {"LP_NUM_THREADS": "0"},  # the agents keep torch to one thread
+        )
+    except processes.Died:
+        raise SurgicaiError(
+            "A process of the evaluation was killed (out of memory?); run it again with --workers 1."
+        ) from None

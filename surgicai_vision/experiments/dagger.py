@@ -19,6 +19,7 @@ import numpy as np
 
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.executor import job
 from surgicai_vision.demos.record import Learner, record_into
 from surgicai_vision.evaluation.policy_spec import checkpoint_subject
 from surgicai_vision.evaluation.rollout import Agent, env_of
@@ -62,6 +63,14 @@ def learner_of(folder: Path, config: TaskConfig) -> Learner:
     return Learner(folder, str(subject.about["checkpoint"]["policy_sha256"]))
 
 
+@job(
+    "drive-episode",
+    stages=(
+        "scene", "envs", "demos", "dataset", "features", "training", "evaluation", "experiments",
+        "encoders", "policies",
+    ),
+    packages=("mujoco", "numpy", "torch", "timm", "lerobot"),
+)  # fmt: skip
 def record_driven(folder: Path, task: Mapping[str, Any], learner: str, **how: Any) -> None:
     """Job "drive-episode": as "record-episode", with a learner that drives."""
     env, wheel = _driven(from_mapping(TaskConfig, task), learner)

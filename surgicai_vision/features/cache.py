@@ -20,25 +20,25 @@ A process killed at any moment leaves `progress.json` behind its rows, and the n
 there.
 """
 
-import fcntl
 import shutil
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from filelock import Timeout
 
 from surgicai_vision import __version__
 from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, UnknownName
-from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, read_json, write_json
+from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, locked, read_json, write_json
 
 FORMAT = 1
 CHUNK = 256  # frames per progress step: 38 MB of images at 224 × 224
 MANIFEST, PROGRESS, ROWS = "manifest.json", "progress.json", "features.npy"
+LOCK = "lock"
 
 Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
@@ -161,8 +161,8 @@ def encode(
         raise InputError(
             f"The feature cache {folder} cannot be made ({error.strerror}); set ${CACHE_VARIABLE} to another folder."
         ) from None
-    with _locked(folder):
-        if (folder / MANIFEST).exists():  # another process finished it while we waited
+    with locked(folder / LOCK):  # a second process waits here
+        if (folder / MANIFEST).exists():  # and finds the entry complete
             return open_entry(folder, dataset.length)
         encoded = _fill(folder, dataset, view, encoder, progress)
         write_json(folder / MANIFEST, _manifest(dataset, view, encoder))
@@ -262,14 +262,6 @@ def _chunks(dataset: FrameSource, view: str, start: int) -> Iterator[tuple[int, 
             yield min(at + CHUNK, dataset.length), frames
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold the entry's lock; a second process waits here and then finds the entry complete."""
-    with open(folder / "lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
 @dataclass(frozen=True)
 class CacheEntry:
     """One entry of the cache as `list_cache` shows it: its folder, size [bytes] and manifest (None:
@@ -302,11 +294,10 @@ def prune_cache(root: Path | None = None, keep_datasets: Collection[str] = ()) -
     for entry in list_cache(root):
         if entry.manifest is not None and entry.manifest["dataset"] in keep_datasets:
             continue
-        with open(entry.folder / "lock", "w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            shutil.rmtree(entry.folder)
+        try:
+            with locked(entry.folder / LOCK, wait=False):
+                shutil.rmtree(entry.folder)
+        except Timeout:
+            continue
         removed.append(entry)
     return removed

@@ -6,16 +6,16 @@ prevented is found by its file. The folder is locked while a session runs, so th
 the same numbers.
 """
 
-import fcntl
-import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from filelock import Timeout
+
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, OutputExists, SurgicaiError
-from surgicai_vision.core.files import TEMPORARY, check_output, code_version
+from surgicai_vision.core.files import TEMPORARY, check_output, code_version, locked
 from surgicai_vision.demos.store import (
     MARKER,
     Demo,
@@ -98,26 +98,20 @@ def open_recordings(
     """
     check_output(folder, may_resume=MARKER)
     folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        _lock(descriptor, folder)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked(folder.with_name(f".{folder.name}.lock"), wait=False))
+        except Timeout:
+            raise SurgicaiError(
+                f"--out {folder}: another session is recording there; give another folder."
+            ) from None
         for leftover in folder.glob(f"{TEMPORARY}*"):
             leftover.unlink(missing_ok=True)
-        recordings = _read(folder, config, scene_hash, seed)
-        yield recordings
-    finally:
-        os.close(descriptor)
-        if not any(folder.iterdir()):
-            folder.rmdir()
-
-
-def _lock(descriptor: int, folder: Path) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise SurgicaiError(
-            f"--out {folder}: another session is recording there; give another folder."
-        ) from None
+        try:
+            yield _read(folder, config, scene_hash, seed)
+        finally:
+            if not any(folder.iterdir()):
+                folder.rmdir()
 
 
 def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -> Recordings:

@@ -124,8 +124,8 @@ def test_version(capsys):
         (["record-demos", "--episodes", "-3"], "--episodes is -3"),
         (["record-demos", "--noise", "-0.1"], "--noise is -0.1; it must be within 0 and 1"),
         (["record-demos", "--executor", "rai"], "Did you mean 'ray'?"),
-        (["render-demos", "--address", "10.0.0.1:6379"], "give --executor ray with it"),
         (["record-demos", "--perturb-start-fraction", "2"], "--perturb-start-fraction is 2.0"),
+        (["render-demos", "--executor", "local,address=10.0.0.1:6379"], "local takes no options"),
         (["train", "--encoder", "rndom"], "Did you mean 'random'?"),
         (["train", "--encoder", "none", "--view", "back"], "leave --view out"),
         (

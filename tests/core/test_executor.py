@@ -1,34 +1,32 @@
 """The executor: the store is the truth, whatever becomes of the processes."""
 
-import fcntl
+import importlib
 import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import fake_jobs
 import pytest
+from filelock import FileLock
 
 from surgicai_vision.core.errors import InputError, SurgicaiError, UnknownName
-from surgicai_vision.core.executor import JOBS, Engine, Job, JobKind, building, run
+from surgicai_vision.core.executor import (
+    JOBS,
+    Job,
+    RunContext,
+    building,
+    open_engine,
+    register_job,
+    run,
+    slurm,
+)
+from surgicai_vision.core.executor.slurm import SUBMISSIONS, SlurmEngine
 from surgicai_vision.core.files import whole_folder
-
-TABLE = {
-    name: JobKind(f"fake_jobs:{name}", ("names",))
-    for name in (
-        "square",
-        "count",
-        "die_once",
-        "die",
-        "refuse",
-        "crash",
-        "slow",
-        "environment",
-        "where",
-    )
-}
 
 
 def squares(numbers, **more):
@@ -44,8 +42,8 @@ def partial(store):
 
 
 def test_results_come_in_order_whatever_the_workers(tmp_path):
-    inline = run(squares(range(5)), tmp_path / "a", workers=0, table=TABLE)
-    spawned = run(squares(range(5)), tmp_path / "b", workers=2, table=TABLE)
+    inline = run(squares(range(5)), tmp_path / "a", RunContext(0))
+    spawned = run(squares(range(5)), tmp_path / "b", RunContext(2))
     assert texts(inline) == texts(spawned) == ["0", "1", "4", "9", "16"]
     assert [path.name for path in inline] == [path.name for path in spawned]
 
@@ -56,12 +54,11 @@ def test_finished_jobs_are_not_done_again(tmp_path):
         Job("count", {"number": number, "log": str(log)}, label=("log",)) for number in range(4)
     ]
     seen = []
-    run(jobs[:2], tmp_path / "store", workers=0, table=TABLE)
+    run(jobs[:2], tmp_path / "store", RunContext(0))
     run(
         jobs,
         tmp_path / "store",
-        workers=0,
-        table=TABLE,
+        RunContext(0),
         progress=lambda *row: seen.append(row),
         unit="frames",
     )
@@ -71,29 +68,27 @@ def test_finished_jobs_are_not_done_again(tmp_path):
 
 def test_key_depends_on_arguments_and_inputs_but_not_on_labels():
     base = Job("square", {"number": 1, "path": "a"}, ("x",), label=("path",))
-    assert base.key(TABLE) == Job(
-        "square", {"number": 1, "path": "b"}, ("x",), label=("path",)
-    ).key(TABLE)
+    assert base.key() == Job("square", {"number": 1, "path": "b"}, ("x",), label=("path",)).key()
     others = [
         Job("square", {"number": 2}, ("x",)),
         Job("square", {"number": 1}, ("y",)),
         Job("crash", {"number": 1}),
     ]
-    assert len({base.key(TABLE), *(job.key(TABLE) for job in others)}) == 4
+    assert len({base.key(), *(job.key() for job in others)}) == 4
 
 
 def test_a_worker_killed_once_is_replaced(tmp_path):
     jobs = [Job("die_once", {"mark": str(tmp_path / "mark")}), *squares(range(3))]
-    folders = run(jobs, tmp_path / "store", workers=2, table=TABLE)
+    folders = run(jobs, tmp_path / "store", RunContext(2))
     assert texts(folders) == ["done", "0", "1", "4"]
 
 
 def test_a_worker_killed_twice_is_an_error_and_keeps_the_rest(tmp_path):
     store = tmp_path / "store"
     with pytest.raises(SurgicaiError, match=r"died 2 times.*die\(\).*same command again"):
-        run([*squares(range(2)), Job("die", {})], store, workers=1, table=TABLE)
+        run([*squares(range(2)), Job("die", {})], store, RunContext(1))
     seen = []
-    run(squares(range(2)), store, workers=0, table=TABLE, progress=lambda *row: seen.append(row))
+    run(squares(range(2)), store, RunContext(0), progress=lambda *row: seen.append(row))
     assert seen == [(2, 2, "jobs")]
 
 
@@ -104,7 +99,7 @@ def test_a_run_that_is_told_of_failures_goes_on_after_them(tmp_path):
         heard[job.name] = (folder.is_dir(), str(error) if error else "")
 
     jobs = [Job("die", {}), Job("crash", {}), *squares([3])]
-    run(jobs, tmp_path / "store", workers=2, table=TABLE, attempts=3, ended=ended)
+    run(jobs, tmp_path / "store", RunContext(2), attempts=3, ended=ended)
     assert heard["square"] == (True, "")
     assert not heard["die"][0] and "died 3 times" in heard["die"][1]
     assert not heard["crash"][0] and "ZeroDivisionError" in heard["crash"][1]
@@ -113,24 +108,31 @@ def test_a_run_that_is_told_of_failures_goes_on_after_them(tmp_path):
 @pytest.mark.parametrize("workers", [0, 1])
 def test_failures_keep_their_kind_and_leave_nothing(tmp_path, workers):
     with pytest.raises(InputError, match="bad input"):
-        run([Job("refuse", {"kind": "input"})], tmp_path, workers=workers, table=TABLE)
+        run([Job("refuse", {"kind": "input"})], tmp_path, RunContext(workers))
     with pytest.raises(InputError, match="Did you mean 'front'"):
-        run([Job("refuse", {"kind": "name"})], tmp_path, workers=workers, table=TABLE)
+        run([Job("refuse", {"kind": "name"})], tmp_path, RunContext(workers))
     with pytest.raises(SurgicaiError, match=r"crash\(\) failed: ZeroDivisionError: by hand"):
-        run([Job("crash", {})], tmp_path, workers=workers, table=TABLE)
-    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+        run([Job("crash", {})], tmp_path, RunContext(workers))
+    assert not list(tmp_path.iterdir())
 
 
 def test_bad_requests_are_refused(tmp_path):
     with pytest.raises(InputError, match="workers is -1"):
-        run([], tmp_path, workers=-1)
+        RunContext(-1)
     with pytest.raises(UnknownName, match="Unknown job 'rm'"):
-        run([Job("rm", {})], tmp_path)
+        run([Job("rm", {})], tmp_path, RunContext(0))
+
+
+def test_a_name_stands_for_one_function():
+    with pytest.raises(
+        InputError, match="Job 'square' is fake_jobs:square already; give other:square another name"
+    ):
+        register_job("square", "other:square", stages=("core",))
 
 
 def test_workers_are_single_threaded(tmp_path):
     before = os.environ.get("LP_NUM_THREADS")
-    assert texts(run([Job("environment", {})], tmp_path, workers=1, table=TABLE)) == ["0"]
+    assert texts(run([Job("environment", {})], tmp_path, RunContext(1))) == ["0"]
     assert os.environ.get("LP_NUM_THREADS") == before
 
 
@@ -138,11 +140,11 @@ SCRIPT = """
 import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-from surgicai_vision.core.executor import Job, JobKind, run
+import fake_jobs
+from surgicai_vision.core.executor import Job, RunContext, run
 if __name__ == "__main__":
-    table = {{"slow": JobKind("fake_jobs:slow", ("names",))}}
     jobs = [Job("slow", {{"number": n, "seconds": 0.3}}) for n in range(6)]
-    run(jobs, Path({store!r}), workers=2, table=table, progress=lambda *row: print(*row, flush=True))
+    run(jobs, Path({store!r}), RunContext(2), progress=lambda *row: print(*row, flush=True))
 """
 
 
@@ -164,21 +166,18 @@ def test_interrupted_run_continues(tmp_path, signal_number):
     time.sleep(1.2)  # orphans notice within half a second
     children = subprocess.run(["pgrep", "-f", str(script)], capture_output=True, text=True).stdout
     assert not children
-    table = {"slow": TABLE["slow"]}
     jobs = [Job("slow", {"number": number, "seconds": 0.3}) for number in range(6)]
     seen = []
-    folders = run(jobs, store, workers=0, table=table, progress=lambda *row: seen.append(row[0]))
+    folders = run(jobs, store, RunContext(0), progress=lambda *row: seen.append(row[0]))
     assert seen[0] >= 2
     assert texts(folders) == ["0", "1", "4", "9", "16", "25"]
     assert not partial(store)
 
 
 def test_a_store_serves_one_run_at_a_time(tmp_path):
-    with open(tmp_path / ".lock", "w") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(InputError, match="Another run is working"):
-            run(squares([7]), tmp_path, workers=0, table=TABLE)
-    run(squares([7]), tmp_path, workers=0, table=TABLE)
+    with FileLock(tmp_path / ".lock"), pytest.raises(InputError, match="Another run is working"):
+        run(squares([7]), tmp_path, RunContext(0))
+    run(squares([7]), tmp_path, RunContext(0))
 
 
 def test_a_built_folder_appears_whole_or_not_at_all(tmp_path):
@@ -186,7 +185,7 @@ def test_a_built_folder_appears_whole_or_not_at_all(tmp_path):
 
     def build(fail):
         with building(out) as (store, result):
-            run(squares([3]), store, workers=0, table=TABLE)
+            run(squares([3]), store, RunContext(0))
             with whole_folder(result) as folder:
                 (folder / "a.txt").write_text("a")
                 assert not out.exists()
@@ -239,30 +238,113 @@ def test_ray_runs_the_same_jobs_on_loopback_and_replaces_a_killed_worker(tmp_pat
     def progress(*row):
         heard.append((row, listening() - others))
 
-    run(squares(range(2)), store, workers=0, table=TABLE)
-    folders = run(jobs, store, workers=2, table=TABLE, engine=Engine("ray"), progress=progress)
+    run(squares(range(2)), store, RunContext(0))
+    folders = run(jobs, store, RunContext(2, open_engine("ray")), progress=progress)
     assert texts(folders) == ["done", "0", "1", "4", "9", "127.0.0.1 0"]
-    assert [folder.name for folder in folders] == [job.key(TABLE) for job in jobs]
+    assert [folder.name for folder in folders] == [job.key() for job in jobs]
     assert heard[0][0] == (2, 6, "jobs"), "the store is the truth"
     assert all(not foreign for _, foreign in heard), "only loopback listens"
     again = run(
-        jobs, store, workers=2, table=TABLE, engine=Engine("ray")
+        jobs, store, RunContext(2, open_engine("ray"))
     )  # nothing to do: no cluster is started
     assert again == folders
 
 
-def test_ray_is_asked_for_in_words(monkeypatch):
+def test_engines_are_asked_for_in_words(monkeypatch):
     with pytest.raises(UnknownName, match="Did you mean 'ray'"):
-        Engine("rya")
-    with pytest.raises(InputError, match="give --executor ray with it"):
-        Engine(address="127.0.0.1:6379")
+        open_engine("rya")
+    with pytest.raises(
+        InputError, match=r"local takes no options; leave 'address=127.0.0.1:6379' out"
+    ):
+        open_engine("local,address=127.0.0.1:6379")
+    with pytest.raises(UnknownName, match="Did you mean 'partition'"):
+        open_engine("slurm,partion=cpu")
+    with pytest.raises(InputError, match="minutes is 0 and gpus 0; allowed: at least 1"):
+        open_engine("slurm,minutes=0")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install 'surgicai-vision\[ray\]'"):
-        Engine("ray")
+    for name in ("ray", "slurm"):
+        with pytest.raises(InputError, match=rf"pip install 'surgicai-vision\[{name}\]'"):
+            open_engine(name)
 
 
-def test_registered_jobs_name_modules_of_this_package():
-    assert all(
-        kind.function.startswith("surgicai_vision.") and ":" in kind.function
-        for kind in JOBS.values()
+def test_slurm_is_looked_for_before_any_job(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match=r"executor slurm: .*login node"):
+        run(squares([1]), tmp_path / "store", RunContext(1, SlurmEngine(partition="cpu")))
+
+
+@pytest.mark.parametrize("cluster", ["debug", "local"])
+def test_slurm_runs_the_same_jobs(tmp_path, monkeypatch, cluster):
+    """The debug executor runs them in this process, the local one makes a process of each."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(fake_jobs.__file__).parent))
+    store = tmp_path / "store"
+    context = RunContext(2, SlurmEngine(cluster=cluster))
+    heard = []
+    jobs = [*squares(range(3)), Job("environment", {})]
+    run(squares(range(1)), store, RunContext(0))
+    folders = run(jobs, store, context, progress=lambda *row: heard.append(row))
+    assert texts(folders)[:3] == ["0", "1", "4"]
+    assert cluster == "debug" or texts(folders)[3] == "0", "a batch job has one core"
+    assert [folder.name for folder in folders] == [job.key() for job in jobs]
+    assert heard[0] == (1, 4, "jobs"), "the store is the truth"
+    assert not (store / SUBMISSIONS).exists(), "nothing is left of what went well"
+    assert run(jobs, store, context) == folders
+    with pytest.raises(SurgicaiError, match=r"crash\(\) failed: ZeroDivisionError: by hand"):
+        run([Job("crash", {})], store, context)
+    with pytest.raises(InputError, match="Did you mean 'front'"):
+        run([Job("refuse", {"kind": "name"})], store, context)
+
+
+def test_a_killed_batch_job_is_submitted_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(fake_jobs.__file__).parent))
+    monkeypatch.setattr(slurm, "GRACE_S", 0.2)
+    heard = {}
+
+    def ended(job, folder, error):
+        heard[job.name] = (folder.is_dir(), str(error) if error else "")
+
+    jobs = [Job("die_once", {"mark": str(tmp_path / "mark")}), Job("die", {}), *squares([3])]
+    run(
+        jobs,
+        tmp_path / "store",
+        RunContext(3, SlurmEngine(cluster="local")),
+        attempts=2,
+        ended=ended,
     )
+    assert heard["die_once"] == (True, "") == heard["square"]
+    done, said = heard["die"]
+    output = Path(re.search(r"its output is in (\S+)\)", said)[1])
+    assert not done and "died 2 times" in said and output.is_file()
+
+
+def test_an_interrupted_run_cancels_its_batch_jobs(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(fake_jobs.__file__).parent))
+    jobs = [*squares([1]), Job("slow", {"number": 2, "seconds": 60})]
+
+    def interrupt(done, total, unit):
+        if done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(
+            jobs,
+            tmp_path / "store",
+            RunContext(2, SlurmEngine(cluster="local")),
+            progress=interrupt,
+        )
+    until = time.monotonic() + 5
+    while subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True).stdout:
+        assert time.monotonic() < until, "a batch job outlives its run"
+        time.sleep(0.1)
+
+
+def test_jobs_are_registered_where_they_are_defined():
+    for module in ("demos.record", "dataset.render", "experiments.sweep.plan"):
+        importlib.import_module(f"surgicai_vision.{module}")
+    ours = {
+        name: kind for name, kind in JOBS.items() if kind.function.startswith("surgicai_vision.")
+    }
+    assert ours["record-episode"].function == "surgicai_vision.demos.record:record_episode"
+    for kind in ours.values():
+        module, _, name = kind.function.partition(":")
+        assert callable(getattr(importlib.import_module(module), name))

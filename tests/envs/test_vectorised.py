@@ -2,6 +2,9 @@
 included.
 """
 
+import os
+import signal
+
 import gymnasium
 import numpy as np
 import pytest
@@ -164,8 +167,8 @@ def test_a_workers_error_and_its_death_are_told():
     with pytest.raises(InputError, match="closed"):
         vector.step(np.zeros((2, 7), np.float32))
     vector = make_vec("place", "workers")
-    vector._workers[1][0].kill()
-    vector._workers[1][0].join()
+    os.kill(vector._workers[1].pid, signal.SIGKILL)
+    vector._workers[1].join()
     with pytest.raises(SurgicaiError, match="died"):
         vector.reset(seed=0)
 

@@ -1,4 +1,4 @@
-"""Executor: jobs by registered name, results in a store, the same command again is the resume.
+"""Executor: jobs by registered name, results in a store; the same command again is the resume.
 
 A job is a registered function called as `function(folder, **arguments)`; it writes its result into
 `folder`, which is empty when it starts. The folder is committed to the store by one rename under
@@ -8,36 +8,38 @@ never computed again, whatever killed the run before. Results do not depend on t
 workers.
 
     jobs = [Job("render-episode", {"demo": "…", "views": ["front"]}, inputs=(sha256,), weight=120)]
-    folders = run(jobs, Path("out.work"), workers=2, progress=lambda done, total, unit: None)
+    folders = run(jobs, Path("out.work"), RunContext(workers=2))
 
-The engine is `local` (spawned processes; `workers=0` runs in this one) or `ray_engine` (Ray Core,
-an extra).
+What runs the jobs is an engine: processes of this machine, Ray or Slurm (extras), or another
+distribution's.
 """
 
-from surgicai_vision.core.executor.jobs import JOBS, Job, JobKind
-from surgicai_vision.core.executor.store import (
-    ENGINES,
-    LOCAL,
-    Ended,
-    Engine,
-    Progress,
-    building,
-    claim,
-    run,
-    work_folder,
-)
+from surgicai_vision.core.executor.context import RunContext
+from surgicai_vision.core.executor.engine import Ending, Engine
+from surgicai_vision.core.executor.engines import ENGINES, open_engine, register_engine
+from surgicai_vision.core.executor.jobs import JOBS, Job, JobKind, Task, job, perform, register_job
+from surgicai_vision.core.executor.local import LOCAL, LocalEngine
+from surgicai_vision.core.executor.store import Ended, building, claim, run, work_folder
 
 __all__ = [
     "ENGINES",
     "JOBS",
     "LOCAL",
     "Ended",
+    "Ending",
     "Engine",
     "Job",
     "JobKind",
-    "Progress",
+    "LocalEngine",
+    "RunContext",
+    "Task",
     "building",
     "claim",
+    "job",
+    "open_engine",
+    "perform",
+    "register_engine",
+    "register_job",
     "run",
     "work_folder",
 ]

@@ -1,20 +1,27 @@
-"""Jobs: registered functions with JSON arguments, what their results are stored under, and how one
-is done.
+"""Jobs: registered functions with JSON arguments, and what their results are stored under.
+
+The module that defines a job's function registers it; a worker imports that module by the
+function's own path:
+
+    @job("record-episode", stages=("scene", "envs", "demos"))
+    def record_episode(folder: Path, *, seed: int) -> None: …
 """
 
 import functools
 import importlib
 import importlib.metadata
-import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TypeVar
 
-from surgicai_vision.core.config import digest
-from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.core.config import JSON, digest
+from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.files import code_version, whole_folder
+from surgicai_vision.core.processes import Failure
+
+F = TypeVar("F", bound=Callable[..., None])
 
 
 @dataclass(frozen=True)
@@ -28,55 +35,56 @@ class JobKind:
     """
 
     function: str
-    stages: tuple[str, ...] = ()
-    packages: tuple[str, ...] = ("mujoco", "numpy")
+    stages: tuple[str, ...]
+    packages: tuple[str, ...]
 
 
-_DATA = ("scene", "envs", "demos", "dataset")
-_LEARN = (*_DATA, "features", "training", "experiments", "encoders", "policies")
-_CELL = (*_LEARN, "evaluation")
-_NUMERIC = ("mujoco", "numpy", "torch", "timm", "lerobot")
+_kinds: dict[str, JobKind] = {}
 
-JOBS: Mapping[str, JobKind] = MappingProxyType(
-    {
-        "record-episode": JobKind(
-            "surgicai_vision.demos.record:record_episode", ("scene", "envs", "demos")
-        ),
-        "drive-episode": JobKind(
-            "surgicai_vision.experiments.dagger:record_driven", _CELL, _NUMERIC
-        ),
-        "render-episode": JobKind(
-            "surgicai_vision.dataset.render:render_episode", ("scene", "envs", "demos", "dataset")
-        ),
-        "encode-video": JobKind(
-            "surgicai_vision.dataset.video_jobs:encode_block", ("dataset",), ("numpy", "av")
-        ),
-        "sweep-features": JobKind(
-            "surgicai_vision.experiments.sweep.jobs:encode_features", _LEARN, _NUMERIC
-        ),
-        "sweep-policy": JobKind(
-            "surgicai_vision.experiments.sweep.jobs:train_policy", _LEARN, _NUMERIC
-        ),
-        "sweep-cell": JobKind("surgicai_vision.experiments.sweep.jobs:run_cell", _CELL, _NUMERIC),
-        "sweep-probe": JobKind(
-            "surgicai_vision.experiments.sweep.jobs:run_probe", _LEARN, _NUMERIC
-        ),
-        "sweep-reference": JobKind(
-            "surgicai_vision.experiments.sweep.jobs:run_reference", _CELL, _NUMERIC
-        ),
-    }
-)
+JOBS: Mapping[str, JobKind] = MappingProxyType(_kinds)
+"""Name → what it stands for, as far as modules that register jobs are imported."""
 
-WORKER_ENVIRONMENT: Mapping[str, str] = MappingProxyType(
-    {
-        "LP_NUM_THREADS": "0",
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-        "HF_HUB_OFFLINE": "1",
-    }
-)
-"""One worker, one core: llvmpipe's and the BLAS's own threads would fight over it (measured: two
-single-threaded processes scale linearly)."""
+
+def register_job(
+    name: str,
+    function: str,
+    *,
+    stages: tuple[str, ...],
+    packages: tuple[str, ...] = ("mujoco", "numpy"),
+) -> None:
+    """Register a job whose function is not imported yet.
+
+    Args:
+        name: what jobs of this kind are called, once in all.
+        function: "module:function", called as `function(folder, **arguments)`.
+        stages: the packages of surgicai_vision whose sources decide the result, or a family beside
+            it ("encoders", "policies"); core's names and config always count.
+        packages: distributions whose versions decide the result.
+
+    Raises:
+        InputError: the name stands for another function already.
+    """
+    kind = JobKind(function, stages, packages)
+    known = _kinds.setdefault(name, kind)
+    if known.function != function:
+        raise InputError(f"Job '{name}' is {known.function} already; give {function} another name.")
+    _kinds[name] = kind
+
+
+def job(
+    name: str,
+    *,
+    stages: tuple[str, ...],
+    packages: tuple[str, ...] = ("mujoco", "numpy"),
+) -> Callable[[F], F]:
+    """Register the decorated function as a job; the arguments are those of `register_job`."""
+
+    def register(function: F) -> F:
+        path = f"{function.__module__}:{function.__qualname__}"
+        register_job(name, path, stages=stages, packages=packages)
+        return function
+
+    return register
 
 
 @dataclass(frozen=True)
@@ -84,31 +92,50 @@ class Job:
     """One unit of work.
 
     Attributes:
-        name: a key of the table of jobs.
+        name: a registered name.
         arguments: JSON data, the function's keyword arguments.
         inputs: hashes of what the job reads besides its arguments.
         weight: what it counts for in the progress.
-        label: arguments named here are left out of the key (where a file lies does not change what
-            it holds).
+        label: names of arguments that are left out of the key: where a file lies does not change
+            what it holds.
     """
 
     name: str
-    arguments: Mapping[str, Any]
+    arguments: Mapping[str, JSON]
     inputs: tuple[str, ...] = ()
     weight: int = 1
     label: tuple[str, ...] = ()
 
-    def key(self, table: Mapping[str, JobKind] = JOBS) -> str:
+    @property
+    def kind(self) -> JobKind:
+        """Return what the name stands for.
+
+        Raises:
+            UnknownName: nothing that was imported registers it.
+        """
+        return _kinds[check_name("job", self.name, _kinds)]
+
+    def key(self) -> str:
         """Return the sha256 (hex) under which the result is stored."""
+        counted = {name: value for name, value in self.arguments.items() if name not in self.label}
         return digest(
             {
                 "name": self.name,
-                "arguments": {k: v for k, v in self.arguments.items() if k not in self.label},
+                "arguments": counted,
                 "inputs": list(self.inputs),
-                "code": code_version(*table[self.name].stages),
-                "packages": [_version(name) for name in table[self.name].packages],
+                "code": code_version(*self.kind.stages),
+                "packages": [_version(name) for name in self.kind.packages],
             }
         )
+
+    def __str__(self) -> str:
+        """Return the job in a few words for a message."""
+        shown = (
+            f"{name}={value}"
+            for name, value in self.arguments.items()
+            if isinstance(value, (str, int))
+        )
+        return f"{self.name}({', '.join(shown)})"
 
 
 @functools.cache
@@ -116,44 +143,36 @@ def _version(package: str) -> str:
     return f"{package} {importlib.metadata.version(package)}"
 
 
-def work(
-    function: str, arguments: dict[str, Any], destination: Path
-) -> tuple[int, str, str] | None:
-    """Do one job; return None, or (exit code, message, traceback) since not every exception can be
-    pickled.
+@dataclass(frozen=True)
+class Task:
+    """A job to be done: what an engine is handed.
+
+    Attributes:
+        job: the job, for messages.
+        function: "module:function".
+        destination: the folder that holds the result once it is committed.
     """
-    if destination.is_dir():  # its worker was killed after the commit and before it could say so
+
+    job: Job
+    function: str
+    destination: Path
+
+    def do(self) -> Failure | None:
+        """Do the job in this process; return how it failed."""
+        return perform(self.function, dict(self.job.arguments), str(self.destination))
+
+
+def perform(function: str, arguments: dict[str, JSON], destination: str) -> Failure | None:
+    """Do one job and commit its result; the function that every engine runs in its workers."""
+    target = Path(destination)
+    if target.is_dir():  # its worker was killed after the commit and before it could say so
         return None
     try:
         module, _, name = function.partition(":")
-        with whole_folder(destination) as folder:
+        with whole_folder(target) as folder:
             getattr(importlib.import_module(module), name)(folder, **arguments)
-    except SurgicaiError as error:
-        return error.exit_code, str(error), ""
     except Exception as error:
-        if destination.is_dir():  # somebody else committed the same result first
+        if target.is_dir():  # somebody else committed the same result first
             return None
-        return 1, f"{type(error).__name__}: {error}", traceback.format_exc()
+        return Failure.of(error)
     return None
-
-
-def failure_of(failure: tuple[int, str, str] | None, job: Job) -> SurgicaiError | None:
-    """Return what a job reported as the error it stands for, its traceback in a note; None for a
-    job done.
-    """
-    if failure is None:
-        return None
-    code, message, trace = failure
-    if not trace:
-        return (InputError if code == InputError.exit_code else SurgicaiError)(message)
-    error = SurgicaiError(f"{describe(job)} failed: {message}")
-    error.add_note(trace)
-    return error
-
-
-def describe(job: Job) -> str:
-    """Return a job in a few words for a message."""
-    text = ", ".join(
-        f"{key}={value}" for key, value in job.arguments.items() if isinstance(value, (str, int))
-    )
-    return f"{job.name}({text})"

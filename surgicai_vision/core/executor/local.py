@@ -1,179 +1,110 @@
 """The local engine: spawned processes on this machine, or none.
 
-Workers are spawned (a GL context cannot be shared by a fork) and each is on its own: one that dies
-(killed, out of memory) is replaced, its job is tried again, and the others go on. A worker whose
-parent died ends by itself.
+Each worker is on its own: one that dies (killed, out of memory) is replaced, its job is tried
+again, and the others go on.
 """
 
-import multiprocessing
-import os
-import signal
-import threading
-import time
 from collections import Counter
-from collections.abc import Generator, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection, wait
-from pathlib import Path
-from typing import Any, final
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from typing import ClassVar, cast, final
 
-from surgicai_vision.core.errors import SurgicaiError
-from surgicai_vision.core.executor.jobs import (
-    WORKER_ENVIRONMENT,
-    Job,
-    JobKind,
-    describe,
-    failure_of,
-    work,
-)
+from surgicai_vision.core.executor.engine import Ending, Engine, lost
+from surgicai_vision.core.executor.jobs import Task, perform
+from surgicai_vision.core.processes import OFFLINE, ONE_THREAD, Died, Done, Failure, Worker
 
 ATTEMPTS = 2
 """How often a job is started whose worker dies, where the caller does not say."""
-LEAVE_S = 10
-"""Longest a dismissed worker may take to leave [s]."""
 
-
-def execute(
-    jobs: Mapping[str, Job],
-    store: Path,
-    workers: int,
-    table: Mapping[str, JobKind],
-    attempts: int | None = None,
-) -> Generator[tuple[str, SurgicaiError | None]]:
-    """Do `jobs` and yield each key as its result is committed, or with the error that the job ended
-    in.
-    """
-    if not workers:
-        for key, job in jobs.items():
-            yield (
-                key,
-                failure_of(work(table[job.name].function, dict(job.arguments), store / key), job),
-            )
-        return
-    queue, started = list(jobs), Counter[str]()
-    crew: list[_Worker] = []
-    try:
-        while queue or any(worker.key for worker in crew):
-            while queue and len([worker for worker in crew if worker.key]) < workers:
-                key = queue.pop(0)
-                started[key] += 1
-                _free(crew).begin(
-                    key, table[jobs[key].name].function, dict(jobs[key].arguments), store / key
-                )
-            for worker in _heard(crew):
-                key = worker.key
-                try:
-                    yield key, failure_of(worker.result(), jobs[key])
-                except EOFError:
-                    crew.remove(worker)
-                    if started[key] < (attempts or ATTEMPTS):
-                        queue.insert(0, key)
-                    else:
-                        yield key, _died(jobs[key], started[key])
-        for worker in crew:
-            worker.dismiss()
-    finally:
-        for worker in crew:
-            worker.end()
-
-
-def _died(job: Job, times: int) -> SurgicaiError:
-    return SurgicaiError(
-        f"A worker died {times} times (killed, or out of memory) at: {describe(job)}. "
-        "What is finished is kept: run the same command again, with fewer workers."
-    )
-
-
-def _free(crew: "list[_Worker]") -> "_Worker":
-    """Return a worker without a job; a new one where there is none."""
-    for worker in crew:
-        if not worker.key:
-            return worker
-    crew.append(_Worker())
-    return crew[-1]
-
-
-def _heard(crew: "list[_Worker]") -> "list[_Worker]":
-    """Wait until some of the busy workers are done or dead and return those."""
-    ready = wait([worker.connection for worker in crew if worker.key])
-    return [worker for worker in crew if worker.connection in ready]
+VARIABLES: Mapping[str, str] = {**ONE_THREAD, **OFFLINE}
+"""Environment of a worker: one core, and no network, since what a job needs is its input."""
 
 
 @final
-class _Worker:
-    """A process that does one job after the other.
+@dataclass(frozen=True)
+class LocalEngine(Engine):
+    """Processes of this machine."""
 
-    Attributes:
-        key: the job it is at; "" when it waits for one.
-        connection: becomes readable when the job is done or the process dead.
-    """
+    name: ClassVar[str] = "local"
 
-    def __init__(self) -> None:
-        self.key = ""
-        context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
-        with environment(WORKER_ENVIRONMENT):
-            self._process = context.Process(target=_serve, args=(theirs, os.getpid()))
-            self._process.start()
-        theirs.close()  # theirs alone holds the other end now: it closes when the process dies
-
-    def begin(self, key: str, function: str, arguments: dict[str, Any], destination: Path) -> None:
-        """Hand it a job."""
-        self.key = key
-        with suppress(OSError):  # dead already: `result` says so
-            self.connection.send((function, arguments, destination))
-
-    def result(self) -> tuple[int, str, str] | None:
-        """Return what the job reported and free the worker; `EOFError` where the process died."""
+    def execute(
+        self, tasks: Mapping[str, Task], workers: int, attempts: int | None = None
+    ) -> Generator[Ending]:
+        """Do the tasks in `workers` processes; 0 does them in this one."""
+        if not workers:
+            for key, task in tasks.items():
+                failure = task.do()
+                yield key, failure.as_error(str(task.job)) if failure else None
+            return
+        crew = _Crew(tasks, workers, attempts or ATTEMPTS)
         try:
-            reported: tuple[int, str, str] | None = self.connection.recv()
-        except (OSError, EOFError):
-            self.end()
-            raise EOFError from None
-        self.key = ""
-        return reported
+            yield from crew.work()
+            crew.dismiss()
+        finally:
+            crew.end()
+
+
+LOCAL = LocalEngine()
+
+
+@final
+class _Crew:
+    """The workers of a run, and the queue that they work off."""
+
+    def __init__(self, tasks: Mapping[str, Task], workers: int, attempts: int):
+        self._tasks = tasks
+        self._workers = workers
+        self._attempts = attempts
+        self._queue = list(tasks)
+        self._started = Counter[str]()
+        self._idle: list[Worker] = []
+        self._busy: dict[Worker, str] = {}
+
+    def work(self) -> Generator[Ending]:
+        """Work off the queue."""
+        while self._queue or self._busy:
+            while self._queue and len(self._busy) < self._workers:
+                self._begin(self._queue.pop(0))
+            ready = wait([worker.connection for worker in self._busy])
+            for worker in [worker for worker in self._busy if worker.connection in ready]:
+                yield from self._hear(worker)
 
     def dismiss(self) -> None:
-        """Let an idle process leave in order (it frees its GL context)."""
-        self.connection.close()
-        self._process.join(LEAVE_S)
+        """Let the idle workers leave in order."""
+        for worker in self._idle:
+            worker.dismiss()
 
     def end(self) -> None:
-        """End the process at once; what it had not committed is lost."""
-        self.connection.close()
-        self._process.kill()
-        self._process.join()
+        """End all workers at once; what they had not committed is lost."""
+        for worker in [*self._idle, *self._busy]:
+            worker.end()
 
+    def _begin(self, key: str) -> None:
+        """Hand a task to an idle worker, or to a new one where there is none."""
+        task = self._tasks[key]
+        worker = self._idle.pop() if self._idle else Worker(VARIABLES)
+        self._busy[worker] = key
+        self._started[key] += 1
+        worker.call(perform, task.function, dict(task.job.arguments), str(task.destination))
 
-def _serve(connection: Connection, parent: int) -> None:
-    """Do jobs until the connection ends: Ctrl-C is the parent's to handle, and without a parent
-    there is no work.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def end_with_parent() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
-    try:
-        while True:
-            connection.send(work(*connection.recv()))
-    except (EOFError, OSError):
-        return
-
-
-@contextmanager
-def environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables for the processes started inside."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
+    def _hear(self, worker: Worker) -> Generator[Ending]:
+        """Take what a worker says; one that died is dropped and its job tried again."""
+        key = self._busy[worker]
+        job = self._tasks[key].job
+        try:
+            answer = worker.receive()
+        except Died:
+            del self._busy[worker]
+            worker.end()
+            if self._started[key] < self._attempts:
+                self._queue.insert(0, key)
             else:
-                os.environ[name] = value
+                yield key, lost(job, self._started[key])
+            return
+        if answer is None:
+            return
+        del self._busy[worker]
+        self._idle.append(worker)
+        failure = cast(Failure | None, answer.value) if isinstance(answer, Done) else answer
+        yield key, failure.as_error(str(job)) if failure else None

@@ -1,55 +1,24 @@
-"""Run jobs against a store: what is there is never computed again, what is missing is done and
-committed whole.
+"""Run jobs against a store: what is there is never computed again.
+
+What is missing is done by an engine and committed whole.
 """
 
-import fcntl
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
-from surgicai_vision.core.errors import InputError, SurgicaiError, check_name
-from surgicai_vision.core.executor import local, ray_engine
-from surgicai_vision.core.executor.jobs import JOBS, Job, JobKind
-from surgicai_vision.core.files import TEMPORARY, sync_folder
+from filelock import Timeout
 
-Progress = Callable[[int, int, str], None]
-"""`progress(done, total, unit)`, called after every finished job and once at the start."""
+from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.core.executor.context import RunContext
+from surgicai_vision.core.executor.jobs import Job, Task
+from surgicai_vision.core.files import TEMPORARY, locked, sync_folder
+from surgicai_vision.core.progress import Progress, silent
 
 Ended = Callable[[Job, Path, SurgicaiError | None], None]
-"""`ended(job, folder, error)`, called as a job ends; without an error the folder holds its
-result.
-"""
-
-ENGINES = ("local", "ray")
-
-
-@dataclass(frozen=True)
-class Engine:
-    """What runs the jobs; it never decides what they give.
-
-    Attributes:
-        name: "local" (processes of this machine) or "ray".
-        address: of a running Ray cluster whose nodes see the store under the same path; by default
-            Ray starts on this machine alone.
-    """
-
-    name: str = "local"
-    address: str | None = None
-
-    def __post_init__(self) -> None:
-        check_name("executor", self.name, ENGINES)
-        if self.address and self.name != "ray":
-            raise InputError(
-                f"--address {self.address} is of a Ray cluster; give --executor ray with it."
-            )
-        if self.name == "ray":
-            ray_engine.check()
-
-
-LOCAL = Engine()
+"""Called as `ended(job, folder, error)`; without an error the folder holds the job's result."""
 
 LOCK = ".lock"
 """File in a store that its run holds locked."""
@@ -58,12 +27,10 @@ LOCK = ".lock"
 def run(
     jobs: Sequence[Job],
     store: Path,
+    context: RunContext,
     *,
-    workers: int = 1,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     unit: str = "jobs",
-    table: Mapping[str, JobKind] = JOBS,
-    engine: Engine = LOCAL,
     attempts: int | None = None,
     ended: Ended | None = None,
 ) -> list[Path]:
@@ -72,46 +39,35 @@ def run(
     Args:
         jobs: what to do.
         store: folder of results; made when missing.
-        workers: number of processes; 0 runs in this one.
-        progress: called with (done, total, unit), counted by the jobs' weights.
+        context: workers (0 does the jobs in this process) and engine.
+        progress: counts the jobs' weights.
         unit: what the weights count ("frames").
-        table: name → kind of job.
-        engine: what runs them.
-        attempts: how often a job is started whose worker dies; the engine's own number by default.
-        ended: called with (job, its folder, its error or None) for every job of this run as it
-            ends; then a job that fails does not end the run.
+        attempts: how often a job is started whose worker dies; None is the engine's own number.
+        ended: called for every job of this run as it ends; then a job that fails does not end the
+            run.
 
     Raises:
-        InputError: `workers` below 0, an unknown job, a store in use by another run, or bad input
-            to a job.
+        InputError: an unknown job, a store in use by another run, or bad input to a job.
         SurgicaiError: a job failed, or its worker died at every attempt.
     """
-    if workers < 0:
-        raise InputError(f"workers is {workers}; it must be 0 (this process) or more.")
-    for job in jobs:
-        check_name("job", job.name, table)
-    report = progress or (lambda done, total, unit: None)
-    folders = {job.key(table): job for job in jobs}
+    by_key = {job.key(): job for job in jobs}
     with claim(store):
-        missing = {key: job for key, job in folders.items() if not (store / key).is_dir()}
-        total = sum(job.weight for job in folders.values())
+        missing = {key: job for key, job in by_key.items() if not (store / key).is_dir()}
+        total = sum(job.weight for job in by_key.values())
         done = total - sum(job.weight for job in missing.values())
-        report(done, total, unit)
-        if engine.name == "ray":
-            finished = ray_engine.execute(
-                missing, store.resolve(), workers, table, engine.address, attempts
-            )
-        else:
-            finished = local.execute(missing, store, workers, table, attempts)
-        with closing(finished):  # workers end with it, whatever is raised here
-            for key, error in finished:
+        progress(done, total, unit)
+        root = store.resolve()
+        tasks = {key: Task(job, job.kind.function, root / key) for key, job in missing.items()}
+        endings = context.engine.execute(tasks, context.processes(), attempts)
+        with closing(endings):  # workers end with it, whatever is raised here
+            for key, error in endings:
                 if ended:
-                    ended(folders[key], store / key, error)
+                    ended(by_key[key], store / key, error)
                 elif error:
                     raise error
-                done += folders[key].weight
-                report(done, total, unit)
-    return [store / job.key(table) for job in jobs]
+                done += by_key[key].weight
+                progress(done, total, unit)
+    return [store / job.key() for job in jobs]
 
 
 _claimed: set[Path] = set()
@@ -130,10 +86,10 @@ def claim(store: Path) -> Iterator[None]:
         yield
         return
     path.mkdir(parents=True, exist_ok=True)
-    with open(path / LOCK, "w") as lock:
+    with ExitStack() as stack:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            stack.enter_context(locked(path / LOCK, wait=False))
+        except Timeout:
             raise InputError(
                 f"Another run is working in {store}; wait for it or stop it first."
             ) from None
@@ -160,7 +116,7 @@ def building(out: Path) -> Iterator[tuple[Path, Path]]:
     removed; after an error or a kill the store stays, and the next run goes on with what it holds.
 
         with building(out) as (store, result):
-            shards = run(jobs, store)
+            shards = run(jobs, store, context)
             with whole_folder(result) as folder: …
     """
     store = work_folder(out)
@@ -173,5 +129,5 @@ def building(out: Path) -> Iterator[tuple[Path, Path]]:
             sync_folder(out.parent)
             shutil.rmtree(store)
     finally:
-        if store.exists() and all(path.name == LOCK for path in store.iterdir()):
-            shutil.rmtree(store, ignore_errors=True)
+        if store.exists() and not any(store.iterdir()):
+            store.rmdir()

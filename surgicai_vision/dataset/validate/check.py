@@ -25,8 +25,8 @@ import pyarrow.parquet as pq
 from surgicai_vision.core import names
 from surgicai_vision.core.config import digest as digest_of
 from surgicai_vision.core.errors import BadFile
-from surgicai_vision.core.executor import Progress
 from surgicai_vision.core.files import read_json, sha256_file
+from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.reader import Dataset, open_dataset
 from surgicai_vision.dataset.stats import column_statistics
@@ -70,7 +70,7 @@ def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
         BadFile: it cannot be opened at all.
     """
     if (path / INFO).is_file() and not (path / names.META_FILE).exists():
-        return _check_foreign(LeRobotFiles(path), progress or (lambda done, total, unit: None))
+        return _check_foreign(LeRobotFiles(path), progress or silent)
     dataset = open_dataset(path)
     problems: list[str] = []
     columns = dataset.columns()

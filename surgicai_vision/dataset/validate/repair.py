@@ -21,8 +21,9 @@ from typing import Any
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, SurgicaiError
-from surgicai_vision.core.executor import Progress, claim, work_folder
+from surgicai_vision.core.executor import claim, work_folder
 from surgicai_vision.core.files import check_output, sync_folder, whole_folder, write_json
+from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.metadata import INDEX_FEATURES, EpisodeRow, video_path, write_metadata
 from surgicai_vision.dataset.validate.check import CheckReport, check_dataset
@@ -86,7 +87,7 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress | Non
         with claim(work):
             made = work / "result"
             shutil.rmtree(made, ignore_errors=True)
-            rows = _write(files, made, work, claimed, progress or (lambda done, total, unit: None))
+            rows = _write(files, made, work, claimed, progress or silent)
             after = check_dataset(made)
             if not after.ok:
                 raise SurgicaiError(

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
+from surgicai_vision.core.processes import ONE_THREAD, run_module
 
 READERS: Mapping[str, str] = MappingProxyType(
     {
@@ -81,26 +82,15 @@ def read_foreign(path: Path, kind: str = "surgicai", **options: Any) -> dict[str
         )
     with tempfile.TemporaryDirectory(prefix="surgicai-vision-") as folder:
         result = Path(folder) / "arrays.npz"
-        command = [
-            sys.executable,
-            "-m",
-            "surgicai_vision.demos.imports.sandbox",
-            str(path),
-            str(result),
-            kind,
-        ]
         try:
-            child = subprocess.run(
-                [*command, json.dumps(options)],
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
+            child = run_module(
+                "surgicai_vision.demos.imports.sandbox",
+                str(path),
+                str(result),
+                kind,
+                json.dumps(options),
+                variables={**ONE_THREAD, "PYTHONPATH": _search_path()},
                 timeout=WALL_SECONDS,
-                env={
-                    **os.environ,
-                    "OPENBLAS_NUM_THREADS": "1",
-                    "OMP_NUM_THREADS": "1",
-                    "PYTHONPATH": _search_path(),
-                },
             )
         except subprocess.TimeoutExpired:
             raise BadFile(f"{path} was not read within {WALL_SECONDS} s.") from None

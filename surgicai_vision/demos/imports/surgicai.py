@@ -23,8 +23,9 @@ import numpy as np
 from surgicai_vision.core import names
 from surgicai_vision.core.config import STEPS, TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnreachablePose, check_name
-from surgicai_vision.core.executor import Progress, building
+from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output, code_version, sha256_file, whole_folder
+from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.demos.imports.replay import (
     MOST_CLIPPED,
     Episode,
@@ -104,9 +105,7 @@ def import_demos(
         limit = max(STEP_LIMIT, *(len(episode.action) for episode in episodes))
         config = TaskConfig(task, step=step, tolerance="released", reward="dense", max_steps=limit)
         with building(out) as (_, result), whole_folder(result) as folder:
-            notes, skipped = _write(
-                folder, episodes, config, progress or (lambda done, total, unit: None)
-            )
+            notes, skipped = _write(folder, episodes, config, progress or silent)
             notes.update(
                 step=step,
                 steps=sum(len(e.action) for e in episodes),

@@ -16,7 +16,7 @@ from typing import Any, final
 from surgicai_vision.core import files
 from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
-from surgicai_vision.core.executor import LOCAL, Engine, Job, claim, run
+from surgicai_vision.core.executor import LOCAL, Engine, Job, RunContext, claim, run
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.storage import (
@@ -84,7 +84,7 @@ def run_sweep(
             for task in grid.task
             if any(s.cell.task == task and s.state != LEFT for s in states)
         ]
-        do = functools.partial(run, workers=workers, engine=engine, attempts=attempts)
+        do = functools.partial(run, context=RunContext(workers, engine), attempts=attempts)
         sweep = _Sweep(grid, out, stage, do, tuple(tasks))
         to_do = [state for state in states if state.state == TO_DO]
         sweep.prepare(to_do, workers, engine)

@@ -9,15 +9,14 @@ import dataclasses
 import functools
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.files import write_json
-from surgicai_vision.core.progress import Stage, timed
+from surgicai_vision.core.progress import Stage, silent_stage, timed
 from surgicai_vision.evaluation.policy_spec import (
     Subject,
     baseline_subject,
@@ -43,7 +42,9 @@ def encode_features(
 ) -> None:
     """Job "sweep-features": put what a cell sees into the feature cache."""
     os.environ.update(environment)
-    features, _ = encode_cell(_cell(cell), _dataset(dataset), silent, accept_licence=accept_licence)
+    features, _ = encode_cell(
+        _cell(cell), _dataset(dataset), silent_stage, accept_licence=accept_licence
+    )
     write_json(folder / "features.json", [entry.folder.name for entry in features])
 
 
@@ -59,7 +60,12 @@ def train_policy(
     """Job "sweep-policy": train one policy of a chain."""
     os.environ.update(environment)
     train_cell(
-        _cell(cell), _dataset(dataset), folder, silent, accept_licence=accept_licence, **options
+        _cell(cell),
+        _dataset(dataset),
+        folder,
+        silent_stage,
+        accept_licence=accept_licence,
+        **options,
     )
 
 
@@ -80,7 +86,7 @@ def run_cell(
     """
     os.environ.update(environment)
     what, seconds, policy = _cell(cell), dict[str, float](), folder / "policy"
-    stage = functools.partial(timed, silent, seconds)
+    stage = functools.partial(timed, silent_stage, seconds)
     with stage() as measured:
         subject = _subject(
             what, policies, _dataset(dataset), policy, measured, accept_licence, options
@@ -135,7 +141,7 @@ def run_probe(
 
     os.environ.update(environment)
     what, data = _cell(cell), _dataset(dataset)
-    features, _ = encode_cell(what, data, silent, accept_licence=accept_licence)
+    features, _ = encode_cell(what, data, silent_stage, accept_licence=accept_licence)
     row = {
         "task": what.task,
         "encoder": what.encoder,
@@ -143,12 +149,6 @@ def run_probe(
         "pool": what.pool,
     }
     write_json(folder / PROBE_FILE, {**row, **probe(data, features).row()})
-
-
-@contextmanager
-def silent(title: str, unit: str) -> Iterator[Callable[..., None]]:
-    """Show no progress: the run counts cells."""
-    yield lambda done, total, unit="": None
 
 
 def _subject(

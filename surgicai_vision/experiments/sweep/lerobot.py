@@ -4,18 +4,14 @@ features.
 Its checkpoint is evaluated as `surgicai-vision evaluate` does. LeRobot is not imported here.
 """
 
-import ctypes
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.core.processes import OFFLINE, run_module
 from surgicai_vision.experiments.run import OWN, Cell
 from surgicai_vision.features import encoders
 
@@ -30,8 +26,8 @@ OPTIONS = {
 """What a policy needs besides: to start its backbone from random weights, and ten steps of
 denoising in the place of a hundred, which take minutes an episode on a core."""
 SCRATCH = "export"
-PARENT_DEATH = 1
-"""prctl's PR_SET_PDEATHSIG: the child ends with its parent."""
+VARIABLES = {**OFFLINE, "HF_DATASETS_DISABLE_PROGRESS_BARS": "1", "WANDB_MODE": "disabled"}
+"""Environment of `lerobot-train`."""
 
 
 def train_lerobot(
@@ -59,16 +55,9 @@ def train_lerobot(
     if cell.encoder != OWN:
         root = out.with_name(SCRATCH)
         _export(cell, dataset, root, accept_licence)
-    command = [
-        sys.executable,
-        "-m",
-        "lerobot.scripts.lerobot_train",
-        *_arguments(cell, dataset, root, out),
-    ]
-    command += [f"--steps={steps}", f"--batch_size={batch}", f"--save_freq={steps}"]
-    done = subprocess.run(
-        command, capture_output=True, text=True, env=_environment(), preexec_fn=_end_with_parent
-    )
+    arguments = _arguments(cell, dataset, root, out)
+    arguments += [f"--steps={steps}", f"--batch_size={batch}", f"--save_freq={steps}"]
+    done = run_module("lerobot.scripts.lerobot_train", *arguments, variables=VARIABLES)
     if done.returncode:
         raise SurgicaiError(f"lerobot-train failed for {cell.name}:\n{done.stderr[-2000:]}")
 
@@ -119,20 +108,3 @@ def _arguments(cell: Cell, dataset: Any, root: Path, out: Path) -> list[str]:
         arguments.append(f"--policy.input_features={json.dumps(inputs)}")
         arguments.append(f"--env.cameras={json.dumps(list(cell.view))}")
     return arguments
-
-
-def _environment() -> dict[str, str]:
-    return {
-        **os.environ,
-        "HF_HUB_OFFLINE": "1",
-        "HF_DATASETS_DISABLE_PROGRESS_BARS": "1",
-        "WANDB_MODE": "disabled",
-    }
-
-
-def _end_with_parent() -> None:
-    """Be killed when the worker is (Linux alone has this; elsewhere the training runs to its
-    end).
-    """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PARENT_DEATH, signal.SIGKILL)

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import digest, to_mapping
+from surgicai_vision.core.config import JSON, digest, to_mapping
 from surgicai_vision.core.errors import BadFile, MissingWeights
-from surgicai_vision.core.executor import Job
+from surgicai_vision.core.executor import Job, register_job
 from surgicai_vision.core.files import read_json
 from surgicai_vision.evaluation.storage import CELL_FILE
 from surgicai_vision.experiments.run import OWN, Cell
@@ -28,6 +28,31 @@ CACHED, TO_DO, NOT_RUN, LEFT = "cached", "to do", "not run", "left"
 STATES = (TO_DO, CACHED, NOT_RUN, LEFT)
 FEATURE_SWITCHES = ("preprocessing", "batch_norm_drift", "bgr")
 """Deviations that change features."""
+
+LEARN = (
+    "scene",
+    "envs",
+    "demos",
+    "dataset",
+    "features",
+    "training",
+    "experiments",
+    "encoders",
+    "policies",
+)
+EVALUATE = (*LEARN, "evaluation")
+PACKAGES = ("mujoco", "numpy", "torch", "timm", "lerobot")
+"""Sources and distributions that decide what a job of a sweep gives."""
+for name, function, stages in (
+    ("sweep-features", "encode_features", LEARN),
+    ("sweep-policy", "train_policy", LEARN),
+    ("sweep-probe", "run_probe", LEARN),
+    ("sweep-cell", "run_cell", EVALUATE),
+    ("sweep-reference", "run_reference", EVALUATE),
+):
+    register_job(
+        name, f"surgicai_vision.experiments.sweep.jobs:{function}", stages=stages, packages=PACKAGES
+    )
 
 
 @dataclass(frozen=True)
@@ -95,7 +120,7 @@ class Jobs:
         self, grid: Grid, out: Path, command: str = "", environment: Mapping[str, str] | None = None
     ):
         self.grid, self.out = grid, out
-        self._where = {"command": command, "environment": dict(environment or {})}
+        self._where: dict[str, JSON] = {"command": command, "environment": dict(environment or {})}
         self._digests: dict[str, str | None] = {}
 
     def cell_folder(self, key: str) -> Path:
@@ -181,13 +206,9 @@ class Jobs:
         """Return the job that evaluates the expert, or blind replay, on a task."""
         dataset = str((self.data_folder(task) / "dataset").absolute())
         config = to_mapping(self.grid.config(task))
-        arguments = {
-            "name": name,
-            "config": config,
-            "seeds": self._seeds,
-            "dataset": dataset,
-            **self._where,
-        }
+        arguments: dict[str, JSON] = {
+            "name": name, "config": config, "seeds": self._seeds, "dataset": dataset, **self._where
+        }  # fmt: skip
         inputs = (self.dataset_digest(task) or "",) if name == "replay" else ()
         return Job("sweep-reference", arguments, inputs, label=LABELS)
 

@@ -23,8 +23,9 @@ import numpy as np
 from surgicai_vision.core import names
 from surgicai_vision.core.config import STEPS, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, UnreachablePose, check_name
-from surgicai_vision.core.executor import Progress, building
+from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output, code_version, sha256_file, whole_folder
+from surgicai_vision.core.progress import Progress
 from surgicai_vision.demos.imports.replay import MOST_CLIPPED, Replay, Track, moves
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
 from surgicai_vision.demos.imports.rosbag.segments import held

@@ -1,0 +1,46 @@
+"""The table of engines, by their names on the command line.
+
+open_engine("local")
+open_engine("slurm,partition=cpu,minutes=60")
+"""
+
+import dataclasses
+from typing import Final
+
+from surgicai_vision.core.config import from_mapping, read_changes
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.executor.engine import Engine
+from surgicai_vision.core.plugins import ENGINES_GROUP, Registry
+
+ENGINES: Final = Registry[type[Engine]](
+    "executor",
+    ENGINES_GROUP,
+    {
+        "local": "surgicai_vision.core.executor.local:LocalEngine",
+        "ray": "surgicai_vision.core.executor.ray:RayEngine",
+        "slurm": "surgicai_vision.core.executor.slurm:SlurmEngine",
+    },
+)
+
+
+def register_engine(engine: type[Engine]) -> None:
+    """Offer an engine under its name in this process.
+
+    Raises:
+        NameCollision: the name is taken.
+    """
+    ENGINES.register(engine.name, engine, engine.__module__.partition(".")[0])
+
+
+def open_engine(text: str) -> Engine:
+    """Return the engine that a text names, with its options: "NAME" or "NAME,KEY=VALUE,…".
+
+    Raises:
+        UnknownName: an engine or an option that does not exist.
+        InputError: a value that is not allowed, or a package that is missing.
+    """
+    name, *options = text.split(",")
+    engine = ENGINES.load(name)
+    if options and not dataclasses.fields(engine):
+        raise InputError(f"--executor {name} takes no options; leave '{options[0]}' out.")
+    return from_mapping(engine, read_changes(options), f"--executor {name}")
