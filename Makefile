@@ -2,6 +2,7 @@
 # make quickstart   set up, then run the main job: outputs/quickstart/report.html
 # make test         set up, then pass the tests
 # make check        lint, format, types, import rule, tests
+# make figures      count what CONTRIBUTING.md asks of the sources
 # make format       rewrite the sources in the house's format
 # make lock         rewrite requirements.lock (UPGRADE=1: newest versions allowed)
 
@@ -10,7 +11,7 @@ BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
-.PHONY: setup quickstart test lint check format lock
+.PHONY: setup quickstart test lint check figures format lock
 .NOTPARALLEL:
 
 setup:
@@ -29,6 +30,9 @@ lint: setup
 	$(BIN)/mypy
 
 check: lint test
+
+figures:
+	@$(BIN)/python scripts/figures.py
 
 format: setup
 	$(BIN)/ruff check --fix-only --exit-zero .

@@ -5,4 +5,4 @@ Importing this package does nothing but name the version; `import surgicai_visio
 the gymnasium ids.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
