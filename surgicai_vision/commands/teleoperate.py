@@ -20,7 +20,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.teleoperation.keyboard import key_table
 
-EXAMPLE = "surgicai-vision teleoperate --task grasp --web"
+EXAMPLE = "surgicai-vision teleoperate --task grasp"
 NOTES = f"""keys (by their place on a US keyboard) and gamepad:
 {key_table()}
 
@@ -55,13 +55,11 @@ class Options:
     task: str = option(
         "grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
     )
-    web: bool = option(False, "show a page on this machine's loopback in place of a window")
-    port: int | None = option(
-        None,
-        "with --web, its port, 0 for any",
+    port: int = option(
+        WEB_PORT,
+        "port of the page on this machine's loopback, 0 for any",
         check=_within(0, 65535),
         metavar="N",
-        default_text=f"{WEB_PORT}",
     )
     view: tuple[str, ...] = option(
         ("front", "back"),
@@ -123,28 +121,27 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     from surgicai_vision.teleoperation.pacer import Pacer
     from surgicai_vision.teleoperation.recordings import open_recordings
     from surgicai_vision.teleoperation.session import Rules, Session
+    from surgicai_vision.teleoperation.web import WebView
 
     if not options.view:
         raise InputError("--view is empty; name at least one view.")
-    if options.port is not None and not options.web:
-        raise InputError("--port is the page's; give --web with it.")
     config = _config(options)
     out = Path(options.out) if options.out else folders.OUTPUTS / "teleoperation" / options.task
     folders.check_folder(out, "demos.json")
     rules = Rules(options.episodes, options.auto_keep, options.keep_failures, options.skip_idle)
-    with _place(options) as place:
+    with WebView(options.view, names.TASK_TEXTS[options.task], options.port) as page:
         env = envs.make(config)
         with open_recordings(out, config, env.scene.hash, options.seed) as recordings:
             session = Session(
                 env, Steering(env, options.frame, options.speed), recordings, options.view, rules
             )
             views = Views(env, options.view, options.size)
-            for line in place.invitation:
+            for line in page.invitation:
                 console.note(line)
             drive(
                 session,
-                place,
-                place,
+                page,
+                page,
                 views,
                 Pacer(options.pace),
                 lambda status: _tell(console, status.message),
@@ -178,18 +175,6 @@ def _config(options: Options) -> TaskConfig:
     subtasks = len(names.SUBTASKS) if options.task == names.SUTURE else 1
     seconds = SECONDS * subtasks if options.seconds is None else options.seconds
     return dataclasses.replace(config, max_steps=max(1, round(seconds * names.FPS)))
-
-
-def _place(options: Options) -> Any:
-    """Return where the person sees and acts: a window or a page."""
-    title = names.TASK_TEXTS[options.task]
-    if options.web:
-        from surgicai_vision.teleoperation.web import WebView
-
-        return WebView(options.view, title, WEB_PORT if options.port is None else options.port)
-    from surgicai_vision.teleoperation.window import Window
-
-    return Window(options.view, title, options.size)
 
 
 def _tell(console: Console, message: str) -> None:

@@ -3,7 +3,7 @@ any others.
 
     keys, sticks ──poll──► Input ──Steering──► action (7,) ──Session.tick──► env ──► Recordings: a
     file an episode
-       window | web page ◄──────────── images and status ◄────────┘
+       web page ◄──────────────────── images and status ◄────────┘
 
 The parts, each usable and tested alone:
 
@@ -20,10 +20,9 @@ The parts, each usable and tested alone:
   at any moment costs the attempt in flight; the same command continues the numbers and the seeds.
 * `pacing`: ticks at 50 Hz of the wall clock. When drawing is too slow, images are dropped, never
   ticks.
-* `window`, `web`: the two places where a person sees and acts. Both are a `Device` and a `Screen`
-  (`driving`).
+* `web`: the page on which a person sees and acts; a `Device` and a `Screen` (`loop`).
 
-The web view exists for machines without a display: it listens on loopback alone, its address holds
-a random token, and a gamepad on the viewer's own machine works through the browser. Images are
-polled one by one, not streamed, so a slow line shows fewer of them and none late.
+The page's server listens on loopback only, its address holds a random token, and a gamepad on the
+viewer's own machine works through the browser. Images are polled one by one, not streamed, so a
+slow connection shows fewer of them and none late.
 """

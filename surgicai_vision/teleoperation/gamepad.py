@@ -1,7 +1,6 @@
 """Gamepad: axes and buttons in the order of the W3C's standard gamepad become an `Input`.
 
-The same order serves a browser's Gamepad API as it is, and GLFW's gamepads after `window` put them
-in it.
+A browser's Gamepad API reports gamepads with the mapping "standard" in this order.
 """
 
 from collections.abc import Sequence

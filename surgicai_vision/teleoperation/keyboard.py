@@ -104,7 +104,7 @@ class Keyboard:
         self._held = down
 
     def release_all(self) -> None:
-        """Note that no key is down: the window lost the keyboard."""
+        """Note that no key is down: the page lost the keyboard."""
         self._held.clear()
 
     def poll(self) -> Input:

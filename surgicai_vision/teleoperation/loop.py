@@ -18,10 +18,6 @@ Images = Mapping[str, NDArray[Any]]
 class Screen(Protocol):
     """Where the person sees."""
 
-    @property
-    def closed(self) -> bool:
-        """Say whether the person shut it."""
-
     def wants(self) -> bool:
         """Say whether a new image would be seen."""
 
@@ -68,7 +64,7 @@ def drive(
     pacer: Pacer,
     heard: Callable[[Status], None] = lambda status: None,
 ) -> None:
-    """Run the session until it stops or the screen is closed.
+    """Run the session until it stops.
 
     Args:
         session: what to run.
@@ -79,7 +75,7 @@ def drive(
         heard: called with the status after every tick that changed its message.
     """
     message, moment, images = "", None, views.look()
-    while not session.over and not screen.closed:
+    while not session.over:
         session.tick(device.poll())
         status = session.status()
         if status.message != message:

@@ -154,8 +154,6 @@ class Show:
     again.
     """
 
-    closed = False
-
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._number, self._image, self._asked, self.watched = 0, 0, False, False
@@ -215,8 +213,6 @@ class WebView:
     Raises:
         InputError: the port is not free.
     """
-
-    closed = False
 
     def __init__(self, views: tuple[str, ...], title: str, port: int = 0):
         self.hands, self.screen = Hands(), Show()

@@ -13,7 +13,6 @@ from surgicai_vision.teleoperation.gamepad import Gamepad
 from surgicai_vision.teleoperation.input_mapping import Steering
 from surgicai_vision.teleoperation.inputs import JAW, KEEP, Input, merged
 from surgicai_vision.teleoperation.keyboard import CODES, PRESSES, TABLE, Keyboard, key_table
-from surgicai_vision.teleoperation.window import standard
 
 # -- hands -----------------------------------------------------------------------------------------
 
@@ -80,19 +79,6 @@ def test_a_gamepad_button_counts_once_a_press():
     pad.release_all()
     pad.update([], [1.0])
     assert pad.poll().events == (JAW,)
-
-
-def test_glfws_gamepads_are_put_in_the_browsers_order():
-    # GLFW: A B X Y LB RB Back Start Guide two thumbs, then the D-pad: up right down left.
-    buttons = [0] * 15
-    buttons[12] = buttons[7] = 1
-    axes, pressed = standard([0.1, 0.2, 0.3, 0.4, -1.0, 1.0], buttons)
-    assert axes == [0.1, 0.2, 0.3, 0.4]
-    assert [index for index, value in enumerate(pressed) if value] == [7, 9, 15]
-    pad = Gamepad()
-    pad.update(axes, pressed)
-    given = pad.poll()
-    assert (given.move[2], set(given.events)) == (1.0, {KEEP, inputs.START})
 
 
 # -- steering --------------------------------------------------------------------------------------

@@ -270,8 +270,6 @@ class Clock:
 class Canvas:
     """A screen that wants every image; each costs `cost` seconds."""
 
-    closed = False
-
     def __init__(self, clock, cost):
         self.clock, self.cost, self.shown = clock, cost, []
 
@@ -320,14 +318,6 @@ def test_what_happened_is_heard_once(begin):
     assert any(message.startswith("Kept as episode 0") for message in messages)
 
 
-def test_a_closed_screen_ends_the_loop(begin):
-    session, clock = begin(), Clock()
-    canvas = Canvas(clock, 0.0)
-    canvas.closed = True
-    drive(session, Script(), canvas, canvas, Pacer(1.0, clock, clock.sleep))
-    assert not session.over
-
-
 # -- the command -----------------------------------------------------------------------------------
 
 
@@ -340,8 +330,7 @@ def test_a_closed_screen_ends_the_loop(begin):
         (["--frame", "cam"], "Did you mean 'camera'?"),
         (["--speed", "2"], "--speed is 2.0; it must be above 0 and at most 1"),
         (["--seconds", "nan"], "--seconds is nan"),
-        (["--port", "8000"], "give --web with it"),
-        (["--port", "99999", "--web"], "--port is 99999"),
+        (["--port", "99999"], "--port is 99999"),
         (["--episodes", "0"], "at least 1"),
         (["--out", "/proc/x"], "cannot be written"),
     ],

@@ -5,6 +5,7 @@ browser.
 import http.client
 import itertools
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -28,7 +29,7 @@ from surgicai_vision.teleoperation.loop import drive
 from surgicai_vision.teleoperation.pacer import Pacer
 from surgicai_vision.teleoperation.recordings import open_recordings
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, WAITING, Rules, Session
-from surgicai_vision.teleoperation.web import BROWSERS, LONGEST, SILENT, Hands, WebView
+from surgicai_vision.teleoperation.web import BROWSERS, FOLDER, LONGEST, SILENT, Hands, WebView
 
 
 class Clock:
@@ -261,7 +262,7 @@ def test_a_page_waits_for_the_next_image_and_asks_for_it(web):
 
 def test_a_port_in_use_is_said_in_one_line(web, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["teleoperate", "--web", "--port", str(web.port)]) == 2
+    assert main(["teleoperate", "--port", str(web.port)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"--port {web.port} is not free" in line
     assert not (tmp_path / "outputs" / "teleoperation" / "grasp").exists()
@@ -301,7 +302,6 @@ def test_the_command_records_stops_and_sums_up(tmp_path):
         "-m",
         "surgicai_vision",
         "teleoperate",
-        "--web",
         "--port",
         "0",
         "--size",
@@ -353,6 +353,11 @@ class Painted:
     def look(self):
         grey = int(40 + 150 * self.env.state[1])
         return {view: np.full((32, 32, 3), grey, np.uint8) for view in VIEWS}
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node here: apt-get install nodejs")
+def test_the_pages_script_is_valid():
+    subprocess.run(["node", "--check", str(FOLDER / "page.js")], check=True)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium here: apt-get install chromium")

@@ -14,27 +14,27 @@ let lastSent = "";
 let lastTime = 0;
 let stopped = false;
 
-// -- hands ------------------------------------------------------------------------------------------------------------
+// -- inputs -----------------------------------------------------------------------------------------------------------
 
 function press(code) {
   if (held.has(code)) return;
   held.add(code);
   pressed.push(code);
-  light();
+  highlight();
   send();
 }
 
 function release(code) {
-  if (held.delete(code)) { light(); send(); }
+  if (held.delete(code)) { highlight(); send(); }
 }
 
 function releaseAll() {
   held.clear();
-  light();
+  highlight();
   send();
 }
 
-function light() {
+function highlight() {
   for (const button of buttons) button.classList.toggle("down", held.has(button.dataset.code));
 }
 
@@ -104,11 +104,11 @@ for (const figure of document.querySelectorAll("figure")) {
 setInterval(() => { element("gamepad").textContent = gamepads().name ? `Found: ${gamepads().name}` : ""; }, 1000);
 setInterval(send, 20);
 
-// -- eyes -------------------------------------------------------------------------------------------------------------
+// -- status and images ---------------------------------------------------------------------------------------------------
 
-async function draw(figure, image) {
+async function draw(figure, number) {
   const view = figure.dataset.view;
-  const answer = await fetch(`view/${view}.jpg?n=${image}`);
+  const answer = await fetch(`view/${view}.jpg?n=${number}`);
   if (!answer.ok) return;
   const image = await createImageBitmap(await answer.blob());
   const canvas = figure.querySelector("canvas");
@@ -117,7 +117,7 @@ async function draw(figure, image) {
   image.close();
 }
 
-function tell(status) {
+function showStatus(status) {
   const text = {
     episode: status.episode, seed: status.seed, subtask: `${status.subtask}, ${status.arm}`,
     time: `${(status.steps / 50).toFixed(1)} of ${status.limit / 50} s`, distance: `${(status.distance * 1000).toFixed(1)} mm`,
@@ -143,7 +143,7 @@ async function watch() {
       const status = await (await fetch(`status?after=${seen}`)).json();
       if (status.state && status.number !== seen) {
         seen = status.number;
-        tell(status);
+        showStatus(status);
         if (status.image !== shown) {
           await Promise.all([...document.querySelectorAll("figure")].map((figure) => draw(figure, status.image)));
           shown = status.image;
