@@ -1,36 +1,75 @@
-"""The verbs, one file each, in the order of the flow.
+"""The commands of `surgicai-vision`, one module each, in the order of the flow.
 
-A verb's module holds `EXAMPLE` (one command line), `Options` (a frozen dataclass: the schema of its
-options and of its `--config` file) and `run(options, console) -> dict` (the result `--json`
-prints). `NOTES`, where there are any, stand at the end of its `--help`.
-A verb that has verbs of its own is a folder with its own `VERBS`.
+A command's module holds
+
+* `Options`, a frozen dataclass: the command's options, and the schema of its `--config` file. A
+  field's annotation is `Annotated[type, TRAIT, ...]` with traits of `options.py` or a
+  `cyclopts.Parameter` of its own; its line under `Attributes:` in the docstring is its help. Fields
+  with `dataclasses.field(kw_only=False)` are positional, all others are options. `type | None` is an
+  option that may be left out (say by `default_text(...)` what happens then), a `tuple` is a comma
+  list that may also be repeated, a `bool` has `--no-NAME`, a `FILE_ONLY` field stands in a
+  `--config` file alone.
+* `run(options, *, console)`, registered by `@app.default`; it returns the result that `--json`
+  prints, with `exit_code` 1 where the command ran and found something wrong.
+* `app = App(name=..., help_epilogue=...)`; the epilogue is the example below `--help`.
+
+Its line in `COMMANDS` (or in `COMMANDS` of the package that groups several, as `dataset`) makes it
+known. It is imported when it runs or when its `--help` is asked for: what takes long to import
+(torch, mujoco, lerobot) is imported inside functions, here alone.
+
+    @Parameter(name="*")
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        \"\"\"Options of `count`.
+
+Attributes:
+            dataset: Folder of the dataset.
+            view: Views to count.
+        \"\"\"
+
+        dataset: Annotated[Path, DIRECTORY] = field(kw_only=False)
+        view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
 """
 
+from collections.abc import Mapping
 from types import MappingProxyType
 
-VERBS = MappingProxyType(
+from cyclopts import App
+
+PROGRAM = "surgicai-vision"
+
+COMMANDS = MappingProxyType(
     {
-        "quickstart": "run the whole flow once, small, and write its report",
-        "doctor": "check this machine and say what to do",
-        "scene": "show what every camera sees",
-        "record-demos": "record demonstrations by the scripted expert",
-        "teleoperate": "record demonstrations by keyboard or gamepad",
-        "import-demos": "read demonstrations of the original SurgicAI, or bags of ROS 1 and 2",
-        "render-demos": "render demonstrations into a LeRobot dataset",
-        "dataset": "check, repair, reduce or share a dataset",
-        "encode": "compute a dataset's frozen features",
-        "probe": "read the needle's pose from frozen features by a linear probe",
-        "cache": "list, measure or prune the cached features",
-        "train": "train a policy on a dataset's features",
-        "evaluate": "run a policy from held-out starts and count successes",
-        "robustness": "run a policy while light, cameras, images or the arm shift",
-        "sweep": "encode, train and evaluate every cell of a grid",
-        "report": "write the report of stored results",
+        "quickstart": "Run the whole flow once, small, and write its report.",
+        "doctor": "Check this machine and say what to do.",
+        "scene": "Show what every camera sees.",
+        "record-demos": "Record demonstrations by the scripted expert.",
+        "teleoperate": "Record demonstrations by keyboard or gamepad.",
+        "import-demos": "Read demonstrations of the original SurgicAI, or bags of ROS 1 and 2.",
+        "render-demos": "Render demonstrations into a LeRobot dataset.",
+        "dataset": "Check, convert, repair or share a dataset.",
+        "encode": "Compute a dataset's frozen features.",
+        "probe": "Read the needle's pose from frozen features by a linear probe.",
+        "cache": "List, measure or prune the cached features.",
+        "train": "Train a policy on a dataset's features.",
+        "evaluate": "Run a policy from held-out starts and count successes.",
+        "robustness": "Run a policy while light, cameras, images or the arm shift.",
+        "sweep": "Encode, train and evaluate every run of a grid.",
+        "report": "Write the report of stored results.",
+        "completion": "Print the script that completes commands and options in a shell.",
     }
 )
-"""Verb → what it does, in one line."""
+"""Command → what it does, in one line."""
 
 
-def module_name(verb: str) -> str:
-    """Name of the module that holds `verb` ("dataset check" for a verb inside a verb)."""
-    return f"{__name__}.{verb.replace('-', '_').replace(' ', '.')}"
+def register(app: App, commands: Mapping[str, str], package: str = __name__) -> None:
+    """Add commands to `app` in this order; each is imported only when it is needed.
+
+    Args:
+        app: Gets the commands.
+        commands: Command → what it does.
+        package: Package with the commands' modules.
+    """
+    for place, (name, text) in enumerate(commands.items()):
+        module = f"{package}.{name.replace('-', '_')}"
+        app.command(f"{module}:app", name=name, help=text, sort_key=place)

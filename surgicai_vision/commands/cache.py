@@ -1,36 +1,39 @@
 """`cache`: list, measure or prune the cache of frozen features."""
 
-import dataclasses
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import one_of, option
+from surgicai_vision.commands.options import LIST
 from surgicai_vision.core.errors import InputError
 
-EXAMPLE = "surgicai-vision cache list"
+app = App(name="cache", help_epilogue="example:\n  surgicai-vision cache list")
 ACTIONS = ("list", "size", "prune")
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `cache`."""
+    """Options of `cache`.
 
-    action: str = option(
-        dataclasses.MISSING,
-        "list, size, or prune",
-        metavar="ACTION",
-        check=one_of("action", ACTIONS),
-    )
-    keep: tuple[str, ...] = option(
-        (), "datasets whose features prune keeps, a comma list of folders", metavar="DIR[,DIR]"
-    )
-    all: bool = option(False, "prune every entry")
+    Attributes:
+        action: What to do with the cached features.
+        keep: Folders of datasets whose features prune keeps.
+        all: Prune every entry.
+    """
+
+    action: Annotated[str, Parameter(choices=ACTIONS, metavar="ACTION")] = field(kw_only=False)
+    keep: Annotated[tuple[Path, ...], LIST, Parameter(metavar="DIR[,DIR]")] = ()
+    all: Annotated[bool, Parameter(negative=())] = False
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
     """Show the entries, or delete those of no dataset that is kept."""
     from surgicai_vision.features.cache import default_cache_root, list_cache, prune_cache
 
@@ -67,13 +70,13 @@ def _mb(size: int) -> str:
     return f"{size / 1e6:.1f} MB"
 
 
-def _text(manifest: dict[str, Any] | None) -> str:
+def _text(manifest: Mapping[str, Any] | None) -> str:
     if manifest is None:
         return "unfinished"
     shape = " × ".join(map(str, (manifest["length"], *manifest["shape"])))
     return f"{manifest['encoder']}, {manifest['view']}, {manifest['pool']}, {shape}, dataset {manifest['dataset'][:12]}"
 
 
-def _row(folder: Path, size: int, manifest: dict[str, Any] | None) -> dict[str, Any]:
+def _row(folder: Path, size: int, manifest: Mapping[str, Any] | None) -> dict[str, object]:
     keys = ("dataset", "view", "encoder", "pool", "length", "dim")
     return {"key": folder.name, "bytes": size, **{key: (manifest or {}).get(key) for key in keys}}

@@ -4,13 +4,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import final
 
+from cyclopts import Parameter
+
 Progress = Callable[..., None]
 """Called as progress(done, total) or progress(done, total, unit), both counted from the start."""
 
 
 @final
+@Parameter(parse=False)
 class Console:
-    """Where a verb prints. `rich` is imported on the first bar, so that short verbs stay quick."""
+    """Where a command prints. `rich` is imported with the first bar: short commands stay quick."""
 
     def say(self, text: str = "") -> None:
         """Print a line of the result."""

@@ -1,20 +1,16 @@
 """`doctor`: check this machine and say what to do."""
 
 import dataclasses
-from dataclasses import dataclass
-from typing import Any
+
+from cyclopts import App
 
 from surgicai_vision.commands.console import Console
 
-EXAMPLE = "surgicai-vision doctor"
+app = App(name="doctor", help_epilogue="example:\n  surgicai-vision doctor")
 
 
-@dataclass(frozen=True)
-class Options:
-    """Options of `doctor`: none of its own."""
-
-
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(*, console: Console) -> dict[str, object]:
     """Print one line a check; the exit code is 1 when something must be mended."""
     from surgicai_vision.commands.doctor_checks import check
 

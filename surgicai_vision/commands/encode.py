@@ -2,68 +2,74 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import many_of, one_of, option, weights_option
-from surgicai_vision.core import names
+from surgicai_vision.commands.options import (
+    ACCEPT_LICENCE,
+    DIRECTORY,
+    ENCODER,
+    POOL,
+    TASK,
+    VIEWS,
+    WEIGHTS,
+    default_text,
+    join_weights,
+)
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import check_output
 from surgicai_vision.features import encoders
 
-EXAMPLE = "surgicai-vision encode --task grasp --encoder imagenet-lite --view front,back"
+app = App(
+    name="encode",
+    help_epilogue="""\
+example:
+  surgicai-vision encode --task grasp --encoder imagenet-lite --view front,back""",
+)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `encode`."""
+    """Options of `encode`.
 
-    task: str = option(
-        "grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
-    )
-    dataset: str | None = option(
-        None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>"
-    )
-    encoder: str = option(
-        "imagenet-lite",
-        f"one of {encoders.encoder_choices()}",
-        check=encoders.check_encoder_option,
-    )
-    view: tuple[str, ...] = option(
-        ("front", "back"),
-        "views, a comma list",
-        check=many_of("view", names.CAMERAS),
-        metavar="VIEW[,VIEW]",
-    )
-    weights: str | None = weights_option()
-    accept_licence: bool = option(False, "accept weights under a non-commercial licence")
-    pool: str = option(
-        "global",
-        f"what is taken: {', '.join(encoders.POOLS)}",
-        check=one_of("pool", encoders.POOLS),
-    )
-    export: str | None = option(
-        None,
-        "also write a dataset with the features in place of images, for LeRobot's policies",
-        metavar="DIR",
-    )
+    Attributes:
+        task: The dataset's task.
+        dataset: Folder of the dataset.
+        encoder: Encoder.
+        view: Views to encode.
+        pool: What is taken from the encoder.
+        export: Also write a dataset with the features in place of images, for LeRobot's policies.
+    """
+
+    task: Annotated[str, TASK] = "grasp"
+    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    encoder: Annotated[str, ENCODER] = "imagenet-lite"
+    view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
+    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
+    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    pool: Annotated[str, POOL] = "global"
+    export: Annotated[Path | None, DIRECTORY] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode every view and say where the features are."""
-    encoders.find_weights(options.encoder, options.weights, options.accept_licence)
+    weights = join_weights(options.weights)
+    encoders.find_weights(options.encoder, weights, options.accept_licence)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
     if options.export:
         if options.pool != "global":
             raise InputError(f"--export writes global features; leave --pool {options.pool} out.")
-        check_output(Path(options.export))
+        check_output(options.export)
     from surgicai_vision.features.cache import encode
 
-    encoder = encoders.load_encoder(
-        options.encoder, options.weights, options.pool, options.accept_licence
-    )
-    entries, rows = [], []
+    encoder = encoders.load_encoder(options.encoder, weights, options.pool, options.accept_licence)
+    entries = []
+    rows = []
     for view in options.view:
         with console.stage(f"encoding {view} by {options.encoder}", "frames") as progress:
             features = encode(dataset, view, encoder, progress=progress)
@@ -90,7 +96,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
             "weights_sha256": encoder.weights_sha256,
             "encoder_fingerprint": encoder.fingerprint,
         }
-        export_features(dataset, rows, about, Path(options.export))
+        export_features(dataset, rows, about, options.export)
         console.say(f"exported: {options.export}")
     return {
         "encoder": options.encoder,

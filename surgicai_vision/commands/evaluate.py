@@ -1,27 +1,37 @@
 """`evaluate`: run a policy from held-out starts and count successes."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    config_only,
-    not_negative,
-    one_of,
-    option,
-    positive,
+    ACCEPT_LICENCE,
+    COUNT,
+    DIRECTORY,
+    FILE_ONLY,
+    NOT_NEGATIVE,
+    TASK,
+    WEIGHTS,
+    default_text,
+    join_weights,
     read_yaml,
     task_config,
-    weights_option,
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import InputError, UnknownName
 
-EXAMPLE = "surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json"
+app = App(
+    name="evaluate",
+    help_epilogue="""\
+example:
+  surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json""",
+)
 
 CHAIN_SUFFIXES = (".yaml", ".yml")
 ALL = "all"
@@ -30,56 +40,43 @@ REPLAY = "replay"
 """The mean demonstration of a dataset, played blind."""
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `evaluate`."""
+    """Options of `evaluate`.
 
-    policy: str = option(
-        dataclasses.MISSING,
-        "a checkpoint folder, a chain.yaml, or expert, replay, random or zero",
-        metavar="POLICY",
-    )
-    task: str | None = option(
-        None,
-        f"the task: {', '.join(names.TASKS)}",
-        check=one_of("task", names.TASKS),
-        default_text="the checkpoint's, else grasp",
-    )
-    episodes: int = option(20, "number of episodes", check=positive, metavar="N")
-    seed: int = option(
-        names.TEST_SEED, "seed of the first start; each episode takes the next", check=not_negative
-    )
-    workers: int | None = option(
-        None,
-        "processes",
-        check=positive,
-        metavar="N",
-        default_text="one a core, at most one for four episodes",
-    )
-    dataset: str | None = option(
-        None,
-        "dataset whose mean demonstration replay plays",
-        metavar="DIR",
-        default_text="outputs/datasets/<task>",
-    )
-    weights: str | None = weights_option()
-    accept_licence: bool = option(False, "accept weights under a non-commercial licence")
-    swap: str | None = option(
-        None,
-        f"for a chain: let the expert do this subtask ({', '.join(names.SUBTASKS)}), or {ALL}: each in turn",
-        check=one_of("subtask", (*names.SUBTASKS, ALL)),
-        metavar="SUBTASK",
-    )
-    out: str | None = option(
-        None,
-        "folder for the rows; an earlier evaluation in it is replaced",
-        metavar="DIR",
-        default_text="outputs/evaluations/<task>-<policy>-starts<seed>+<episodes>",
-    )
-    env: dict | None = config_only()
+    Attributes:
+        policy: A checkpoint folder, a chain.yaml, or expert, replay, random or zero.
+        task: The task.
+        episodes: Number of episodes.
+        seed: Seed of the first start; each episode takes the next.
+        workers: Number of processes.
+        dataset: Dataset whose mean demonstration replay plays.
+        swap: For a chain, the subtask that the expert does, or all: each in turn.
+        out: Folder for the rows; an earlier evaluation in it is replaced.
+    """
+
+    policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
+    task: Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")] = None
+    episodes: Annotated[int, COUNT] = 20
+    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    workers: Annotated[
+        int | None, COUNT, default_text("one a core, at most one for four episodes")
+    ] = None
+    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
+    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    swap: Annotated[str | None, Parameter(choices=(*names.SUBTASKS, ALL), metavar="SUBTASK")] = None
+    out: Annotated[
+        Path | None,
+        DIRECTORY,
+        default_text("outputs/evaluations/<task>-<policy>-starts<seed>+<episodes>"),
+    ] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
     """Evaluate, keep the rows and print the summary."""
     from surgicai_vision.evaluation import run
     from surgicai_vision.evaluation.storage import MARKER
@@ -91,7 +88,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     default = folders.evaluation_folder(
         subject.config.task, subject.name, options.seed, options.episodes
     )
-    out = Path(options.out) if options.out else default
+    out = options.out or default
     folders.check_folder(out, MARKER)
     title = f"evaluating {subject.name} on {subject.config.task}"
     with console.stage(title, "steps") as progress:
@@ -109,7 +106,9 @@ def subject_of(options: Any) -> Any:
     """
     from surgicai_vision.evaluation import agents, lerobot_agent, policy_spec
 
-    folder, swap = Path(options.policy), getattr(options, "swap", None)
+    folder = Path(options.policy)
+    swap = getattr(options, "swap", None)
+    weights = join_weights(options.weights)
     if swap and folder.suffix not in CHAIN_SUFFIXES:
         raise InputError(f"--swap {swap} is for a chain.yaml; leave it out.")
     if options.policy == REPLAY:
@@ -130,9 +129,9 @@ def subject_of(options: Any) -> Any:
         )
     lerobot = lerobot_agent.find(folder)
     if lerobot:
-        subject = lerobot_agent.subject(lerobot, options.task, options.weights)
+        subject = lerobot_agent.subject(lerobot, options.task, weights)
     else:
-        subject = policy_spec.checkpoint_subject(folder, options.weights, options.accept_licence)
+        subject = policy_spec.checkpoint_subject(folder, weights, options.accept_licence)
     trained_for = subject.config.task
     if options.task not in (None, trained_for):
         raise InputError(
@@ -160,15 +159,14 @@ def _chain(path: Path, options: Any, swap: str | None = None) -> Any:
             f"{path} is a chain of the whole procedure; leave --task {options.task} out."
         )
     env = {"max_steps": config.max_steps, **options.env} if options.env else None
+    weights = join_weights(options.weights)
     if swap != ALL:
-        return _in_env(
-            expert_swap.swapped(config, swap, options.weights, options.accept_licence), env
-        )
-    variants = expert_swap.variants_of(config, options.weights, options.accept_licence)
+        return _in_env(expert_swap.swapped(config, swap, weights, options.accept_licence), env)
+    variants = expert_swap.variants_of(config, weights, options.accept_licence)
     return {name: _in_env(subject, env) for name, subject in variants.items()}
 
 
-def _run_swaps(options: Options, console: Console) -> dict[str, Any]:
+def _run_swaps(options: Options, console: Console) -> dict[str, object]:
     """Evaluate a chain as it is and with each subtask swapped, and print how far each comes."""
     from surgicai_vision.evaluation.expert_swap import AS_IT_IS, CURVES, MARK, survival_curves
 
@@ -177,7 +175,7 @@ def _run_swaps(options: Options, console: Console) -> dict[str, Any]:
     default = folders.evaluation_folder(
         plain.config.task, plain.name, options.seed, options.episodes
     )
-    out = Path(options.out) if options.out else default.with_name(f"{default.name}-swaps")
+    out = options.out or default.with_name(f"{default.name}-swaps")
     folders.check_folder(out, MARK)
     seeds = range(options.seed, options.seed + options.episodes)
     rows = survival_curves(variants, seeds, out, console.stage, options.workers)

@@ -1,4 +1,4 @@
-"""Where verbs read and write when nothing else is said: below `outputs/` in the current folder."""
+"""Where commands read and write when nothing else is said: below `outputs/` in the current folder."""
 
 import os
 import tempfile
@@ -58,14 +58,14 @@ def demos_task(folder: Path) -> str:
     return str(read_marker(folder)["task"])
 
 
-def open_dataset(folder: str | None, task: str, views: Sequence[str]) -> Any:
+def open_dataset(folder: Path | None, task: str, views: Sequence[str]) -> Any:
     """Open a dataset, by default the task's; say which command makes it where there is none.
 
     Raises:
         BadFile: no dataset there.
         UnknownName: a view the dataset does not have.
     """
-    path = Path(folder) if folder else dataset_folder(task)
+    path = folder or dataset_folder(task)
     if not path.exists():
         command = f"surgicai-vision render-demos --task {task} --episodes 50"
         raise BadFile(

@@ -2,13 +2,15 @@
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import config_only, one_of, option
+from surgicai_vision.commands.options import DIRECTORY, FILE_ONLY, SUBTASK, default_text
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.demos.imports.rosbag.config import (
@@ -20,59 +22,58 @@ from surgicai_vision.demos.imports.rosbag.config import (
     is_bag,
 )
 
-EXAMPLE = "surgicai-vision import-demos regrasp_all_episodes_merged.pkl --task handoff --out outputs/demos/surgicai"
-ROLES = tuple(field.name for field in dataclasses.fields(Topics))
-NOTES = f"""\
+ROLES = tuple(role.name for role in dataclasses.fields(Topics))
+app = App(
+    name="import-demos",
+    help_epilogue=f"""\
+example:
+  surgicai-vision import-demos regrasp_all_episodes_merged.pkl --task handoff \\
+      --out outputs/demos/surgicai
+
 A bag is a .bag, .db3 or .mcap file, or a folder of ROS 2; a folder of bags is read whole:
   surgicai-vision import-demos trial.bag --topic needle=/needle/pose --out outputs/demos/trial
 Roles of --topic: {", ".join(ROLES)}.
-Without --task every subtask that is found gets a folder below --out. Frames, units, labels and more stand in the table
-`bag` of a --config file, the scene in the table `env`; see docs/demos.md."""
+Without --task every subtask that is found gets a folder below --out. Frames, units, labels and
+more stand in the table `bag` of a --config file, the scene in the table `env`; see docs/demos.md.""",
+)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `import-demos`."""
+    """Options of `import-demos`.
 
-    file: str = option(
-        dataclasses.MISSING,
-        "a pickle as SurgicAI writes it, an npz of its arrays, a bag, or a folder of bags",
-    )
-    task: str | None = option(
-        None,
-        f"what it shows: {', '.join(names.SUBTASKS)}",
-        check=one_of("task", names.SUBTASKS),
-        default_text="none: say it; of a bag all that is found",
-    )
-    out: str | None = option(
-        None,
-        "folder to make",
-        metavar="DIR",
-        default_text="outputs/demos/surgicai-<task> or outputs/demos/bag",
-    )
-    topic: tuple[str, ...] = option(
-        (), "topics of a bag that differ, as ROLE=/TOPIC,ROLE=/TOPIC", metavar="LIST"
-    )
-    convention: str | None = option(
-        None,
-        f"whose topics a bag has: {', '.join(CONVENTIONS)}",
-        check=one_of("convention", CONVENTIONS),
-        default_text="dvrk",
-    )
-    segmentation: str | None = option(
-        None,
-        f"what cuts a bag into subtasks: {', '.join(SEGMENTATIONS)}",
-        check=one_of("segmentation", SEGMENTATIONS),
-        default_text="auto",
-        metavar="WAY",
-    )
-    bag: BagConfig | None = config_only()
-    env: dict | None = config_only()
+    Attributes:
+        file: A pickle as SurgicAI writes it, an npz of its arrays, a bag, or a folder of bags.
+        task: What it shows; needed for a pickle, which does not say it.
+        out: Folder to make.
+        topic: Topics of a bag that differ from the convention's.
+        convention: Whose topics a bag has.
+        segmentation: What cuts a bag into subtasks.
+    """
+
+    file: Annotated[Path, Parameter(metavar="FILE")] = field(kw_only=False)
+    task: Annotated[str | None, SUBTASK, default_text("of a bag all that is found")] = None
+    out: Annotated[
+        Path | None, DIRECTORY, default_text("outputs/demos/surgicai-<task> or outputs/demos/bag")
+    ] = None
+    topic: Annotated[
+        tuple[str, ...], Parameter(metavar="ROLE=/TOPIC[,ROLE=/TOPIC]", show_default=False)
+    ] = ()
+    convention: Annotated[
+        str | None, Parameter(choices=tuple(CONVENTIONS)), default_text("dvrk")
+    ] = None
+    segmentation: Annotated[
+        str | None, Parameter(choices=tuple(SEGMENTATIONS)), default_text("auto")
+    ] = None
+    bag: Annotated[BagConfig | None, FILE_ONLY] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
     """Import and say where the demonstrations are."""
-    path = Path(options.file)
+    path = options.file
     if is_bag(path) or path.is_dir():
         return _import_bags(path, options, console)
     given = [
@@ -87,14 +88,14 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     return _import_surgicai(path, options, console)
 
 
-def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str, Any]:
+def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str, object]:
     from surgicai_vision.demos.imports.surgicai import import_demos
 
     if options.task is None:
         raise InputError(
             f"import-demos needs --task: the file does not say it; one of {', '.join(names.SUBTASKS)}."
         )
-    out = Path(options.out) if options.out else folders.demos_folder(f"surgicai-{options.task}")
+    out = options.out or folders.demos_folder(f"surgicai-{options.task}")
     folders.check_folder(out, "demos.json")
     with console.stage(f"importing {options.task}", "episodes") as progress:
         summary = import_demos(path, task=options.task, out=out, progress=progress)
@@ -115,7 +116,7 @@ def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str
     }
 
 
-def _import_bags(path: Path, options: Options, console: Console) -> dict[str, Any]:
+def _import_bags(path: Path, options: Options, console: Console) -> dict[str, object]:
     from surgicai_vision.demos.imports.rosbag.importer import import_bags
 
     bags = bags_in(path)
@@ -123,7 +124,7 @@ def _import_bags(path: Path, options: Options, console: Console) -> dict[str, An
         raise BadFile(
             f"Cannot read {path}: it is a folder without bags (*.bag, *.db3, *.mcap, folders of ROS 2)."
         )
-    out = Path(options.out) if options.out else folders.demos_folder("bag")
+    out = options.out or folders.demos_folder("bag")
     with console.stage(f"importing {path.name}", "bags") as progress:
         summaries = import_bags(
             bags,

@@ -1,39 +1,61 @@
-"""The command line: `surgicai-vision VERB [options]`.
+"""The command line: `surgicai-vision COMMAND [OPTIONS]`, built on cyclopts.
 
 Exit codes: 0 done, 1 the work failed or was interrupted, 2 wrong input, 143 ended by SIGTERM.
-Errors made on purpose (`SurgicaiError`) are one line without a traceback. A verb's module, and what
-it needs, is imported only when that verb runs, so `--help` is instant.
+Errors made on purpose (`SurgicaiError`) and wrong input are one line without a traceback. A
+command's module, and what it needs, is imported only when that command runs, so `--help` is
+instant.
 """
 
-import argparse
-import importlib
 import json
 import os
 import signal
 import sys
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NoReturn, final
+from typing import Annotated
 
-from surgicai_vision.commands import VERBS, module_name
-from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import add_arguments, build, nearest_option
+from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts.argument import Argument, ArgumentCollection
+from cyclopts.exceptions import (
+    MissingArgumentError,
+    UnknownCommandError,
+    UnknownOptionError,
+    UnusedCliTokensError,
+)
+
+from surgicai_vision.commands import COMMANDS, PROGRAM, register
+from surgicai_vision.commands.options import from_file, split_comma_lists
 from surgicai_vision.core.errors import InputError, SurgicaiError, UnknownName
 from surgicai_vision.core.processes import Terminated, raise_on_terminate
 
-PROGRAM = "surgicai-vision"
 TITLE = (
-    "Image-based imitation learning for robotic suturing:\n"
+    "Image-based imitation learning for robotic suturing: "
     "scene → env → demos → dataset → features → policy → evaluation → report"
 )
 INTERRUPTED = "interrupted; run the same command again to continue"
 TERMINATED = 128 + signal.SIGTERM
 """Exit code after SIGTERM, as a shell gives it."""
+EVERYWHERE = Group("Options of every command", sort_key=1)
+
+app = App(
+    name=PROGRAM,
+    help=TITLE,
+    version=lambda: f"{PROGRAM} {version(PROGRAM)}",
+    default_parameter=Parameter(negative_iterable=(), show_env_var=False),
+    help_format="plaintext",
+    result_action="return_value",
+    print_error=False,
+    exit_on_error=False,
+)
+"""All commands. Its `meta` app takes `--config` and `--json`, then parses and runs the command."""
+register(app, COMMANDS)
+app.meta.config = ()
+app.meta.suppress_keyboard_interrupt = False
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run one verb and return its exit code."""
-    arguments = sys.argv[1:] if argv is None else argv
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command and return its exit code."""
     for name in (
         "HF_DATASETS_DISABLE_PROGRESS_BARS",
         "HF_HUB_DISABLE_PROGRESS_BARS",
@@ -44,136 +66,80 @@ def main(argv: list[str] | None = None) -> int:
         )  # the bars are ours; nothing of a run is reported to anyone
     raise_on_terminate()
     try:
-        return _dispatch(arguments)
+        return app.meta(sys.argv[1:] if arguments is None else arguments) or 0
+    except CycloptsError as error:
+        return _fail(explain(error))
     except SurgicaiError as error:
-        print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return error.exit_code
+        return _fail(error)
     except KeyboardInterrupt as interrupt:
         print(f"{PROGRAM}: {INTERRUPTED}", file=sys.stderr)
         return TERMINATED if isinstance(interrupt, Terminated) else 1
     except BrokenPipeError:
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # or Python complains at exit
+        # Standard output is gone; Python would complain when it flushes it at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
         if error.filename is None:
             raise
-        print(f"{PROGRAM}: error: {error.filename}: {error.strerror}.", file=sys.stderr)
-        return 1
+        return _fail(SurgicaiError(f"{error.filename}: {error.strerror}."))
 
 
-def _dispatch(arguments: list[str]) -> int:
-    if arguments[:1] == ["--version"]:
-        from importlib.metadata import version
+@app.meta.default
+def _run(
+    *words: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
+    config: Annotated[Path | None, Parameter(metavar="FILE.yaml", group=EVERYWHERE)] = None,
+    as_json: Annotated[
+        bool, Parameter(name="--json", negative=(), show_default=False, group=EVERYWHERE)
+    ] = False,
+) -> int:
+    """Parse and run one command.
 
-        print(f"{PROGRAM} {version(PROGRAM)}")
-        return 0
-    return _choose("", VERBS, TITLE, arguments)
-
-
-def _choose(group: str, verbs: Mapping[str, str], title: str, arguments: list[str]) -> int:
-    """Find the verb among `verbs`, in the group's own where it has them, and run it."""
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(_usage(group, verbs, title))
-        return 0 if arguments else 2
-    verb = arguments[0]
-    if verb.startswith("-"):
-        raise UnknownName(
-            "option before the verb", verb, ("--help",) if group else ("--help", "--version")
-        )
-    if verb not in verbs:
-        raise UnknownName(f"verb of {group}" if group else "verb", verb, verbs)
-    name = f"{group} {verb}".strip()
-    module = importlib.import_module(module_name(name))
-    if hasattr(module, "VERBS"):
-        return _choose(
-            name, module.VERBS, f"{verbs[verb][0].upper()}{verbs[verb][1:]}.", arguments[1:]
-        )
-    return _run(name, verbs[verb], module, arguments[1:])
-
-
-def _run(verb: str, text: str, module: Any, arguments: list[str]) -> int:
-    """Parse one verb's options, run it and print its result."""
-    parser = _parser(verb, text, module)
-    for text in arguments:
-        if text.startswith("--") and text.split("=")[0] not in parser._option_string_actions:
-            raise nearest_option(text, parser)
-    try:
-        known, extra = parser.parse_known_args(arguments)
-    except _HelpShown:
-        return 0
-    if extra:
-        raise InputError(f"{verb}: unexpected argument '{extra[0]}'; see `{parser.prog} --help`.")
-    given = vars(known)
-    as_json, config = given.pop("json", False), given.pop("config", None)
-    options = build(module.Options, given, config)
-    result: dict[str, Any] = module.run(options, Console())
+    Args:
+        words: The command line without the two options below.
+        config: Take options from this file; those on the command line override it.
+        as_json: Print the result as one JSON object, the last line of stdout.
+    """
+    app.config = (split_comma_lists, *([from_file(config)] if config else []))
+    command, bound, left_out = app.parse_args(words)
+    services = {name: make() for name, make in left_out.items()}
+    result: Mapping[str, object] | None = command(*bound.args, **bound.kwargs, **services)
+    if result is None:  # no command was named, so its help was shown
+        return 2
     if as_json:
         print(json.dumps(result, sort_keys=True), flush=True)
-    return int(result.get("exit_code", 0))
+    return 1 if result.get("exit_code") else 0
 
 
-def _usage(group: str, verbs: Mapping[str, str], title: str) -> str:
-    program = f"{PROGRAM} {group}".strip()
-    width = max(map(len, verbs))
-    lines = [
-        f"usage: {program} VERB [options]",
-        "",
-        title,
-        "",
-        "verbs:",
-        *(f"  {verb:<{width}}  {text}" for verb, text in verbs.items()),
-        "",
-        f"`{program} VERB --help` shows a verb's options, defaults and an example.",
-    ]
-    if not group:
-        lines.append(f"`{PROGRAM} --version` prints the version.")
-    return "\n".join(lines)
+def _fail(error: SurgicaiError) -> int:
+    """Print an error in one line and return its exit code."""
+    print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return error.exit_code
 
 
-class _HelpShown(Exception):
-    """`--help` was printed."""
+def explain(error: CycloptsError) -> InputError:
+    """Return what cyclopts found wrong as an error of ours, with the nearest name suggested."""
+    chain = " ".join(error.command_chain or ())
+    common = app.meta.assemble_argument_collection()
+    match error:
+        case UnknownCommandError(unused_tokens=[given, *_], app=App() as group):
+            allowed = [*group, *_names(common)] if given.startswith("-") else [*group]
+            return UnknownName(f"command of {chain}" if chain else "command", given, allowed)
+        case UnknownOptionError(token=token, argument_collection=own):
+            given = (token.keyword or token.value).partition("=")[0]
+            return UnknownName("option", given, (*_names(own), *_names(common), "--help"))
+        case UnusedCliTokensError(unused_tokens=[given, *_]):
+            problem = f"unexpected argument '{given}'"
+        case MissingArgumentError(argument=Argument(index=int(), parameter=parameter)):
+            problem = f"{parameter.metavar} is missing"
+        case _:
+            error.verbose = False
+            problem = str(error).replace('"', "'").rstrip(".")
+    return InputError(f"{problem}; see `{PROGRAM} {f'{chain} '.lstrip()}--help`.")
 
 
-@final
-class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one `InputError` line."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(
-            f"{self.prog.removeprefix(PROGRAM).strip()}: {message}; see `{self.prog} --help`."
-        )
-
-    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
-        raise _HelpShown
-
-
-def _parser(verb: str, text: str, module: Any) -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog=f"{PROGRAM} {verb}",
-        description=f"{text[0].upper()}{text[1:]}.",
-        epilog="\n\n".join(
-            [f"example:\n  {module.EXAMPLE}", *filter(None, [getattr(module, "NOTES", "")])]
-        ),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    add_arguments(parser, module.Options)
-    parser.add_argument(
-        "--config",
-        type=Path,
-        default=argparse.SUPPRESS,
-        metavar="FILE.yaml",
-        help="take options from this file; those given here override it",
-    )
-    parser.add_argument(
-        "--json",
-        action="store_true",
-        default=argparse.SUPPRESS,
-        help="print the result as one JSON object, the last line of stdout",
-    )
-    return parser
+def _names(options: ArgumentCollection) -> list[str]:
+    """Return the names of options that `--help` shows."""
+    return [name for option in options if option.show for name in option.names]
 
 
 if __name__ == "__main__":

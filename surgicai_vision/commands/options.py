@@ -1,56 +1,127 @@
-"""Options: a frozen dataclass per verb becomes its command line and the schema of its `--config`
-file.
+"""What the options of all commands share: traits, comma lists and the `--config` file.
 
-Values are taken in this order: the command line, the file, the dataclass's default.
+The options of a command are a frozen dataclass; cyclopts reads its fields, their types and the
+`Attributes:` of its docstring. A trait below is a `cyclopts.Parameter` with what several options
+have in common. It stands in the annotation beside the type, and may be combined with others:
+
+    episodes: Annotated[int, COUNT] = 20
+    view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
+
+A value is taken from the command line, else from the `--config` file, else from the dataclass.
 """
 
-import argparse
-import dataclasses
-import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
 
-from surgicai_vision.core.config import TaskConfig, from_mapping
-from surgicai_vision.core.errors import BadFile, InputError, UnknownName, check_name
+import yaml
+from cyclopts import App, Parameter, Token, validators
+from cyclopts.argument import Argument, ArgumentCollection
 
-T = TypeVar("T")
-Check = Callable[[str, Any], None]
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, convert, from_mapping
+from surgicai_vision.core.errors import BadFile, InputError, UnknownName
+from surgicai_vision.features import encoders
 
-
-def option(
-    default: Any,
-    text: str,
-    *,
-    check: Check | None = None,
-    metavar: str = "",
-    default_text: str = "",
-    repeat: bool = False,
-) -> Any:
-    """Declare an option.
-
-    Args:
-        default: its default; `dataclasses.MISSING` makes it a required positional argument.
-        text: what it is, for `--help`.
-        check: called with the option's name and value; raises `InputError`.
-        metavar: how `--help` names its value.
-        default_text: what `--help` says of a default that depends on other options.
-        repeat: it may be given again: texts are joined by commas, lists one behind the other.
-    """
-    metadata = {
-        "text": text,
-        "check": check,
-        "metavar": metavar,
-        "default_text": default_text,
-        "repeat": repeat,
-    }
-    if default is dataclasses.MISSING:
-        return dataclasses.field(metadata=metadata)
-    return dataclasses.field(default=default, metadata=metadata)
+Source = Callable[[App, tuple[str, ...], ArgumentCollection], None]
+"""What cyclopts calls between reading the command line and converting the texts to values."""
 
 
-def task_config(task: str, env: dict[str, Any] | None) -> TaskConfig:
+def _whole_number(_: type, tokens: Sequence[Token]) -> int:
+    """Convert a text to an int; cyclopts itself would round 3.5."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"expected a whole number, got '{tokens[0].value}'.") from None
+
+
+def _refuse_repetition(_: type, values: Sequence[object] | None) -> None:
+    """Raise ValueError if a list holds a value twice."""
+    given = values or ()
+    for value in given:
+        if given.count(value) > 1:
+            raise ValueError(f"'{value}' is given twice; give it once.")
+
+
+def _refuse_text(_: type, tokens: Sequence[Token]) -> None:
+    """Raise ValueError: a table cannot be given on the command line."""
+    raise ValueError(f"'{tokens[0].value}' is given, but this table stands in a --config file.")
+
+
+def _check_encoder(_: type, name: str) -> None:
+    encoders.check_encoder_name(name)
+
+
+def _check_encoders(_: type, given: Sequence[str]) -> None:
+    for name in given:
+        encoders.check_encoder_name(name)
+
+
+def _show_list(values: Sequence[object]) -> str:
+    """Return the default of a comma list as it would be typed."""
+    return ",".join(f"{value:g}" if isinstance(value, float) else str(value) for value in values)
+
+
+def within(low: int, high: int) -> Parameter:
+    """Return the trait of a whole number from `low` to `high`."""
+    return Parameter(
+        converter=_whole_number, validator=validators.Number(gte=low, lte=high), metavar="N"
+    )
+
+
+TASK = Parameter(choices=names.TASKS)
+SUBTASK = Parameter(choices=names.SUBTASKS)
+DIRECTORY = Parameter(metavar="DIR")
+COUNT = Parameter(converter=_whole_number, validator=validators.Number(gte=1), metavar="N")
+NOT_NEGATIVE = Parameter(converter=_whole_number, validator=validators.Number(gte=0), metavar="N")
+FRACTION = Parameter(validator=validators.Number(gte=0, lte=1), metavar="P")
+IMAGE_SIZE = Parameter.combine(within(16, 960), Parameter(metavar="PX"))
+"""Height and width [px] that the renderer has room for."""
+LIST = Parameter(show_default=_show_list)
+UNIQUE = Parameter(show_default=_show_list, validator=_refuse_repetition)
+"""A comma list that holds nothing twice."""
+VIEWS = Parameter.combine(UNIQUE, Parameter(choices=names.CAMERAS, metavar="VIEW[,VIEW]"))
+VIDEO = Parameter(
+    help="Store RGB as video; the error is measured.", choices=("h264", "av1"), metavar="CODEC"
+)
+ENCODER = Parameter(
+    help=f"One of {encoders.encoder_choices()}.", validator=_check_encoder, metavar="NAME"
+)
+ENCODERS = Parameter(
+    help=f"Encoders, of {encoders.encoder_choices()}.",
+    validator=_check_encoders,
+    show_default=_show_list,
+    metavar="NAME[,NAME]",
+)
+POOL = Parameter(choices=encoders.POOLS)
+WEIGHTS = Parameter(
+    help="File with the encoder's pretrained weights; NAME=FILE for the encoder NAME alone.",
+    metavar="[NAME=]FILE",
+    show_default=False,
+)
+"""Given again for another encoder; `join_weights` makes one text of it."""
+ACCEPT_LICENCE = Parameter(help="Accept weights under a non-commercial licence.", negative=())
+EXECUTOR = Parameter(
+    help="What runs the jobs: local, ray or slurm, with its options, such as ray,address=HOST:PORT "
+    "or slurm,partition=cpu,minutes=60.",
+    metavar="NAME[,KEY=VALUE]",
+)
+"""`executor.open_engine` reads it."""
+FILE_ONLY = Parameter(accepts_keys=False, converter=_refuse_text, show=False)
+"""A table that only the `--config` file can give."""
+
+
+def default_text(text: str) -> Parameter:
+    """Return a trait that says what an option without a value of its own defaults to."""
+    return Parameter(show_default=text)
+
+
+def join_weights(given: Sequence[str]) -> str | None:
+    """Return every `--weights` as the one text that `encoders.weights_of` reads."""
+    return ",".join(given) or None
+
+
+def task_config(task: str, env: dict[str, object] | None) -> TaskConfig:
     """Return the configuration of `task`, changed by the table `env` of a `--config` file.
 
     Raises:
@@ -63,141 +134,98 @@ def task_config(task: str, env: dict[str, Any] | None) -> TaskConfig:
     return from_mapping(TaskConfig, {**changes, "task": task}, "env")
 
 
-def config_only() -> Any:
-    """Declare a table that only the `--config` file can give."""
-    return dataclasses.field(default=None, metadata={"config_only": True})
+def split_comma_lists(_: App, __: tuple[str, ...], arguments: ArgumentCollection) -> None:
+    """Give every part of a comma list on the command line a token of its own."""
+    for argument in arguments:
+        if _is_list(argument):
+            argument.tokens = [
+                token.evolve(value=part)
+                for token in argument.tokens
+                for part in _parts(token.value, argument.name)
+            ]
 
 
-def positive(name: str, value: float | None) -> None:
-    """Refuse a number below 1."""
-    if value is not None and value < 1:
-        raise InputError(f"{name} is {value}; it must be at least 1.")
+def from_file(path: Path) -> Source:
+    """Return a source that gives every option left out its value in the YAML file `path`."""
+
+    def fill(_: App, __: tuple[str, ...], arguments: ArgumentCollection) -> None:
+        known = {_key(argument): argument for argument in arguments if argument.keys}
+        for key, value in read_yaml(path).items():
+            if key not in known:
+                raise UnknownName(f"key in {path}", key, known)
+            argument = known[key]
+            tokens = [
+                token.evolve(source=str(path)) for token in _tokens(argument, key, value, path)
+            ]
+            if not argument.tokens:
+                argument.tokens = tokens
+
+    return fill
 
 
-def image_size(name: str, value: int) -> None:
-    """Refuse a size that the renderer has no room for [px]."""
-    if not 16 <= value <= 960:
-        raise InputError(f"{name} is {value}; it must be within 16 and 960 pixels.")
+def _key(argument: Argument) -> str:
+    """Return how an option is called in a file."""
+    return argument.name.lstrip("-").replace("-", "_")
 
 
-def not_negative(name: str, value: float | None) -> None:
-    """Refuse a number below 0."""
-    if value is not None and value < 0:
-        raise InputError(f"{name} is {value}; it must be at least 0.")
+def _is_list(argument: Argument) -> bool:
+    """Return True if the option takes a comma list."""
+    is_tuple = typing.get_origin(argument.resolved_hint) is tuple
+    return is_tuple and argument.parameter.accepts_keys is not False
 
 
-def share(name: str, value: float | None) -> None:
-    """Refuse a number that is not within 0 and 1."""
-    if value is not None and not 0 <= value <= 1:
-        raise InputError(f"{name} is {value}; it must be within 0 and 1.")
-
-
-def one_of(kind: str, allowed: Iterable[str]) -> Check:
-    """Return a check that admits one of `allowed`."""
-    known = tuple(allowed)
-
-    def check(_: str, value: str | None) -> None:
-        if value is not None:
-            check_name(kind, value, known)
-
-    return check
-
-
-def many_of(kind: str, allowed: Iterable[str]) -> Check:
-    """Return a check that admits a list without repetition of names among `allowed`."""
-    known = tuple(allowed)
-
-    def check(name: str, values: tuple[str, ...] | None) -> None:
-        for value in values or ():
-            check_name(kind, value, known)
-            if values and values.count(value) > 1:
-                raise InputError(f"{name} names '{value}' twice; give each {kind} once.")
-
-    return check
-
-
-def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
-    """Add the options of the dataclass `cls` to `parser`; what is not given stays out of the
-    result.
-    """
-    hints = typing.get_type_hints(cls)
-    for field in dataclasses.fields(cls):
-        meta = field.metadata
-        if meta.get("config_only"):
-            continue
-        hint = _plain(hints[field.name])
-        keywords: dict[str, Any] = {"default": argparse.SUPPRESS, "help": _help(field)}
-        if hint is bool:
-            keywords["action"] = argparse.BooleanOptionalAction
-        else:
-            keywords["type"] = _READERS.get(hint, _names)
-            keywords["action"] = _Joined if meta.get("repeat") else "store"
-            keywords["metavar"] = meta["metavar"] or field.name.upper()
-        if field.default is dataclasses.MISSING:
-            parser.add_argument(field.name, **keywords)
-        else:
-            parser.add_argument(flag(field.name), dest=field.name, **keywords)
-
-
-def executor_option() -> Any:
-    """Declare `executor`: what runs a verb's jobs; `executor.open_engine` reads it."""
-    return option(
-        "local",
-        "what runs the jobs: local, ray or slurm, with its options, such as ray,address=HOST:PORT or "
-        "slurm,partition=cpu,minutes=60",
-        metavar="NAME[,KEY=VALUE]",
-    )
-
-
-def weights_option() -> Any:
-    """Declare `weights`: the files of pretrained weights; `encoders.weights_of` reads it."""
-    return option(
-        None,
-        "file with the encoder's pretrained weights; NAME=FILE for the encoder NAME alone, once for each encoder",
-        metavar="[NAME=]FILE",
-        repeat=True,
-    )
-
-
-def flag(name: str) -> str:
-    """The command-line spelling of a field's name; `from_` is `--from`, a keyword of Python."""
-    return f"--{name.rstrip('_').replace('_', '-')}"
-
-
-def build(cls: type[T], given: Mapping[str, Any], config: Path | None) -> T:
-    """Build the options from the command line's values and a YAML file, and check every value.
+def _parts(text: str, name: str) -> list[str]:
+    """Return the parts of a comma list.
 
     Raises:
-        BadFile: a file that is missing or no YAML table.
-        UnknownName: a key of the file that the verb does not have.
-        InputError: a value out of its range.
+        InputError: the list is empty, or nothing stands before, between or after two commas.
     """
-    values = _read(cls, config) if config else {}
-    options = from_mapping(cls, {**values, **given}, where=str(config) if config else "options")
-    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
-        check = field.metadata.get("check")
-        if check is not None:
-            check(flag(field.name), getattr(options, field.name))
-    return options
+    parts = [part.strip() for part in text.split(",")]
+    if not all(parts):
+        problem = f"is '{text}'; expected names between commas" if len(parts) > 1 else "is empty"
+        raise InputError(f"{name} {problem}.")
+    return parts
 
 
-def _read(cls: type, path: Path) -> dict[str, Any]:
-    """Read a YAML table; a comma list is taken where a list is wanted."""
-    table = read_yaml(path)
-    hints = typing.get_type_hints(cls)
-    for key, value in table.items():
-        if key in hints and typing.get_origin(hints[key]) is tuple and isinstance(value, str):
-            try:
-                table[key] = list(_READERS.get(hints[key], _names)(value))
-            except argparse.ArgumentTypeError as error:
-                raise InputError(f"{path}: {key}: {error}.") from None
-    return table
+def _tokens(argument: Argument, key: str, value: object, path: Path) -> list[Token]:
+    """Return a file's value as the texts that would stand on the command line, where it has such.
+
+    Raises:
+        InputError: the value is of another type than the option.
+    """
+    where = f"{path}: {key}"
+    hint = argument.resolved_hint
+    if value is None and type(None) in typing.get_args(argument.hint):
+        return []
+    if _is_list(argument):
+        if isinstance(value, str):
+            texts = _parts(value, where)
+        else:
+            listed = convert(_written_as(hint), value, where)
+            assert isinstance(listed, tuple)
+            texts = [str(part) for part in listed]
+        if texts:
+            return [Token(keyword=key, value=text) for text in texts]
+        return [Token(keyword=key, implicit_value=())]
+    value = convert(_written_as(hint), value, where)
+    if isinstance(value, str):
+        return [Token(keyword=key, value=value)]
+    return [Token(keyword=key, implicit_value=value)]
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file that holds a table; `BadFile` where it is missing or something else."""
-    import yaml
+def _written_as(hint: type) -> type:
+    """Return the type that a file holds where an option has type `hint`."""
+    if hint is Path:
+        return str
+    return tuple[str, ...] if hint == tuple[Path, ...] else hint
 
+
+def read_yaml(path: Path) -> dict[str, object]:
+    """Read a YAML file that holds a table.
+
+    Raises:
+        BadFile: the file is missing, or holds something else.
+    """
     try:
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -205,82 +233,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise BadFile(f"{path} is not valid YAML ({' '.join(str(error).split())}).") from None
     except (RecursionError, ValueError) as error:
-        raise BadFile(
-            f"{path} is not taken: {type(error).__name__} ({' '.join(str(error).split())[:100]})."
-        ) from None
+        problem = " ".join(str(error).split())[:100]
+        raise BadFile(f"{path} is refused: {type(error).__name__} ({problem}).") from None
     if not isinstance(table, dict) or not all(isinstance(key, str) for key in table):
         raise BadFile(f"{path} holds no table of keys; write one `key: value` a line.")
     return table
-
-
-def nearest_option(given: str, parser: argparse.ArgumentParser) -> UnknownName:
-    """Return the error for an option that `parser` does not have."""
-    return UnknownName("option", given.split("=")[0], parser._option_string_actions)
-
-
-class _Joined(argparse.Action):
-    """An option that may be given again."""
-
-    def __call__(
-        self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None
-    ) -> None:
-        """Join texts by commas, lists one behind the other."""
-        before = getattr(namespace, self.dest, None)
-        joined = f"{before},{values}" if isinstance(values, str) else (*(before or ()), *values)
-        setattr(namespace, self.dest, values if before is None else joined)
-
-
-def _help(field: "dataclasses.Field[Any]") -> str:
-    """An option's help with its default."""
-    text = field.metadata["text"]
-    shown = field.metadata["default_text"]
-    if not shown and field.default is not dataclasses.MISSING and field.default is not None:
-        default = field.default
-        shown = ",".join(map(_shown, default)) if isinstance(default, tuple) else str(default)
-        shown = {"True": "on", "False": "off"}.get(shown, shown)
-    return (f"{text} (default: {shown})" if shown else text).replace("%", "%%")
-
-
-def _shown(item: Any) -> str:
-    return f"{item:g}" if isinstance(item, float) else str(item)
-
-
-def _plain(hint: Any) -> Any:
-    """The type behind `X | None`."""
-    if isinstance(hint, types.UnionType):
-        return next(part for part in typing.get_args(hint) if part is not type(None))
-    return hint
-
-
-def _whole(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a whole number, got '{text}'") from None
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a number, got '{text}'") from None
-
-
-def _names(text: str) -> tuple[str, ...]:
-    """Read a comma list; the empty text is the empty list."""
-    parts = tuple(part.strip() for part in text.split(","))
-    if parts == ("",):
-        return ()
-    if "" in parts:
-        raise argparse.ArgumentTypeError(f"expected names between commas, got '{text}'")
-    return parts
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    """Read a comma list of numbers."""
-    return tuple(map(_number, _names(text)))
-
-
-_READERS: Mapping[Any, Callable[[str], Any]] = types.MappingProxyType(
-    {int: _whole, float: _number, str: str, tuple[float, ...]: _numbers}
-)

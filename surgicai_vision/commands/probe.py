@@ -2,74 +2,75 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import many_of, not_negative, one_of, option, weights_option
-from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.commands.options import (
+    ACCEPT_LICENCE,
+    DIRECTORY,
+    ENCODERS,
+    NOT_NEGATIVE,
+    POOL,
+    TASK,
+    VIEWS,
+    WEIGHTS,
+    default_text,
+    join_weights,
+)
 from surgicai_vision.core.files import check_output, write_json
 from surgicai_vision.features import encoders
 
-EXAMPLE = "surgicai-vision probe --task grasp --encoder imagenet-lite,random --view front,back"
+app = App(
+    name="probe",
+    help_epilogue="""\
+example:
+  surgicai-vision probe --task grasp --encoder imagenet-lite,random --view front,back""",
+)
 RESULT = "probe.json"
 
 
-def _check_encoders(name: str, given: tuple[str, ...]) -> None:
-    if not given:
-        raise InputError(f"{name} is empty; name at least one of {encoders.encoder_choices()}.")
-    for encoder in given:
-        encoders.check_encoder_name(encoder)
-
-
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `probe`."""
+    """Options of `probe`.
 
-    task: str = option(
-        "grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
-    )
-    dataset: str | None = option(
-        None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>"
-    )
-    encoder: tuple[str, ...] = option(
-        ("imagenet-lite",),
-        f"encoders, a comma list of {encoders.encoder_choices()}",
-        check=_check_encoders,
-        metavar="NAME[,NAME]",
-    )
-    view: tuple[str, ...] = option(
-        ("front", "back"),
-        "views, a comma list: each is probed alone, and all side by side",
-        check=many_of("view", names.CAMERAS),
-        metavar="VIEW[,VIEW]",
-    )
-    weights: str | None = weights_option()
-    accept_licence: bool = option(False, "accept weights under a non-commercial licence")
-    pool: str = option(
-        "global",
-        f"what is taken: {', '.join(encoders.POOLS)}",
-        check=one_of("pool", encoders.POOLS),
-    )
-    seed: int = option(0, "seed of the folds and of the intervals", check=not_negative)
-    out: str | None = option(
-        None, f"folder for {RESULT}; an earlier one is replaced", metavar="DIR",
-        default_text="outputs/probes/<task>-<encoders>-<views>",
-    )  # fmt: skip
+    Attributes:
+        task: The dataset's task.
+        dataset: Folder of the dataset.
+        encoder: Encoders to probe.
+        view: Views to probe, each alone and all side by side.
+        pool: What is taken from the encoder.
+        seed: Seed of the folds and of the intervals.
+        out: Folder for probe.json; an earlier one is replaced.
+    """
+
+    task: Annotated[str, TASK] = "grasp"
+    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    encoder: Annotated[tuple[str, ...], ENCODERS] = ("imagenet-lite",)
+    view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
+    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
+    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    pool: Annotated[str, POOL] = "global"
+    seed: Annotated[int, NOT_NEGATIVE] = 0
+    out: Annotated[
+        Path | None, DIRECTORY, default_text("outputs/probes/<task>-<encoders>-<views>")
+    ] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Probe every encoder and view set, keep the rows and print them."""
-    if not options.view:
-        raise InputError("--view is empty; name at least one view.")
+    weights = join_weights(options.weights)
     for encoder in options.encoder:
-        encoders.find_weights(encoder, options.weights, options.accept_licence)
+        encoders.find_weights(encoder, weights, options.accept_licence)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
     label = "-".join(
         (dataset.task, "+".join(options.encoder).replace(":", "-"), "+".join(options.view))
     )
-    out = Path(options.out) if options.out else folders.OUTPUTS / "probes" / label
+    out = options.out or folders.OUTPUTS / "probes" / label
     check_output(out, may_resume=RESULT)
     rows = [row for encoder in options.encoder for row in _rows(options, encoder, dataset, console)]
     out.mkdir(parents=True, exist_ok=True)
@@ -83,7 +84,9 @@ def _rows(options: Options, name: str, dataset: Any, console: Console) -> list[d
     from surgicai_vision.features.cache import encode
     from surgicai_vision.features.probe import probe
 
-    encoder = encoders.load_encoder(name, options.weights, options.pool, options.accept_licence)
+    encoder = encoders.load_encoder(
+        name, join_weights(options.weights), options.pool, options.accept_licence
+    )
     entries = {}
     for view in options.view:
         with console.stage(f"features: {name}, {view}", "frames") as progress:

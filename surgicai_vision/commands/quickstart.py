@@ -2,59 +2,55 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import (
-    config_only,
-    many_of,
-    not_negative,
-    one_of,
-    option,
-    positive,
-)
-from surgicai_vision.core import names
+from surgicai_vision.commands.options import COUNT, DIRECTORY, FILE_ONLY, NOT_NEGATIVE, TASK, VIEWS
 from surgicai_vision.experiments.quickstart_config import PolicyChoice, Quickstart
 
-EXAMPLE = "surgicai-vision quickstart"
+app = App(name="quickstart", help_epilogue="example:\n  surgicai-vision quickstart")
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `quickstart`."""
+    """Options of `quickstart`.
 
-    task: str = option(
-        Quickstart.task, f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
-    )
-    demonstrations: int = option(
-        Quickstart.demonstrations, "expert demonstrations", check=positive, metavar="N"
-    )
-    view: tuple[str, ...] = option(
-        Quickstart.view,
-        "rendered views, a comma list",
-        check=many_of("view", names.CAMERAS),
-        metavar="VIEW[,VIEW]",
-    )
-    size: int = option(
-        Quickstart.size, "height and width of images [px]", check=positive, metavar="PX"
-    )
-    depth: bool = option(Quickstart.depth, "render depth beside RGB")
-    recipe: str = option(Quickstart.recipe, "recipe of behaviour cloning")
-    episodes: int = option(
-        Quickstart.episodes, "held-out starts of each evaluation", check=positive, metavar="N"
-    )
-    seed: int = option(Quickstart.seed, "training seed", check=not_negative)
-    workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
-    out: str = option("outputs/quickstart", "folder to make or to continue", metavar="DIR")
-    policies: tuple[PolicyChoice, ...] | None = config_only()
+    Attributes:
+        task: The task.
+        demonstrations: Expert demonstrations.
+        view: Rendered views.
+        size: Height and width of images [px].
+        depth: Render depth beside RGB.
+        recipe: Recipe of behaviour cloning.
+        episodes: Held-out starts of each evaluation.
+        seed: Training seed.
+        workers: Number of processes.
+        out: Folder to make or to continue.
+    """
+
+    task: Annotated[str, TASK] = Quickstart.task
+    demonstrations: Annotated[int, COUNT] = Quickstart.demonstrations
+    view: Annotated[tuple[str, ...], VIEWS] = Quickstart.view
+    size: Annotated[int, COUNT, Parameter(metavar="PX")] = Quickstart.size
+    depth: bool = Quickstart.depth
+    recipe: str = Quickstart.recipe
+    episodes: Annotated[int, COUNT] = Quickstart.episodes
+    seed: Annotated[int, NOT_NEGATIVE] = Quickstart.seed
+    workers: Annotated[int, COUNT] = folders.CORES
+    out: Annotated[Path, DIRECTORY] = Path("outputs/quickstart")
+    policies: Annotated[tuple[PolicyChoice, ...] | None, FILE_ONLY] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Run it, print the table and say where the page is."""
     from surgicai_vision.experiments.quickstart import run_quickstart
 
-    result = run_quickstart(plan_of(options), Path(options.out), console.stage, options.workers)
+    result = run_quickstart(plan_of(options), options.out, console.stage, options.workers)
     console.say()
     for line in table(result["results"]):
         console.say(line)

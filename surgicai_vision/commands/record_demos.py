@@ -1,88 +1,79 @@
-"""`record-demos`: record demonstrations by the scripted expert, or by movement primitives learned
-from some.
-"""
+"""`record-demos`: record demonstrations by the scripted expert or by movement primitives."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    config_only,
-    executor_option,
-    not_negative,
-    one_of,
-    option,
-    positive,
-    share,
+    COUNT,
+    DIRECTORY,
+    EXECUTOR,
+    FILE_ONLY,
+    FRACTION,
+    NOT_NEGATIVE,
+    TASK,
+    default_text,
     task_config,
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 
-EXAMPLE = "surgicai-vision record-demos --task grasp --episodes 50"
+app = App(
+    name="record-demos",
+    help_epilogue="example:\n  surgicai-vision record-demos --task grasp --episodes 50",
+)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `record-demos`."""
+    """Options of `record-demos`.
 
-    task: str = option(
-        "grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
-    )
-    episodes: int = option(50, "successful episodes to keep", check=positive, metavar="N")
-    demonstrator: str = option(
-        "expert",
-        "who acts: expert; search: the expert without the grasp's goal; dmp: movement primitives learned from --from",
-    )
-    from_: str | None = option(
-        None, "demonstrations to learn from (--demonstrator dmp)", metavar="DEMOS"
-    )
-    demos_used: int = option(1, "how many of them to learn from", check=positive, metavar="N")
-    seed: int = option(
-        names.TRAIN_SEED, "seed of the first start; each episode takes the next", check=not_negative
-    )
-    noise: float = option(
-        0.0,
-        "standard deviation of the noise on executed motions, in units of an action's range; labels stay the expert's",
-        check=share,
-        metavar="SIGMA",
-    )
-    noise_from: float | None = option(
-        None,
-        "lowest such deviation: each episode draws its own between this and --noise",
-        check=share,
-        metavar="SIGMA",
-        default_text="--noise itself",
-    )
-    perturb_start_fraction: float = option(
-        0.0,
-        "share of episodes that start with a push that is not recorded",
-        check=share,
-        metavar="P",
-    )
-    learner: str | None = option(
-        None,
-        "a checkpoint that acts until a step drawn by chance; labels stay the expert's (DAgger)",
-        metavar="DIR",
-    )
-    post_success_steps: int = option(
-        0,
-        "control steps that an episode goes on after its success",
-        check=not_negative,
-        metavar="N",
-    )
-    workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
-    executor: str = executor_option()
-    out: str | None = option(
-        None, "folder to make or to continue", metavar="DIR", default_text="outputs/demos/<task>"
-    )
-    env: dict | None = config_only()
+    Attributes:
+        task: The task.
+        episodes: Successful episodes to keep.
+        demonstrator: Who acts: expert; search, the expert without the grasp's goal; dmp, movement
+            primitives learned from --from.
+        from_: Demonstrations to learn from (--demonstrator dmp).
+        demos_used: How many of them to learn from.
+        seed: Seed of the first start; each episode takes the next.
+        noise: Standard deviation of the noise on executed motions, in units of an action's range;
+            labels stay the expert's.
+        noise_from: Lowest such deviation: each episode draws its own between this and --noise.
+        perturb_start_fraction: Share of episodes that start with a push that is not recorded.
+        learner: A checkpoint that acts until a step drawn at random; labels stay the expert's
+            (DAgger).
+        post_success_steps: Control steps that an episode goes on after its success.
+        workers: Number of processes.
+        out: Folder to make or to continue.
+    """
+
+    task: Annotated[str, TASK] = "grasp"
+    episodes: Annotated[int, COUNT] = 50
+    demonstrator: str = "expert"
+    from_: Annotated[Path | None, Parameter(metavar="DEMOS")] = None
+    demos_used: Annotated[int, COUNT] = 1
+    seed: Annotated[int, NOT_NEGATIVE] = names.TRAIN_SEED
+    noise: Annotated[float, FRACTION, Parameter(metavar="SIGMA")] = 0.0
+    noise_from: Annotated[
+        float | None, FRACTION, Parameter(metavar="SIGMA"), default_text("--noise itself")
+    ] = None
+    perturb_start_fraction: Annotated[float, FRACTION] = 0.0
+    learner: Annotated[Path | None, DIRECTORY] = None
+    post_success_steps: Annotated[int, NOT_NEGATIVE] = 0
+    workers: Annotated[int, COUNT] = folders.CORES
+    executor: Annotated[str, EXECUTOR] = "local"
+    out: Annotated[Path | None, DIRECTORY, default_text("outputs/demos/<task>")] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Record and say where the demonstrations are."""
     from surgicai_vision.core.executor import open_engine
     from surgicai_vision.demos.record import record
@@ -96,10 +87,10 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         )
     engine = open_engine(options.executor)
     config = task_config(options.task, options.env)
-    out = Path(options.out) if options.out else folders.demos_folder(options.task)
+    out = options.out or folders.demos_folder(options.task)
     folders.check_folder(out, "demos.json")
-    taught = _taught(Path(options.from_), options.demos_used) if options.from_ else []
-    learner = _learner(Path(options.learner), config) if options.learner else None
+    taught = _taught(options.from_, options.demos_used) if options.from_ else []
+    learner = _learner(options.learner, config) if options.learner else None
     with console.stage(f"recording {options.task}", "episodes") as progress:
         paths = record(
             config,

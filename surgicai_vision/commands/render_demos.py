@@ -3,84 +3,76 @@
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders, record_demos
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    config_only,
-    executor_option,
-    image_size,
-    many_of,
-    not_negative,
-    one_of,
-    option,
-    positive,
+    COUNT,
+    DIRECTORY,
+    EXECUTOR,
+    FILE_ONLY,
+    IMAGE_SIZE,
+    NOT_NEGATIVE,
+    TASK,
+    VIDEO,
+    VIEWS,
+    default_text,
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
 
-CODECS = ("h264", "av1")
-EXAMPLE = "surgicai-vision render-demos --task grasp --episodes 50 --view front,back --depth"
+app = App(
+    name="render-demos",
+    help_epilogue="""\
+example:
+  surgicai-vision render-demos --task grasp --episodes 50 --view front,back --depth""",
+)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `render-demos`."""
+    """Options of `render-demos`.
 
-    demos: tuple[str, ...] | None = option(
-        None,
-        "demonstrations to render, or several folders of them",
-        metavar="DIR[,DIR]",
-        default_text="record the expert's into outputs/demos/<task>",
-    )
-    task: str | None = option(
-        None,
-        f"without --demos, the task: {', '.join(names.TASKS)}",
-        check=one_of("task", names.TASKS),
-        default_text="grasp",
-    )
-    episodes: int | None = option(
-        None,
-        "without --demos, demonstrations to record",
-        check=positive,
-        metavar="N",
-        default_text="50",
-    )
-    seed: int = option(
-        names.TRAIN_SEED, "without --demos, seed of the first start", check=not_negative
-    )
-    view: tuple[str, ...] = option(
-        ("front", "back"),
-        "views, a comma list",
-        check=many_of("view", names.CAMERAS),
-        metavar="VIEW[,VIEW]",
-    )
-    size: int = option(224, "height and width of images [px]", check=image_size, metavar="PX")
-    depth: bool = option(False, "render depth beside RGB")
-    segmentation: bool = option(False, "render the parts beside RGB")
-    frame_stride: int = option(
-        1,
-        "render every N-th frame alone: many episodes at the cost of few",
-        check=positive,
-        metavar="N",
-    )
-    video: str | None = option(
-        None,
-        f"store RGB as video: {', '.join(CODECS)}; the error is measured",
-        check=one_of("video codec", CODECS),
-        metavar="CODEC",
-        default_text="lossless images",
-    )
-    workers: int = option(folders.CORES, "processes", check=positive, metavar="N")
-    executor: str = executor_option()
-    out: str | None = option(
-        None, "dataset to make", metavar="DIR", default_text="outputs/datasets/<task>"
-    )
-    env: dict | None = config_only()
+    Attributes:
+        demos: Demonstrations to render, or several folders of them.
+        task: Without --demos, the task.
+        episodes: Without --demos, demonstrations to record.
+        seed: Without --demos, seed of the first start.
+        view: Views to render.
+        size: Height and width of images [px].
+        depth: Render depth beside RGB.
+        segmentation: Render the parts beside RGB.
+        frame_stride: Render every N-th frame alone: many episodes at the cost of few.
+        workers: Number of processes.
+        out: Dataset to make.
+    """
+
+    demos: Annotated[
+        tuple[Path, ...],
+        Parameter(metavar="DIR[,DIR]"),
+        default_text("record the expert's into outputs/demos/<task>"),
+    ] = ()
+    task: Annotated[str | None, TASK, default_text("grasp")] = None
+    episodes: Annotated[int | None, COUNT, default_text("50")] = None
+    seed: Annotated[int, NOT_NEGATIVE] = names.TRAIN_SEED
+    view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
+    size: Annotated[int, IMAGE_SIZE] = 224
+    depth: bool = False
+    segmentation: bool = False
+    frame_stride: Annotated[int, COUNT] = 1
+    video: Annotated[str | None, VIDEO, default_text("lossless images")] = None
+    workers: Annotated[int, COUNT] = folders.CORES
+    executor: Annotated[str, EXECUTOR] = "local"
+    out: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Record where that is asked for, render, and say where the dataset is."""
     from surgicai_vision.core.executor import open_engine
     from surgicai_vision.dataset import render_demos
@@ -90,13 +82,10 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         raise InputError(
             "--task, --episodes and env say what to record; with --demos DIR nothing is recorded."
         )
-    if not options.view:
-        raise InputError(f"--view is empty; give some of {', '.join(names.CAMERAS)}.")
-    given = [Path(folder) for folder in options.demos or ()]
-    task = folders.demos_task(given[0]) if given else options.task or "grasp"
-    out = Path(options.out) if options.out else folders.dataset_folder(task)
+    task = folders.demos_task(options.demos[0]) if options.demos else options.task or "grasp"
+    out = options.out or folders.dataset_folder(task)
     folders.check_folder(out, names.META_FILE)
-    demos = given or [_record(options, task, console)]
+    demos = options.demos or [_record(options, task, console)]
     with console.stage(f"rendering {', '.join(options.view)}", "frames") as progress:
         summary = render_demos(
             demos,
@@ -140,4 +129,4 @@ def _record(options: Options, task: str, console: Console) -> Path:
         executor=options.executor,
         env=options.env,
     )
-    return Path(record_demos.run(asked, console)["demos"])
+    return Path(str(record_demos.run(asked, console=console)["demos"]))

@@ -1,48 +1,45 @@
 """`report`: write the page and the tables of stored results."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import not_negative, option
+from surgicai_vision.commands.options import NOT_NEGATIVE, default_text
 from surgicai_vision.core.errors import BadFile, SurgicaiError
 
-EXAMPLE = "surgicai-vision report outputs/quickstart"
+app = App(name="report", help_epilogue="example:\n  surgicai-vision report outputs/quickstart")
 STRIPS = 160
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `report`."""
+    """Options of `report`.
 
-    dir: str = option(
-        dataclasses.MISSING,
-        "folder with results of quickstart, evaluate, robustness or sweep",
-        metavar="DIR",
+    Attributes:
+        dir: Folder with results of quickstart, evaluate, robustness or sweep.
+        out: Where to write the page; tables/ stands beside it.
+        strips: Film strips at most, as far as the page's budget allows.
+    """
+
+    dir: Annotated[Path, Parameter(metavar="DIR")] = field(kw_only=False)
+    out: Annotated[Path | None, Parameter(metavar="FILE.html"), default_text("DIR/report.html")] = (
+        None
     )
-    out: str | None = option(
-        None,
-        "where to write the page; tables/ stands beside it",
-        metavar="FILE.html",
-        default_text="DIR/report.html",
-    )
-    strips: int = option(
-        STRIPS,
-        "film strips at most, as far as the page's budget allows",
-        check=not_negative,
-        metavar="N",
-    )
+    strips: Annotated[int, NOT_NEGATIVE] = STRIPS
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
     """Write page and tables and say where they are."""
     from surgicai_vision.report import collect, write_report
     from surgicai_vision.report.tables import FOLDER
 
-    folder = Path(options.dir)
+    folder = options.dir
     if not folder.is_dir():
         raise BadFile(
             f"{folder} is no folder; give one that quickstart, evaluate or sweep has written."
@@ -50,7 +47,7 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     cells = _cells(folder, console)
     found = collect(folder, cells)
     with console.stage("report", "parts") as progress:
-        out = Path(options.out) if options.out else None
+        out = options.out or None
         page = write_report(folder, out, progress, cells=cells, strips=options.strips)
     tables = page.parent / FOLDER
     console.say(f"report: {page}")

@@ -1,88 +1,86 @@
-"""`robustness`: run a policy while one thing at a time shifts, and draw its successes against the
-strength.
-"""
+"""`robustness`: run a policy while one thing at a time shifts, and draw its successes."""
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.evaluate import subject_of
 from surgicai_vision.commands.options import (
-    config_only,
-    many_of,
-    not_negative,
-    one_of,
-    option,
-    positive,
-    weights_option,
+    ACCEPT_LICENCE,
+    COUNT,
+    DIRECTORY,
+    FILE_ONLY,
+    LIST,
+    NOT_NEGATIVE,
+    TASK,
+    UNIQUE,
+    WEIGHTS,
+    default_text,
 )
 from surgicai_vision.core import names
 from surgicai_vision.evaluation.robustness import AXES, CURVES, MARK, STRENGTHS, robustness
 
-EXAMPLE = "surgicai-vision robustness outputs/train/grasp-imagenet-lite-front-seed0 --axis light,blur --strength 0,0.5,1"
+app = App(
+    name="robustness",
+    help_epilogue="""\
+example:
+  surgicai-vision robustness outputs/train/grasp-imagenet-lite-front-seed0 \\
+      --axis light,blur --strength 0,0.5,1""",
+)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `robustness`."""
+    """Options of `robustness`.
 
-    policy: str = option(
-        dataclasses.MISSING,
-        "a checkpoint folder, a chain.yaml, or expert, replay, random or zero",
-        metavar="POLICY",
-    )
-    task: str | None = option(
-        None,
-        f"the task: {', '.join(names.TASKS)}",
-        check=one_of("task", names.TASKS),
-        default_text="the checkpoint's, else grasp",
-    )
-    axis: tuple[str, ...] = option(
-        (),
-        f"what shifts: {', '.join(AXES)}",
-        check=many_of("axis", AXES),
-        metavar="AXIS,AXIS",
-        default_text="all that change what the policy sees or does",
-    )
-    strength: tuple[float, ...] = option(
-        STRENGTHS, "how much, from 0 (not at all) to 1, increasing", metavar="NUMBER,NUMBER"
-    )
-    episodes: int = option(20, "number of episodes at each strength", check=positive, metavar="N")
-    seed: int = option(
-        names.TEST_SEED, "seed of the first start; each episode takes the next", check=not_negative
-    )
-    workers: int | None = option(
-        None,
-        "processes",
-        check=positive,
-        metavar="N",
-        default_text="one a core, at most one for four episodes",
-    )
-    dataset: str | None = option(
-        None,
-        "dataset whose mean demonstration replay plays",
-        metavar="DIR",
-        default_text="outputs/datasets/<task>",
-    )
-    weights: str | None = weights_option()
-    accept_licence: bool = option(False, "accept weights under a non-commercial licence")
-    out: str | None = option(
-        None,
-        "folder to make or to continue",
-        metavar="DIR",
-        default_text="outputs/robustness/<task>-<policy>-starts<seed>+<episodes>",
-    )
-    env: dict | None = config_only()
+    Attributes:
+        policy: A checkpoint folder, a chain.yaml, or expert, replay, random or zero.
+        task: The task.
+        axis: What shifts.
+        strength: How much, from 0 (not at all) to 1, increasing.
+        episodes: Number of episodes at each strength.
+        seed: Seed of the first start; each episode takes the next.
+        workers: Number of processes.
+        dataset: Dataset whose mean demonstration replay plays.
+        out: Folder to make or to continue.
+    """
+
+    policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
+    task: Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")] = None
+    axis: Annotated[
+        tuple[str, ...],
+        UNIQUE,
+        Parameter(choices=AXES, metavar="AXIS[,AXIS]"),
+        default_text("all that change what the policy sees or does"),
+    ] = ()
+    strength: Annotated[tuple[float, ...], LIST, Parameter(metavar="NUMBER[,NUMBER]")] = STRENGTHS
+    episodes: Annotated[int, COUNT] = 20
+    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    workers: Annotated[
+        int | None, COUNT, default_text("one a core, at most one for four episodes")
+    ] = None
+    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
+    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    out: Annotated[
+        Path | None,
+        DIRECTORY,
+        default_text("outputs/robustness/<task>-<policy>-starts<seed>+<episodes>"),
+    ] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
     """Evaluate every axis at every strength and print the curves."""
     subject = subject_of(options)
     name = f"{subject.config.task}-{subject.name}-starts{options.seed}+{options.episodes}"
-    out = Path(options.out) if options.out else folders.OUTPUTS / "robustness" / name
+    out = options.out or folders.OUTPUTS / "robustness" / name
     folders.check_folder(out, MARK)
     seeds = range(options.seed, options.seed + options.episodes)
     rows = robustness(

@@ -2,57 +2,61 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    config_only,
-    image_size,
-    many_of,
-    not_negative,
-    one_of,
-    option,
+    FILE_ONLY,
+    IMAGE_SIZE,
+    NOT_NEGATIVE,
+    TASK,
+    VIEWS,
+    default_text,
     task_config,
 )
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError
 
-EXAMPLE = "surgicai-vision scene --task grasp --seed 0 --sheet sheet.png"
+app = App(
+    name="scene",
+    help_epilogue="example:\n  surgicai-vision scene --task grasp --seed 0 --sheet sheet.png",
+)
 QUALITIES = ("fast", "high")
 FILM_FRAMES = 6
+FIGURE_SUFFIXES = (".png", ".jpg", ".pdf", ".svg")
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `scene`."""
+    """Options of `scene`.
 
-    task: str = option(
-        "grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
-    )
-    seed: int = option(names.TRAIN_SEED, "seed of the start", check=not_negative)
-    view: tuple[str, ...] = option(
-        names.CAMERAS,
-        "views, a comma list",
-        check=many_of("view", names.CAMERAS),
-        metavar="VIEW[,VIEW]",
-    )
-    size: int = option(336, "height and width of each image [px]", check=image_size, metavar="PX")
-    quality: str = option(
-        "high", "fast (as datasets are rendered) or high", check=one_of("quality", QUALITIES)
-    )
-    sheet: str | None = option(
-        None, "where to write it", metavar="FILE.png", default_text="outputs/scene-<task>.png"
-    )
-    film: str | None = option(
-        None,
-        "draw a film strip of the expert in every subtask instead, in the first view",
-        metavar="FILE.png",
-    )
-    env: dict | None = config_only()
+    Attributes:
+        task: The task.
+        seed: Seed of the start.
+        view: Views to show.
+        size: Height and width of each image [px].
+        quality: fast (as datasets are rendered) or high.
+        sheet: File to write.
+        film: Draw a film strip of the expert in every subtask instead, in the first view.
+    """
+
+    task: Annotated[str, TASK] = "grasp"
+    seed: Annotated[int, NOT_NEGATIVE] = names.TRAIN_SEED
+    view: Annotated[tuple[str, ...], VIEWS] = names.CAMERAS
+    size: Annotated[int, IMAGE_SIZE] = 336
+    quality: Annotated[str, Parameter(choices=QUALITIES)] = "high"
+    sheet: Annotated[
+        Path | None, Parameter(metavar="FILE.png"), default_text("outputs/scene-<task>.png")
+    ] = None
+    film: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Roll the expert once and draw the start and the end as every camera sees them."""
     from surgicai_vision.envs import contact_sheet
     from surgicai_vision.evaluation import policy_spec
@@ -62,10 +66,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     if options.film:
         return _film(options, console)
     config = task_config(options.task, options.env)
-    path = Path(options.sheet) if options.sheet else folders.OUTPUTS / f"scene-{options.task}.png"
-    if not options.view:
-        raise InputError(f"--view is empty; give some of {', '.join(names.CAMERAS)}.")
-    folders.check_file(path, "--sheet", (".png", ".jpg", ".pdf", ".svg"))
+    path = options.sheet or folders.OUTPUTS / f"scene-{options.task}.png"
+    folders.check_file(path, "--sheet", FIGURE_SUFFIXES)
     with console.stage(f"rolling the expert of {options.task}", "steps") as progress:
         episode = evaluate(
             policy_spec.expert, config, [options.seed], workers=1, progress=progress
@@ -103,16 +105,14 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     }
 
 
-def _film(options: Options, console: Console) -> dict[str, Any]:
-    """Draw a row of moments for every subtask: the expert's episode from the seed, as the first
-    view sees it.
-    """
+def _film(options: Options, console: Console) -> dict[str, object]:
+    """Draw a row of moments for every subtask: the expert's episode from the seed, as the first view sees it."""
     from surgicai_vision.envs import contact_sheet
     from surgicai_vision.evaluation import policy_spec
     from surgicai_vision.evaluation.rollout import evaluate
 
     path, rows, outcomes = Path(options.film or ""), [], {}
-    folders.check_file(path, "--film", (".png", ".jpg", ".pdf", ".svg"))
+    folders.check_file(path, "--film", FIGURE_SUFFIXES)
     with console.stage("filming", "subtasks") as progress:
         for done, subtask in enumerate(names.SUBTASKS):
             config = task_config(subtask, options.env)

@@ -1,67 +1,69 @@
 """`sweep`: encode, train and evaluate every cell of a grid."""
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import executor_option, option, positive, read_yaml
+from surgicai_vision.commands.options import (
+    COUNT,
+    DIRECTORY,
+    EXECUTOR,
+    default_text,
+    read_yaml,
+)
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, UnknownName
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.experiments.sweep import AXES, Choice, Grid
 
-EXAMPLE = "surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/smoke --json"
+app = App(
+    name="sweep",
+    help_epilogue="""\
+example:
+  surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/smoke --json""",
+)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `sweep`."""
+    """Options of `sweep`.
 
-    grid: str = option(
-        dataclasses.MISSING,
-        "the grid; shipped ones also by their name (smoke)",
-        metavar="GRID.yaml",
-    )
-    out: str | None = option(
-        None,
-        "folder to make or to continue",
-        metavar="DIR",
-        default_text="outputs/sweeps/<name of the grid>",
-    )
-    only: tuple[str, ...] | None = option(
-        None,
-        "work on these cells alone, by an axis of the grid; repeat it for another axis; views are joined by +",
-        metavar="AXIS=VALUE,...",
-        repeat=True,
-        default_text="all",
-    )
-    dry_run: bool = option(
-        False, "list the cells, what is there already and about how long the rest takes; no work"
-    )
-    workers: int = option(
-        folders.CORES,
-        "cells at a time; the results do not depend on it",
-        check=positive,
-        metavar="N",
-    )
-    attempts: int = option(
-        3, "how often a cell is started whose process is killed", check=positive, metavar="N"
-    )
-    executor: str = executor_option()
+    Attributes:
+        grid: The grid; shipped ones also by their name (smoke).
+        out: Folder to make or to continue.
+        only: Work on these runs alone, by an axis of the grid; repeat it for another axis; views
+            are joined by +.
+        dry_run: List the runs, what is there already and about how long the rest takes; no work.
+        workers: Runs at a time; the results do not depend on it.
+        attempts: How often a run is started whose process is killed.
+    """
+
+    grid: Annotated[str, Parameter(metavar="GRID.yaml")] = field(kw_only=False)
+    out: Annotated[Path | None, DIRECTORY, default_text("outputs/sweeps/<name of the grid>")] = None
+    only: Annotated[
+        tuple[str, ...], Parameter(metavar="AXIS=VALUE[,VALUE]"), default_text("all")
+    ] = ()
+    dry_run: Annotated[bool, Parameter(negative=())] = False
+    workers: Annotated[int, COUNT] = folders.CORES
+    attempts: Annotated[int, COUNT] = 3
+    executor: Annotated[str, EXECUTOR] = "local"
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
     """Run the sweep, or list its cells."""
     from surgicai_vision.core.executor import open_engine
     from surgicai_vision.experiments.sweep import read_choice, run_sweep
 
     path = grid_file(options.grid)
     grid = read_grid(path)
-    choice = read_choice(options.only or (), grid.cells)
-    out = Path(options.out) if options.out else folders.OUTPUTS / "sweeps" / path.stem
+    choice = read_choice(options.only, grid.cells)
+    out = options.out or folders.OUTPUTS / "sweeps" / path.stem
     engine = open_engine(options.executor)
     if options.dry_run:
         return _list(grid, out, choice, options.workers, console)
@@ -73,7 +75,9 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     return {**result, "exit_code": 1 if result["failed"] else 0}
 
 
-def _list(grid: Grid, out: Path, choice: Choice, workers: int, console: Console) -> dict[str, Any]:
+def _list(
+    grid: Grid, out: Path, choice: Choice, workers: int, console: Console
+) -> dict[str, object]:
     """Say what each cell is, and how long the rest takes."""
     from surgicai_vision.experiments.sweep import STATES, estimate, plan
 
@@ -117,14 +121,17 @@ def grid_file(given: str) -> Path:
 
 
 def read_grid(path: Path) -> Grid:
-    """Read a grid; a list of views may be written as "front,back", an axis of one value without
-    brackets.
+    """Read a grid.
+
+    A list of views may be written as "front,back", and an axis of one value without brackets.
     """
     table = read_yaml(path)
-    if isinstance(table.get("view"), list):
-        table["view"] = [_listed(view) for view in table["view"]]
-    if isinstance(table.get("ablation"), list):
-        table["ablation"] = [_ablation(ablation) for ablation in table["ablation"]]
+    views = table.get("view")
+    if isinstance(views, list):
+        table["view"] = [_listed(view) for view in views]
+    ablations = table.get("ablation")
+    if isinstance(ablations, list):
+        table["ablation"] = [_ablation(ablation) for ablation in ablations]
     for name in AXES:
         if name in table and isinstance(table[name], (str, int)):
             table[name] = [table[name]]
@@ -133,13 +140,13 @@ def read_grid(path: Path) -> Grid:
     return from_mapping(Grid, table, str(path))
 
 
-def _listed(value: Any) -> Any:
+def _listed(value: object) -> object:
     """Return "front,back" as a list."""
     return value.split(",") if isinstance(value, str) else value
 
 
-def _ablation(table: Any) -> Any:
-    """Return a ablation whose lists may be written as texts."""
+def _ablation(table: object) -> object:
+    """Return an ablation whose lists may be written as texts."""
     if not isinstance(table, dict):
         return table
     return {

@@ -1,119 +1,91 @@
 """`teleoperate`: drive the arms by keyboard or gamepad and record what succeeded."""
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from cyclopts import App, Parameter, validators
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    config_only,
-    many_of,
-    not_negative,
-    one_of,
-    option,
-    positive,
+    COUNT,
+    DIRECTORY,
+    FILE_ONLY,
+    NOT_NEGATIVE,
+    TASK,
+    VIEWS,
+    default_text,
     task_config,
+    within,
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.teleoperation.keyboard import key_table
 
-EXAMPLE = "surgicai-vision teleoperate --task grasp"
-NOTES = f"""keys (by their place on a US keyboard) and gamepad:
+app = App(
+    name="teleoperate",
+    help_epilogue=f"""\
+example:
+  surgicai-vision teleoperate --task grasp
+
+keys (by their place on a US keyboard) and gamepad:
 {key_table()}
 
-Only successes are kept. The same command goes on where a session was stopped or killed."""
-
+Only successes are kept. The same command goes on where a session was stopped or killed.""",
+)
 SECONDS = 60.0
 """Time a subtask may take [s]; the paper's 4 s suit a policy, not a hand."""
-SIZES = (64, 1024)
-PACES = (0.05, 4.0)
 WEB_PORT = 8765
 
 
-def _speed(name: str, value: float) -> None:
-    if not 0 < value <= 1:
-        raise InputError(f"{name} is {value}; it must be above 0 and at most 1.")
-
-
-def _within(low: float, high: float) -> Any:
-    """Return a check that admits numbers from `low` to `high`."""
-
-    def check(name: str, value: float | None) -> None:
-        if value is not None and not low <= value <= high:
-            raise InputError(f"{name} is {value}; it must be within {low} and {high}.")
-
-    return check
-
-
-@dataclasses.dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `teleoperate`."""
+    """Options of `teleoperate`.
 
-    task: str = option(
-        "grasp", f"the task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
-    )
-    port: int = option(
-        WEB_PORT,
-        "port of the page on this machine's loopback, 0 for any",
-        check=_within(0, 65535),
-        metavar="N",
-    )
-    view: tuple[str, ...] = option(
-        ("front", "back"),
-        f"views shown, a comma list; the first leads: {', '.join(names.CAMERAS)}",
-        check=many_of("view", names.CAMERAS),
-        metavar="VIEW[,VIEW]",
-    )
-    size: int = option(448, "height and width of images [px]", check=_within(*SIZES), metavar="PX")
-    frame: str = option(
-        "camera",
-        "whose axes the keys mean: camera (of the leading view), or tool",
-        check=one_of("frame", ("camera", "tool")),
-    )
-    speed: float = option(
-        0.5, "share of the step size that a key or a full deflection commands", check=_speed
-    )
-    pace: float = option(
-        1.0, "share of real time; 0.5 gives twice the time to react", check=_within(*PACES)
-    )
-    seconds: float | None = option(
-        None,
-        "simulated seconds an attempt may take",
-        check=_within(0.1, 3600),
-        default_text=f"{SECONDS:g}, {SECONDS * len(names.SUBTASKS):g} for {names.SUTURE}",
-    )
-    episodes: int | None = option(
-        None,
-        "stop when so many more are kept",
-        check=positive,
-        metavar="N",
-        default_text="go on until Esc",
-    )
-    seed: int | None = option(
-        None,
-        "seed of a new folder's first start",
-        check=not_negative,
-        metavar="N",
-        default_text=f"{names.TRAIN_SEED}",
-    )
-    auto_keep: bool = option(False, "keep a success without asking")
-    keep_failures: bool = option(False, "→ keeps an episode without success too")
-    skip_idle: bool = option(
-        False, "the world stands still while nothing is held, and pauses are not recorded"
-    )
-    out: str | None = option(
-        None,
-        "folder to make or to continue",
-        metavar="DIR",
-        default_text="outputs/teleoperation/<task>",
-    )
-    env: dict | None = config_only()
+    Attributes:
+        task: The task.
+        port: Port of the page on this machine's loopback, 0 for any.
+        view: Views shown; the first leads.
+        size: Height and width of images [px].
+        frame: Whose axes the keys mean: those of the camera of the leading view, or the tool's.
+        speed: Share of the step size that a key or a full deflection commands.
+        pace: Share of real time; 0.5 gives twice the time to react.
+        seconds: Simulated seconds an attempt may take.
+        episodes: Stop when so many more are kept.
+        seed: Seed of a new folder's first start.
+        auto_keep: Keep a success without asking.
+        keep_failures: → keeps an episode without success too.
+        skip_idle: The world stands still while nothing is held, and pauses are not recorded.
+        out: Folder to make or to continue.
+    """
+
+    task: Annotated[str, TASK] = "grasp"
+    port: Annotated[int, within(0, 65535)] = WEB_PORT
+    view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
+    size: Annotated[int, within(64, 1024), Parameter(metavar="PX")] = 448
+    frame: Annotated[str, Parameter(choices=("camera", "tool"))] = "camera"
+    speed: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=1))] = 0.5
+    pace: Annotated[float, Parameter(validator=validators.Number(gte=0.05, lte=4))] = 1.0
+    seconds: Annotated[
+        float | None,
+        Parameter(validator=validators.Number(gte=0.1, lte=3600)),
+        default_text(f"{SECONDS:g}, {SECONDS * len(names.SUBTASKS):g} for {names.SUTURE}"),
+    ] = None
+    episodes: Annotated[int | None, COUNT, default_text("go on until Esc")] = None
+    seed: Annotated[int | None, NOT_NEGATIVE, default_text(str(names.TRAIN_SEED))] = None
+    auto_keep: bool = False
+    keep_failures: bool = False
+    skip_idle: bool = False
+    out: Annotated[Path | None, DIRECTORY, default_text("outputs/teleoperation/<task>")] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Let a person record and say what was kept."""
     from surgicai_vision import envs
     from surgicai_vision.teleoperation.input_mapping import Steering
@@ -123,10 +95,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     from surgicai_vision.teleoperation.session import Rules, Session
     from surgicai_vision.teleoperation.web import WebView
 
-    if not options.view:
-        raise InputError("--view is empty; name at least one view.")
     config = _config(options)
-    out = Path(options.out) if options.out else folders.OUTPUTS / "teleoperation" / options.task
+    out = options.out or folders.OUTPUTS / "teleoperation" / options.task
     folders.check_folder(out, "demos.json")
     rules = Rules(options.episodes, options.auto_keep, options.keep_failures, options.skip_idle)
     with WebView(options.view, names.TASK_TEXTS[options.task], options.port) as page:

@@ -2,18 +2,26 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.logs import LOGS, open_log
 from surgicai_vision.commands.options import (
-    many_of,
-    not_negative,
-    one_of,
-    option,
-    positive,
-    weights_option,
+    ACCEPT_LICENCE,
+    COUNT,
+    DIRECTORY,
+    NOT_NEGATIVE,
+    POOL,
+    SUBTASK,
+    TASK,
+    UNIQUE,
+    VIEWS,
+    WEIGHTS,
+    default_text,
+    join_weights,
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.config import DEVIATIONS
@@ -21,100 +29,90 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
 
-EXAMPLE = "surgicai-vision train --encoder random --view back"
-NO_ENCODER, STATE = "none", "state"
-"""What stands for an encoder: proprioception alone, and the state with the goal (the ceiling)."""
+app = App(
+    name="train", help_epilogue="example:\n  surgicai-vision train --encoder random --view back"
+)
+NO_ENCODER = "none"
+"""`--encoder`: proprioception alone."""
+STATE = "state"
+"""`--encoder`: the state with the goal, an upper bound."""
 
 
-def _check_encoder(name: str, given: str) -> None:
-    if given not in (NO_ENCODER, STATE):
-        encoders.check_encoder_option(name, given)
+def _check_encoder(_: type, name: str) -> None:
+    if name not in (NO_ENCODER, STATE):
+        encoders.check_encoder_name(name)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `train`."""
+    """Options of `train`.
 
-    task: str = option(
-        "grasp", f"the dataset's task: {', '.join(names.TASKS)}", check=one_of("task", names.TASKS)
-    )
-    dataset: str | None = option(
-        None, "dataset folder", metavar="DIR", default_text="outputs/datasets/<task>"
-    )
-    subtask: str | None = option(
-        None,
-        f"take one subtask's frames of a dataset of whole procedures, for a chain: {', '.join(names.SUBTASKS)}",
-        check=one_of("subtask", names.SUBTASKS),
-        metavar="SUBTASK",
-    )
-    encoder: str = option(
-        "imagenet-lite",
-        f"one of {encoders.encoder_choices()}; none for proprioception alone, state for the state with the goal",
-        check=_check_encoder,
-    )
-    view: tuple[str, ...] | None = option(
-        None,
-        "views, a comma list",
-        check=many_of("view", names.CAMERAS),
-        metavar="VIEW[,VIEW]",
-        default_text="front,back",
-    )
-    weights: str | None = weights_option()
-    accept_licence: bool = option(False, "accept weights under a non-commercial licence")
-    pool: str = option(
-        "global",
-        f"what is taken: {', '.join(encoders.POOLS)}",
-        check=one_of("pool", encoders.POOLS),
-    )
-    policy: str = option(
-        "bc", f"one of {', '.join(policies.POLICIES)}", check=one_of("policy", policies.POLICIES)
-    )
-    recipe: str = option(
-        "paper", f"the policy's recipe: {', '.join(policies.recipe_names())}, or FILE.yaml"
-    )
-    deviation: tuple[str, ...] | None = option(
-        None,
-        f"what to do as the released code did, a comma list of {', '.join(DEVIATIONS)}",
-        check=many_of("deviation", DEVIATIONS),
-        metavar="NAME[,NAME]",
-        default_text="the recipe's",
-    )
-    change: tuple[str, ...] | None = option(
-        None,
-        "replace values of the recipe, a comma list: clock=false,map_head=softmax",
-        metavar="KEY=VALUE[,KEY=VALUE]",
-        repeat=True,
-        default_text="none",
-    )
-    epochs: int | None = option(
-        None, "passes over the frames", check=positive, metavar="N", default_text="the recipe's"
-    )
-    start: str | None = option(
-        None, "checkpoint to start from, with the same inputs (fine-tuning)", metavar="DIR"
-    )
-    save_every: int = option(
-        0,
-        "also keep a checkpoint every N epochs; 0 keeps the last",
-        check=not_negative,
-        metavar="N",
-    )
-    log: str = option(
-        "auto", f"where losses are drawn: {', '.join(LOGS)}", check=one_of("log", LOGS)
-    )
-    seed: int = option(0, "training seed", check=not_negative)
-    out: str | None = option(
-        None,
-        "checkpoint folder to make or to continue",
-        metavar="DIR",
-        default_text="outputs/train/<task>-<policy>-seed<seed>",
-    )
+    Attributes:
+        task: The dataset's task.
+        dataset: Folder of the dataset.
+        subtask: Take one subtask's frames of a dataset of whole procedures, for a chain.
+        view: Views that the policy sees.
+        pool: What is taken from the encoder.
+        policy: The kind of policy.
+        deviation: What to do as the released code did.
+        change: Replace values of the recipe, such as clock=false,map_head=softmax.
+        epochs: Passes over the frames.
+        start: Checkpoint to start from, with the same inputs (fine-tuning).
+        save_every: Also keep a checkpoint every N epochs; 0 keeps the last alone.
+        log: Where losses are drawn.
+        seed: Training seed.
+        out: Checkpoint folder to make or to continue.
+    """
+
+    task: Annotated[str, TASK] = "grasp"
+    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    subtask: Annotated[str | None, SUBTASK, Parameter(metavar="SUBTASK")] = None
+    encoder: Annotated[
+        str,
+        Parameter(
+            help=f"One of {encoders.encoder_choices()}; none for proprioception alone, state for "
+            "the state with the goal.",
+            validator=_check_encoder,
+            metavar="NAME",
+        ),
+    ] = "imagenet-lite"
+    view: Annotated[tuple[str, ...] | None, VIEWS, default_text("front,back")] = None
+    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
+    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    pool: Annotated[str, POOL] = "global"
+    policy: Annotated[str, Parameter(choices=tuple(policies.POLICIES))] = "bc"
+    recipe: Annotated[
+        str,
+        Parameter(
+            help=f"Recipe of the policy: {', '.join(policies.recipe_names())}, or FILE.yaml.",
+            metavar="NAME",
+        ),
+    ] = "paper"
+    deviation: Annotated[
+        tuple[str, ...] | None,
+        UNIQUE,
+        Parameter(choices=DEVIATIONS, metavar="NAME[,NAME]"),
+        default_text("the recipe's"),
+    ] = None
+    change: Annotated[tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]")] = ()
+    epochs: Annotated[int | None, COUNT, default_text("the recipe's")] = None
+    start: Annotated[Path | None, DIRECTORY] = None
+    save_every: Annotated[int, NOT_NEGATIVE] = 0
+    log: Annotated[str, Parameter(choices=LOGS)] = "auto"
+    seed: Annotated[int, NOT_NEGATIVE] = 0
+    out: Annotated[
+        Path | None, DIRECTORY, default_text("outputs/train/<task>-<policy>-seed<seed>")
+    ] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode what is not at hand, train and say where the checkpoint is."""
+    weights = join_weights(options.weights)
     encoder = None if options.encoder in (NO_ENCODER, STATE) else options.encoder
     if encoder:
-        encoders.find_weights(encoder, options.weights, options.accept_licence)
+        encoders.find_weights(encoder, weights, options.accept_licence)
     from surgicai_vision.experiments.run import Cell, train_cell
 
     task = names.SUTURE if options.subtask else options.task
@@ -129,11 +127,11 @@ def run(options: Options, console: Console) -> dict[str, Any]:
         privileged=options.encoder == STATE,
         epochs=options.epochs,
         deviations=options.deviation,
-        change=options.change or (),
+        change=options.change,
     )
     policies.load_recipe(cell.policy, cell.recipe, cell.changes)
     label = f"{options.subtask}-of-{task}" if options.subtask else task
-    out = Path(options.out) if options.out else folders.train_folder(label, cell.name, cell.seed)
+    out = options.out or folders.train_folder(label, cell.name, cell.seed)
     folders.check_folder(out, "training.json")
     dataset = folders.open_dataset(options.dataset, task, cell.view)
     if options.subtask:
@@ -143,8 +141,8 @@ def run(options: Options, console: Console) -> dict[str, Any]:
     cell = replace(cell, task=dataset.task)
     with open_log(options.log, out) as log:
         train_cell(
-            cell, dataset, out, console.stage, options.weights, accept_licence=options.accept_licence,
-            start=Path(options.start) if options.start else None, save_every=options.save_every, log=log,
+            cell, dataset, out, console.stage, weights, accept_licence=options.accept_licence,
+            start=options.start, save_every=options.save_every, log=log,
         )  # fmt: skip
     console.say(f"checkpoint: {out}")
     if cell.policy == "bc":

@@ -218,7 +218,7 @@ def from_mapping(cls: type[T], mapping: Mapping[str, object], where: str = "conf
     for key, value in mapping.items():
         if key not in hints:
             raise UnknownName(f"key in {where}", key, hints)
-        values[key] = _convert(hints[key], value, f"{where}: {key}")
+        values[key] = convert(hints[key], value, f"{where}: {key}")
     nothing = dataclasses.MISSING
     for item in fields:
         if item.name not in values and item.default is nothing and item.default_factory is nothing:
@@ -226,19 +226,21 @@ def from_mapping(cls: type[T], mapping: Mapping[str, object], where: str = "conf
     return cls(**values)
 
 
-def _convert(hint: object, value: object, where: str) -> object:
+def convert(hint: object, value: object, where: str) -> object:
     """Return `value` as the type `hint` says, or raise `InputError`."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
-        return _convert(next(a for a in arguments if a is not type(None)), value, where)
+        return convert(next(a for a in arguments if a is not type(None)), value, where)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_mapping(hint, cast(Mapping[str, object], value), where)
     if origin is tuple:
         if isinstance(value, str) or not isinstance(value, (list, tuple)):
             raise InputError(f"{where}: expected a list, got {value!r}.")
-        return tuple(_convert(arguments[0], item, where) for item in value)
+        return tuple(convert(arguments[0], item, where) for item in value)
+    if origin is dict:
+        hint = dict
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if isinstance(hint, type) and (

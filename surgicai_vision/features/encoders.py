@@ -65,12 +65,6 @@ def check_encoder_name(name: str) -> str:
     return name
 
 
-def check_encoder_option(_: str, given: str | None) -> None:
-    """Check a verb's option that names an encoder, without importing any."""
-    if given is not None:
-        check_encoder_name(given)
-
-
 def encoder_choices() -> str:
     """Return the encoder names as `--help` lists them."""
     return ", ".join((*ENCODERS, *(f"{prefix}<name>" for prefix in OPEN_ENCODERS)))

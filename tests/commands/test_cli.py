@@ -1,30 +1,32 @@
 """The command line: help, wrong input in one line, options from files, exit codes."""
 
-import importlib
+import dataclasses
 import json
 import os
 import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
 import pytest
 import yaml
+from cyclopts import Parameter
+from read_options import read_options
 
-from surgicai_vision.commands import VERBS, evaluate, module_name, quickstart
+from surgicai_vision.commands import COMMANDS, dataset, evaluate, quickstart
 from surgicai_vision.commands.console import QuietConsole
 from surgicai_vision.commands.main import INTERRUPTED, main
-from surgicai_vision.commands.options import build, config_only, many_of, option, positive
-from surgicai_vision.core import names
+from surgicai_vision.commands.options import COUNT, FILE_ONLY, VIEWS
 from surgicai_vision.core.config import SceneConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.core.files import configs_folder
 
-
-def all_verbs():
-    """Every verb, those inside a verb with both words."""
-    for verb in VERBS:
-        inner = getattr(importlib.import_module(module_name(verb)), "VERBS", None)
-        yield from [verb] if inner is None else [f"{verb} {name}" for name in inner]
+ALL_COMMANDS = (
+    *(name for name in COMMANDS if name != "dataset"),
+    *(f"dataset {name}" for name in dataset.COMMANDS),
+)
+HEAVY = {"torch", "lerobot", "mujoco", "scipy", "cv2", "pandas", "matplotlib", "transformers"}
 
 
 @pytest.fixture(autouse=True)
@@ -45,46 +47,59 @@ def fails(capsys, *arguments):
     return lines[0]
 
 
-@pytest.mark.parametrize("verb", list(all_verbs()))
-def test_help_shows_options_and_an_example(verb, capsys):
-    assert main([*verb.split(), "--help"]) == 0
+@pytest.mark.parametrize("command", ALL_COMMANDS)
+def test_help_shows_options_and_an_example(command, capsys):
+    assert main([*command.split(), "--help"]) == 0
     text = capsys.readouterr().out
-    assert f"example:\n  surgicai-vision {verb}" in text
+    assert f"example:\n  surgicai-vision {command}" in text
     assert "--json" in text
     assert "--config" in text
 
 
-def test_help_names_every_verb(capsys):
+def test_help_names_every_command_in_the_order_of_the_flow(capsys):
     assert main(["--help"]) == 0
     text = capsys.readouterr().out
-    assert all(verb in text for verb in VERBS)
+    places = [text.index(f"│ {command} ") for command in COMMANDS]
+    assert places == sorted(places)
 
 
-def test_help_of_a_verb_with_verbs_names_them(capsys):
+def test_help_of_a_group_names_its_commands(capsys):
     assert main(["dataset"]) == 2
     assert main(["dataset", "--help"]) == 0
     text = capsys.readouterr().out
-    assert "usage: surgicai-vision dataset VERB" in text
-    assert "check" in text
-    assert "repair" in text
+    assert "Usage: surgicai-vision dataset COMMAND" in text
+    assert all(f"│ {command} " in text for command in dataset.COMMANDS)
 
 
 def test_help_imports_nothing_heavy():
-    verbs = list(all_verbs())
     code = (
         "import sys, contextlib, io\n"
         "from surgicai_vision.commands.main import main\n"
         "with contextlib.redirect_stdout(io.StringIO()):\n"
-        f"    codes = [main([*verb.split(), '--help']) for verb in {verbs}]\n"
-        "print(codes, sorted({'torch', 'lerobot', 'mujoco', 'scipy', 'cv2', 'pandas'} & set(sys.modules)))"
+        f"    codes = [main([*name.split(), '--help']) for name in {ALL_COMMANDS}]\n"
+        f"print(codes, sorted({HEAVY} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == f"{[0] * len(verbs)} []"
+    assert done.stdout.strip() == f"{[0] * len(ALL_COMMANDS)} []"
+
+
+def test_help_of_all_imports_no_command():
+    code = (
+        "import sys, contextlib, io\n"
+        "from surgicai_vision.commands.main import main\n"
+        "with contextlib.redirect_stdout(io.StringIO()):\n"
+        "    main(['--help'])\n"
+        "print(sorted(name for name in sys.modules if name.startswith('surgicai_vision.commands.')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == str(
+        ["surgicai_vision.commands.main", "surgicai_vision.commands.options"]
+    )
 
 
 def test_no_arguments_show_help_and_fail(capsys):
     assert main([]) == 2
-    assert "verbs:" in capsys.readouterr().out
+    assert "Commands" in capsys.readouterr().out
 
 
 def test_version(capsys):
@@ -96,9 +111,9 @@ def test_version(capsys):
     ("arguments", "said"),
     [
         (["evaluat"], "Did you mean 'evaluate'?"),
-        (["dataset", "chek"], "Unknown verb of dataset 'chek'. Did you mean 'check'?"),
-        (["dataset", "--jsn"], "option before the verb"),
-        (["dataset", "check"], "dataset check: the following arguments are required: DIR"),
+        (["dataset", "chek"], "Unknown command of dataset 'chek'. Did you mean 'check'?"),
+        (["dataset", "--jsn"], "Did you mean '--json'?"),
+        (["dataset", "check"], "DIR is missing; see `surgicai-vision dataset check --help`"),
         (["dataset", "check", "missing"], "missing is not a dataset"),
         (["dataset", "check", "missing", "--jsn"], "Did you mean '--json'?"),
         (["dataset", "repair", "missing"], "missing is no LeRobot dataset"),
@@ -106,13 +121,24 @@ def test_version(capsys):
         (["evaluate", "expert", "--episods", "5"], "Did you mean '--episodes'?"),
         (["evaluate", "--episods=5"], "Did you mean '--episodes'?"),
         (["evaluate", "expert", "--episode", "5"], "Did you mean '--episodes'?"),
-        (["evaluate"], "POLICY"),
+        (["evaluate"], "POLICY is missing"),
         (["evaluate", "expert", "expert"], "unexpected argument"),
-        (["evaluate", "expert", "--episodes", "-5"], "--episodes is -5; it must be at least 1"),
-        (["evaluate", "expert", "--episodes", "0"], "--episodes is 0"),
+        (
+            ["evaluate", "expert", "--episodes", "-5"],
+            "Invalid value '-5' for --episodes. Must be >= 1",
+        ),
+        (["evaluate", "expert", "--episodes", "0"], "'0' for --episodes. Must be >= 1"),
         (["evaluate", "expert", "--episodes", "many"], "expected a whole number, got 'many'"),
-        (["evaluate", "expert", "--seed", "-1"], "--seed is -1; it must be at least 0"),
+        (["evaluate", "expert", "--seed", "-1"], "Invalid value '-1' for --seed. Must be >= 0"),
+        (["evaluate", "expert", "--episodes", "3.5"], "expected a whole number, got '3.5'"),
+        (["evaluate", "expert", "--episodes"], "--episodes requires an argument"),
         (["evaluate", "expert", "--task", "grsp"], "Did you mean 'grasp'?"),
+        (["evaluate", "expert", "--task", "grsp"], "Choose from: 'grasp', 'place'"),
+        (["evaluate", "expert", "--task", "grasp", "--task", "place"], "--task specified multiple"),
+        (["evaluate", "expert", "--env", "3"], "stands in a --config file"),
+        (["evaluate", "expert", "--config"], "--config requires an argument"),
+        (["completion", "bsh"], "Did you mean 'bash'?"),
+        (["robustness", "expert", "--strength", "0,much"], "unable to convert 'much' into float"),
         (["evaluate", "exprt"], "Did you mean 'expert'?"),
         (["evaluate", "no/such/folder"], "no/such/folder"),
         (["render-demos", "--view", "front,bakc"], "Did you mean 'back'?"),
@@ -121,11 +147,14 @@ def test_version(capsys):
         (["render-demos", "--view", ""], "--view is empty"),
         (["render-demos", "--demos", "missing"], "missing"),
         (["render-demos", "--demos", "missing", "--episodes", "3"], "nothing is recorded"),
-        (["record-demos", "--episodes", "-3"], "--episodes is -3"),
-        (["record-demos", "--noise", "-0.1"], "--noise is -0.1; it must be within 0 and 1"),
+        (["record-demos", "--episodes", "-3"], "'-3' for --episodes. Must be >= 1"),
+        (["record-demos", "--noise", "-0.1"], "Invalid value '-0.1' for --noise. Must be >= 0"),
         (["record-demos", "--executor", "rai"], "Did you mean 'ray'?"),
-        (["record-demos", "--perturb-start-fraction", "2"], "--perturb-start-fraction is 2.0"),
         (["render-demos", "--executor", "local,address=10.0.0.1:6379"], "local takes no options"),
+        (
+            ["record-demos", "--perturb-start-fraction", "2"],
+            "Invalid value '2.0' for --perturb-start-fraction. Must be <= 1",
+        ),
         (["train", "--encoder", "rndom"], "Did you mean 'random'?"),
         (["train", "--encoder", "none", "--view", "back"], "leave --view out"),
         (
@@ -198,13 +227,17 @@ def test_an_unwritable_sheet_is_refused(capsys):
     assert "cannot be written" in fails(capsys, "scene", "--sheet", "/proc/sheet.png")
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Sample:
-    """Options of a verb that does not exist."""
+    """Options of a command that does not exist."""
 
-    episodes: int = option(5, "episodes", check=positive)
-    view: tuple[str, ...] = option(("back",), "views", check=many_of("view", names.CAMERAS))
-    scene: SceneConfig | None = config_only()
+    episodes: Annotated[int, COUNT] = 5
+    view: Annotated[tuple[str, ...], VIEWS] = ("back",)
+    folder: Path | None = None
+    noise: float = 0.0
+    depth: bool = False
+    scene: Annotated[SceneConfig | None, FILE_ONLY] = None
 
 
 def write(path, text):
@@ -213,9 +246,33 @@ def write(path, text):
 
 
 def test_the_command_line_overrides_the_file(tmp_path):
-    path = write(tmp_path / "a.yaml", "episodes: 7\nview: front,back\nscene: {thread: 20}\n")
-    assert build(Sample, {}, path) == Sample(7, ("front", "back"), SceneConfig(thread=20))
-    assert build(Sample, {"episodes": 9}, path).episodes == 9
+    text = (
+        "episodes: 7\nview: front,back\nfolder: a/b\nnoise: 1\ndepth: true\nscene: {thread: 20}\n"
+    )
+    path = write(tmp_path / "a.yaml", text)
+    from_file = Sample(
+        episodes=7,
+        view=("front", "back"),
+        folder=Path("a/b"),
+        noise=1.0,
+        depth=True,
+        scene=SceneConfig(thread=20),
+    )
+    assert read_options(Sample, config=path) == from_file
+    words = ["--episodes", "9", "--no-depth", "--view", "back"]
+    overridden = dataclasses.replace(from_file, episodes=9, depth=False, view=("back",))
+    assert read_options(Sample, words, path) == overridden
+
+
+def test_comma_lists_and_repetition_give_the_same(tmp_path):
+    for words in (
+        ["--view", "front,back"],
+        ["--view", "front", "--view", "back"],
+        ["--view=front, back"],
+    ):
+        assert read_options(Sample, words).view == ("front", "back")
+    path = write(tmp_path / "a.yaml", "view: [front, back]\nfolder: null")
+    assert read_options(Sample, config=path) == Sample(view=("front", "back"))
 
 
 @pytest.mark.parametrize(
@@ -224,8 +281,13 @@ def test_the_command_line_overrides_the_file(tmp_path):
         ("episods: 3", UnknownName, "Did you mean 'episodes'"),
         ("scene: {tread: 3}", UnknownName, "Did you mean 'thread'"),
         ("episodes: many", InputError, "expected int"),
-        ("episodes: -1", InputError, "at least 1"),
-        ("view: [bakc]", UnknownName, "Did you mean 'back'"),
+        ("episodes: 3.5", InputError, "expected int"),
+        ("episodes: -1", InputError, "Must be >= 1"),
+        ("depth: 1", InputError, "expected bool"),
+        ("folder: [a]", InputError, "expected str"),
+        ("view: [bakc]", InputError, "Did you mean 'back'"),
+        ("view: back,back", InputError, "twice"),
+        ("view: {back: 1}", InputError, "expected a list"),
         ("- 1", BadFile, "no table"),
         ("a: [", BadFile, "not valid YAML"),
         ("!!python/object/apply:os.system ['true']", BadFile, "not valid YAML"),
@@ -233,11 +295,16 @@ def test_the_command_line_overrides_the_file(tmp_path):
 )
 def test_a_wrong_file_is_refused(text, error, said, tmp_path):
     with pytest.raises(error, match=said):
-        build(Sample, {}, write(tmp_path / "a.yaml", text))
+        read_options(Sample, config=write(tmp_path / "a.yaml", text))
+
+
+def test_a_file_is_read_whole_even_where_the_command_line_overrides_it(tmp_path):
+    with pytest.raises(InputError, match="expected int"):
+        read_options(Sample, ["--episodes", "3"], write(tmp_path / "a.yaml", "episodes: many"))
 
 
 def test_shipped_quickstart_is_the_default():
-    shipped = build(quickstart.Options, {}, configs_folder() / "quickstart.yaml")
+    shipped = read_options(quickstart.Options, config=configs_folder() / "quickstart.yaml")
     default = quickstart.Options()
     assert quickstart.plan_of(shipped) == quickstart.plan_of(default)
 
@@ -272,10 +339,10 @@ def test_cells_without_weights_are_listed_as_not_run(tmp_path, capsys):
 
 
 def test_interruption_says_how_to_continue(monkeypatch, capsys):
-    def interrupted(options, console):
+    def interrupted(options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(evaluate, "run", interrupted)
+    monkeypatch.setattr(evaluate, "subject_of", interrupted)
     assert main(["evaluate", "zero"]) == 1
     assert INTERRUPTED in capsys.readouterr().err
 
@@ -299,13 +366,6 @@ def test_evaluate_prints_one_json_object_last(capsys, tmp_path):
     assert main(["evaluate", "zero", "--config", "short.yaml"]) == 0, (
         "a second run replaces the first"
     )
-
-
-def test_every_verb_has_its_module():
-    for verb in all_verbs():
-        module = importlib.import_module(module_name(verb))
-        assert module.EXAMPLE.startswith(f"surgicai-vision {verb}")
-        assert callable(module.run)
 
 
 def test_quiet_console_shows_nothing(capsys):

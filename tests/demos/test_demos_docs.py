@@ -5,10 +5,10 @@ import re
 
 import pytest
 import yaml
+from read_options import read_options
 
 from surgicai_vision.commands import import_demos
 from surgicai_vision.commands.main import main
-from surgicai_vision.commands.options import build
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.imports.rosbag.config import CONVENTIONS, BagConfig, Frames, Topics
 
@@ -31,7 +31,7 @@ def test_the_expert_labels_a_learners_states(text):
 def test_the_table_of_bags_names_every_field_with_its_default(text, tmp_path):
     path = tmp_path / "bag.yaml"
     path.write_text(block(text, "yaml"))
-    options = build(import_demos.Options, {"file": "trial.bag"}, path)
+    options = read_options(import_demos.Options, ["trial.bag"], path)
     table = yaml.safe_load(path.read_text())["bag"]
     assert set(table) == {field.name for field in dataclasses.fields(BagConfig)}
     assert set(table["frames"]) == {field.name for field in dataclasses.fields(Frames)}

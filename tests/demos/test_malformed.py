@@ -17,17 +17,20 @@ import zipfile
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from bag_writer import FORMATS, write_bag
+from cyclopts import Parameter
 from fake_demos import render_with_fake_env, write_demos
 from fake_env import FakeEnv, FakeExpert
 from malformed_bags import databases, good_streams, mcaps, ros1_bags
+from read_options import read_options
 
-from surgicai_vision.commands.options import build, config_only, option
+from surgicai_vision.commands.options import COUNT, FILE_ONLY
 from surgicai_vision.core import names
 from surgicai_vision.core.config import SceneConfig, TaskConfig
 from surgicai_vision.core.errors import InputError
@@ -420,10 +423,11 @@ def test_parquet(tmp_path, dataset):
     assert check_dataset(dataset).ok
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Sample:
-    episodes: int = option(5, "episodes")
-    scene: SceneConfig | None = config_only()
+    episodes: Annotated[int, COUNT] = 5
+    scene: Annotated[SceneConfig | None, FILE_ONLY] = None
 
 
 def yaml_files(trace):
@@ -480,7 +484,7 @@ def yaml_files(trace):
 def test_yaml(tmp_path):
     trace = tmp_path / "trace"
     paths = on_disk(tmp_path / "files", yaml_files(str(trace)), "yaml")
-    refused("yaml", paths, lambda path: build(Sample, {}, Path(path)))
+    refused("yaml", paths, lambda path: read_options(Sample, config=Path(path)))
     assert not trace.exists()
 
 

@@ -1,14 +1,21 @@
-"""`dataset`: verbs on a dataset that exists, one file each."""
+"""`dataset`: commands on a dataset that exists, one module each."""
 
 from types import MappingProxyType
 
-VERBS = MappingProxyType(
+from cyclopts import App
+
+from surgicai_vision.commands import register
+
+COMMANDS = MappingProxyType(
     {
-        "check": "read all of a dataset and say what is wrong with it",
-        "view": "take some views of a dataset, or store them as video, without rendering",
-        "repair": "keep the longest whole prefix of a broken LeRobot dataset",
-        "push": "share a dataset on the Hugging Face Hub, with a card",
-        "pull": "fetch a dataset from the Hugging Face Hub and check it",
+        "check": "Read all of a dataset and say what is wrong with it.",
+        "view": "Take some views of a dataset, or store them as video, without rendering.",
+        "repair": "Keep the longest whole prefix of a broken LeRobot dataset.",
+        "push": "Share a dataset on the Hugging Face Hub, with a card.",
+        "pull": "Fetch a dataset from the Hugging Face Hub and check it.",
     }
 )
-"""Verb → what it does, in one line."""
+"""Command → what it does, in one line."""
+
+app = App(name="dataset")
+register(app, COMMANDS, __name__)

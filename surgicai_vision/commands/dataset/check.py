@@ -1,31 +1,40 @@
 """`dataset check`: read all of a dataset and say what is wrong with it."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import option
+from surgicai_vision.commands.options import DIRECTORY
 
-EXAMPLE = "surgicai-vision dataset check outputs/datasets/grasp --json"
+app = App(
+    name="check",
+    help_epilogue="example:\n  surgicai-vision dataset check outputs/datasets/grasp --json",
+)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `dataset check`."""
+    """Options of `dataset check`.
 
-    dataset: str = option(
-        dataclasses.MISSING, "a dataset of ours, or any LeRobot v3 dataset", metavar="DIR"
-    )
+    Attributes:
+        dataset: A dataset of ours, or any LeRobot v3 dataset.
+    """
+
+    dataset: Annotated[Path, DIRECTORY] = field(kw_only=False)
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
     """Print one line a problem; the exit code is 1 when there is one."""
     from surgicai_vision.dataset import check_dataset
 
     with console.stage("checking") as progress:
-        report = check_dataset(Path(options.dataset), progress)
+        report = check_dataset(options.dataset, progress)
     for problem in report.problems:
         console.say(problem)
     verdict = (

@@ -1,39 +1,47 @@
 """`dataset pull`: fetch a dataset from the Hugging Face Hub and check it."""
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import option
+from surgicai_vision.commands.options import DIRECTORY, default_text
 
-EXAMPLE = "surgicai-vision dataset pull somebody/suturing-grasp --out outputs/datasets/grasp"
+app = App(
+    name="pull",
+    help_epilogue="""\
+example:
+  surgicai-vision dataset pull somebody/suturing-grasp --out outputs/datasets/grasp""",
+)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `dataset pull`."""
+    """Options of `dataset pull`.
 
-    repo: str = option(dataclasses.MISSING, "a LeRobot v3 dataset on the Hub", metavar="USER/NAME")
-    out: str | None = option(
-        None, "folder to make", metavar="DIR", default_text="outputs/datasets/NAME"
-    )
-    revision: str | None = option(
-        None, "branch, tag or commit", metavar="REV", default_text="the main branch"
-    )
+    Attributes:
+        repo: A LeRobot v3 dataset on the Hub.
+        out: Folder to make.
+        revision: Branch, tag or commit.
+    """
+
+    repo: Annotated[str, Parameter(metavar="USER/NAME")] = field(kw_only=False)
+    out: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/NAME")] = None
+    revision: Annotated[
+        str | None, Parameter(metavar="REVISION"), default_text("the main branch")
+    ] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
     """Fetch, check and say where it is."""
     from surgicai_vision.dataset.hub import pull_dataset
 
-    out = (
-        Path(options.out)
-        if options.out
-        else folders.dataset_folder(options.repo.partition("/")[2] or options.repo)
-    )
+    out = options.out or folders.dataset_folder(options.repo.partition("/")[2] or options.repo)
     with console.stage("checking") as progress:
         report = pull_dataset(options.repo, out, revision=options.revision, progress=progress)
     console.say(f"{report.episodes} episodes, {report.frames} frames: {out}")

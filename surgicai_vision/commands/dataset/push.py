@@ -1,45 +1,54 @@
 """`dataset push`: share a dataset on the Hugging Face Hub, with a card."""
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import option
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.commands.options import DIRECTORY
 
-EXAMPLE = (
-    "surgicai-vision dataset push outputs/datasets/grasp --repo somebody/suturing-grasp --private"
+app = App(
+    name="push",
+    help_epilogue="""\
+example:
+  surgicai-vision dataset push outputs/datasets/grasp --repo somebody/suturing-grasp --private""",
 )
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `dataset push`."""
+    """Options of `dataset push`.
 
-    dataset: str = option(dataclasses.MISSING, "a dataset of ours", metavar="DIR")
-    repo: str | None = option(None, "where to; made when it does not exist", metavar="USER/NAME")
-    private: bool = option(False, "make it private")
-    licence: str = option("mit", "the Hub's short name of a licence", metavar="NAME")
-    dry_run: bool = option(False, "show the card and upload nothing")
+    Attributes:
+        dataset: A dataset of ours.
+        repo: Where to; made when it does not exist.
+        private: Make it private.
+        licence: The Hub's short name of a licence.
+        dry_run: Show the card and upload nothing.
+    """
+
+    dataset: Annotated[Path, DIRECTORY] = field(kw_only=False)
+    repo: Annotated[str, Parameter(metavar="USER/NAME")]
+    private: Annotated[bool, Parameter(negative=())] = False
+    licence: Annotated[str, Parameter(metavar="NAME")] = "mit"
+    dry_run: Annotated[bool, Parameter(negative=())] = False
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
     """Check, push and say where it is."""
     from surgicai_vision.dataset.hub import dataset_card, push_dataset
     from surgicai_vision.dataset.reader import open_dataset
 
-    if options.repo is None:
-        raise InputError("dataset push needs --repo USER/NAME.")
     if options.dry_run:
-        console.say(
-            dataset_card(open_dataset(Path(options.dataset)), options.repo, options.licence)
-        )
+        console.say(dataset_card(open_dataset(options.dataset), options.repo, options.licence))
         return {"repo": options.repo, "dry_run": True}
     with console.stage("checking", "frames") as progress:
         address = push_dataset(
-            Path(options.dataset),
+            options.dataset,
             options.repo,
             private=options.private,
             licence=options.licence,

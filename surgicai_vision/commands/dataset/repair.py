@@ -1,39 +1,48 @@
 """`dataset repair`: keep the longest whole prefix of a broken LeRobot dataset."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from cyclopts import App, Parameter
 
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import option
+from surgicai_vision.commands.options import DIRECTORY, default_text
 
-EXAMPLE = "surgicai-vision dataset repair recordings/broken --out recordings/mended"
+app = App(
+    name="repair",
+    help_epilogue="""\
+example:
+  surgicai-vision dataset repair recordings/broken --out recordings/mended""",
+)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `dataset repair`."""
+    """Options of `dataset repair`.
 
-    dataset: str = option(
-        dataclasses.MISSING, "a LeRobot v3 dataset, ours or any other", metavar="DIR"
-    )
-    out: str | None = option(
-        None,
-        "folder to make",
-        metavar="DIR2",
-        default_text="DIR itself; the original stays as DIR.broken",
-    )
+    Attributes:
+        dataset: A LeRobot v3 dataset, ours or any other.
+        out: Folder to make.
+    """
+
+    dataset: Annotated[Path, DIRECTORY] = field(kw_only=False)
+    out: Annotated[
+        Path | None,
+        Parameter(metavar="DIR2"),
+        default_text("DIR itself; the original stays as DIR.broken"),
+    ] = None
 
 
-def run(options: Options, console: Console) -> dict[str, Any]:
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
     """Repair and say what was kept, what was wrong and where the original is."""
     from surgicai_vision.dataset import repair_dataset
 
     with console.stage("verifying", "episodes") as progress:
-        repair = repair_dataset(
-            Path(options.dataset), Path(options.out) if options.out else None, progress
-        )
+        repair = repair_dataset(options.dataset, options.out, progress)
     for problem in repair.problems:
         console.say(problem)
     if repair.original is None:
