@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torch import nn
@@ -61,20 +61,6 @@ class EncoderCard:
 
 
 @dataclass(frozen=True)
-class Released:
-    """How SurgicAI's released code used an encoder where it departs from the paper.
-
-    Attributes:
-        action_noise: half width of the uniform noise its evaluation adds to each translation of the
-            action.
-        card: entries of the card that its own preprocessing amounts to.
-    """
-
-    action_noise: float = 0.0
-    card: Mapping[str, Any] = MappingProxyType({})
-
-
-@dataclass(frozen=True)
 class Plugin:
     """A member of the family: its card and the function that builds its network.
 
@@ -82,10 +68,8 @@ class Plugin:
         card: the card as published.
         build: (card, weights file or None) → (final card, network).
         known: further published files the loader knows, filename → sha256.
-        released: how the released code used it.
     """
 
     card: EncoderCard
     build: "Callable[[EncoderCard, Path | None], tuple[EncoderCard, nn.Module]]"
     known: Mapping[str, str] = MappingProxyType({})
-    released: Released = Released()

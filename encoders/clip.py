@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from encoders.card import EncoderCard, Plugin, Released
+from encoders.card import EncoderCard, Plugin
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import sha256_file
 
@@ -96,11 +96,5 @@ def _read(path: Path) -> "dict[str, torch.Tensor]":
     return read_tensors(path)
 
 
-RELEASED = Released(
-    action_noise=0.4,
-    card=MappingProxyType({"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}),
-)
-"""The released code fed CLIP ImageNet's statistics."""
-
-CLIP = Plugin(CARD, build, MappingProxyType({"ViT-B-32.pt": ARCHIVES["ViT-B-32.pt"]}), RELEASED)
-CLIP_RN50 = Plugin(RN50, build, MappingProxyType({"RN50.pt": ARCHIVES["RN50.pt"]}), RELEASED)
+CLIP = Plugin(CARD, build, MappingProxyType({"ViT-B-32.pt": ARCHIVES["ViT-B-32.pt"]}))
+CLIP_RN50 = Plugin(RN50, build, MappingProxyType({"RN50.pt": ARCHIVES["RN50.pt"]}))

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from encoders.card import EncoderCard, Plugin, Released
+from encoders.card import EncoderCard, Plugin
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import sha256_file
 
@@ -144,5 +144,4 @@ IMAGENET = Plugin(
     CARD,
     build,
     MappingProxyType({variant.filename: variant.sha256 for variant in VARIANTS}),
-    Released(action_noise=0.5),
 )

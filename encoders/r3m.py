@@ -1,16 +1,14 @@
 """`r3m`: ResNets trained on Ego4D by time contrast and language (Nair et al., CoRL 2022).
 
 R3M takes images in 0–255, divides by 255 and normalises with ImageNet's statistics itself; the card
-writes that as a mean and a standard deviation in units of 0–255. The released SurgicAI code
-normalised a second time before it (`RELEASED`).
+writes that as a mean and a standard deviation in units of 0–255.
 """
 
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from encoders.card import EncoderCard, Plugin, Released
+from encoders.card import EncoderCard, Plugin
 from surgicai_vision.core.errors import BadFile
 
 if TYPE_CHECKING:
@@ -68,16 +66,6 @@ def _smaller(depth: int) -> EncoderCard:
     )
 
 
-# The released code normalised images in [0, 1] with ImageNet's statistics and handed them to a
-# network that does the same once more to images in 0–255: ((x - m) / s / 255 - m) / s = (x - m (1 +
-# 255 s)) / (255 s²).
-_TWICE = {
-    "input_range": (0.0, 1.0),
-    "mean": tuple(m / 255 * (1 + s) for m, s in zip(CARD.mean, CARD.std, strict=True)),
-    "std": tuple(s * s / 255 for s in CARD.std),
-}
-RELEASED = Released(action_noise=0.1, card=MappingProxyType(_TWICE))
-
-R3M = Plugin(CARD, build, released=RELEASED)
-R3M_34 = Plugin(_smaller(34), build, released=RELEASED)
-R3M_18 = Plugin(_smaller(18), build, released=RELEASED)
+R3M = Plugin(CARD, build)
+R3M_34 = Plugin(_smaller(34), build)
+R3M_18 = Plugin(_smaller(18), build)

@@ -16,7 +16,7 @@ import abc
 import copy
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, final
 
@@ -25,7 +25,7 @@ import torch
 from torch import nn
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import CLOCK_SIZE, Deviations
+from surgicai_vision.core.config import CLOCK_SIZE
 from surgicai_vision.core.errors import InputError, check_name
 
 ACTIONS = len(names.ACTION_NAMES)
@@ -53,7 +53,7 @@ class Recipe:
             down to nothing (Smith and Topin, Super-convergence, 2017).
         epochs: passes over the training frames; the last one is the checkpoint.
         batch_size: frames per step.
-        split: "episode", or "transition" as the released code did (neighbouring frames leak).
+        split: "episode", or "transition" as SurgicAI's released code did (neighbouring frames leak).
         validation: share of the episodes (or transitions) held out of training.
         proprioception: feed tip pose and jaw too: the active arm's, for a high-level policy both
             arms'.
@@ -65,7 +65,6 @@ class Recipe:
             neighbours say nearly the same.
         privileged: feed the 21 values of obs_type "state", goal included, in place of all else: a
             ceiling.
-        deviations: of the released code, outside its training.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -82,7 +81,6 @@ class Recipe:
     map_head: str = "softmax"
     frame_stride: int = 1
     privileged: bool = False
-    deviations: Deviations = field(default_factory=Deviations)
 
     def __post_init__(self) -> None:
         check_name("split", self.split, ("episode", "transition"))

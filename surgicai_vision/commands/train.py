@@ -24,7 +24,6 @@ from surgicai_vision.commands.options import (
     join_weights,
 )
 from surgicai_vision.core import names
-from surgicai_vision.core.config import DEVIATIONS
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
@@ -55,7 +54,6 @@ class Options:
         view: Views that the policy sees.
         pool: What is taken from the encoder.
         policy: The kind of policy.
-        deviation: What to do as the released code did.
         change: Replace values of the recipe, such as clock=false,map_head=softmax.
         epochs: Passes over the frames.
         start: Checkpoint to start from, with the same inputs (fine-tuning).
@@ -89,12 +87,6 @@ class Options:
             metavar="NAME",
         ),
     ] = "paper"
-    deviation: Annotated[
-        tuple[str, ...] | None,
-        UNIQUE,
-        Parameter(choices=DEVIATIONS, metavar="NAME[,NAME]"),
-        default_text("the recipe's"),
-    ] = None
     change: Annotated[tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]")] = ()
     epochs: Annotated[int | None, COUNT, default_text("the recipe's")] = None
     start: Annotated[Path | None, DIRECTORY] = None
@@ -126,7 +118,6 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         pool=options.pool if encoder else "global",
         privileged=options.encoder == STATE,
         epochs=options.epochs,
-        deviations=options.deviation,
         change=options.change,
     )
     policies.load_recipe(cell.policy, cell.recipe, cell.changes)

@@ -174,34 +174,6 @@ class TaskConfig:
             object.__setattr__(self, "max_steps", SUBTASK_STEPS * subtasks)
 
 
-@dataclass(frozen=True)
-class Deviations:
-    """Where SurgicAI's released code departs from its paper, each a switch of its own; all are off
-    by default.
-
-    The sixth, its training (one hidden layer, 1e-4, 40 epochs, split over transitions), is plain
-    settings of the recipe "released".
-
-    Attributes:
-        action_noise: evaluation adds uniform noise to the translation, as much as the encoder's
-            file says.
-        preprocessing: R3M and CLIP are fed ImageNet's statistics in place of their own.
-        batch_norm_drift: the frozen network stands under `train()`, so its BatchNorm statistics
-            drift.
-        bgr: images are handed over as BGR and read as RGB.
-        three_evaluations: one trained policy is evaluated three times, where the paper trains five.
-    """
-
-    action_noise: bool = False
-    preprocessing: bool = False
-    batch_norm_drift: bool = False
-    bgr: bool = False
-    three_evaluations: bool = False
-
-
-DEVIATIONS = tuple(switch.name for switch in dataclasses.fields(Deviations))
-
-
 def from_mapping(cls: type[T], mapping: Mapping[str, object], where: str = "configuration") -> T:
     """Build the dataclass `cls` from plain data, nested dataclasses included.
 

@@ -252,40 +252,6 @@ def _frame(observation: Any, view: str) -> NDArray[np.uint8]:
     return frame
 
 
-@final
-class NoisyAgent:
-    """An agent with uniform noise on its translations, as the released code's evaluation had.
-
-    Args:
-        agent: whose actions.
-        noise: half width of the noise, in actions.
-    """
-
-    def __init__(self, agent: Any, noise: float):
-        self.name, self.cameras, self.image_size = agent.name, agent.cameras, agent.image_size
-        self.depth = getattr(agent, "depth", False)
-        self._agent, self._noise = agent, noise
-        self._generators: dict[int, np.random.Generator] = {}
-
-    def begin(self, slot: int, env: Any, seed: int) -> None:
-        """Seed the slot's noise."""
-        self._agent.begin(slot, env, seed)
-        self._generators[slot] = np.random.default_rng((seed, 1))
-
-    def share(self, features: "Shared") -> None:
-        """Share features: see `PolicyAgent.share`."""
-        self._agent.share(features)
-
-    def act(
-        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
-        """Return the agent's actions (n, 7), their translations off by up to the noise."""
-        actions = np.array(self._agent.act(slots, envs, observations), np.float32)
-        for row, slot in enumerate(slots):
-            actions[row, :3] += self._generators[slot].uniform(-self._noise, self._noise, 3)
-        return actions
-
-
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Let torch compute with one thread: processes share the cores, and sums keep their order."""

@@ -9,19 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import Deviations, TaskConfig, from_mapping
+from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.evaluation.agents import (
     BASELINES,
-    NoisyAgent,
     PolicyAgent,
     ReplayAgent,
     mean_demonstration,
 )
 from surgicai_vision.evaluation.rollout import Agent, MakeAgent
-
-ROUNDS = 3
-"""Evaluations of one trained policy in the released code, 20 episodes each."""
 
 
 @dataclass(frozen=True)
@@ -33,15 +29,12 @@ class Subject:
         config: the task.
         make_agent: makes the agent in a worker process.
         about: more to be kept beside the result.
-        rounds: how often as many starts again are evaluated (the released code evaluated one policy
-            three times).
     """
 
     name: str
     config: TaskConfig
     make_agent: MakeAgent
     about: dict[str, Any] = field(default_factory=dict)
-    rounds: int = 1
 
 
 def policy_name(
@@ -116,8 +109,7 @@ def checkpoint_subject(
         "encoder": encoder.name if encoder else checkpoint_name(checkpoint),
     }
     make = functools.partial(policy_agent, folder, weights, accept_licence)
-    rounds = ROUNDS if _deviations(checkpoint).three_evaluations else 1
-    return Subject(checkpoint_name(checkpoint), checkpoint.task, make, about, rounds)
+    return Subject(checkpoint_name(checkpoint), checkpoint.task, make, about)
 
 
 def checkpoint_name(checkpoint: Any) -> str:
@@ -129,10 +121,6 @@ def checkpoint_name(checkpoint: Any) -> str:
     return policy_name(
         name, checkpoint.views, pool, privileged, checkpoint.policy, checkpoint.recipe_name
     )
-
-
-def _deviations(checkpoint: Any) -> Deviations:
-    return from_mapping(Deviations, checkpoint.recipe.get("deviations") or {})
 
 
 def expert() -> Agent:
@@ -152,15 +140,10 @@ def policy_agent(folder: Path, weights: str | None = None, accept_licence: bool 
     Raises:
         InputError: the encoder at hand is not the one the policy was trained on.
     """
-    from surgicai_vision.features import encoders
     from surgicai_vision.training import policies
 
     policy = policies.load_policy(folder)
     checkpoint = policy.checkpoint
     encoder = policies.load_encoder_of(checkpoint, weights, accept_licence)
     name, vector = checkpoint_name(checkpoint), policy.inputs.vector or names.STATE
-    agent = PolicyAgent(name, policy, encoder, checkpoint.views, checkpoint.image_size, vector)
-    acts = policies.policy_plugin(checkpoint.policy).target == names.ACTION
-    if acts and checkpoint.encoder and _deviations(checkpoint).action_noise:
-        return NoisyAgent(agent, encoders.released_noise(checkpoint.encoder.name))
-    return agent
+    return PolicyAgent(name, policy, encoder, checkpoint.views, checkpoint.image_size, vector)

@@ -40,27 +40,21 @@ def evaluate_into(
 
     Args:
         out: folder for rows, films and summary.
-        subject: who acts; with several rounds the starts that follow `seeds` are evaluated too.
-        seeds: start seeds of one round, in a row.
+        subject: who acts.
+        seeds: start seeds.
         workers: processes.
         progress: called as progress(steps done, steps at most).
     """
     from surgicai_vision.scene import build_scene
 
-    seeds = range(seeds[0], seeds[0] + subject.rounds * len(seeds)) if subject.rounds > 1 else seeds
     episodes = evaluate(
         subject.make_agent, subject.config, seeds, workers=workers, progress=progress
     )
-    wins = [episode.row.success for episode in episodes]
-    size = len(wins) // subject.rounds
-    cuts = range(0, len(wins), size)
-    rounds = {"rounds": [sum(wins[at : at + size]) for at in cuts]} if subject.rounds > 1 else {}
     about = {
         "command": command_line(),
         "provenance": provenance(),
         "scene_hash": build_scene(subject.config.scene).hash,
         **subject.about,
-        **rounds,
         "task_config": to_mapping(subject.config),
     }
-    return {**write_evaluation(out, episodes, about), **rounds}
+    return write_evaluation(out, episodes, about)

@@ -4,17 +4,18 @@ grid.
 Every step leaves a whole folder and skips the one that is there, so running again continues.
 """
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import DEVIATIONS, Deviations, read_changes
+from surgicai_vision.core.config import read_changes
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.policy_spec import policy_name
+from surgicai_vision.features.cache import Features, encode
+from surgicai_vision.features.encoders import load_encoder
 
 OWN = "own"
 """Stands for an encoder: a network of the policy's own, trained with it on the images."""
@@ -35,7 +36,6 @@ class Cell:
         pool: what is taken from the encoder.
         privileged: see the goal in place of all else: the ceiling.
         epochs: passes over the training frames; None takes the recipe's.
-        deviations: switches of `config.Deviations` that are on; None takes the recipe's.
         change: keys of the recipe and their values, `config.read_changes`'s texts.
         demonstrations: train on the first so many demonstrations; None takes all.
         chain: how subtasks end, where this is a high-level policy over a policy a subtask
@@ -52,7 +52,6 @@ class Cell:
     pool: str = "global"
     privileged: bool = False
     epochs: int | None = None
-    deviations: tuple[str, ...] | None = None
     change: tuple[str, ...] = ()
     demonstrations: int | None = None
     chain: str | None = None
@@ -72,8 +71,6 @@ class Cell:
             raise InputError(
                 f"encoder '{self.encoder}' with views {list(self.view)}; give both or neither."
             )
-        for switch in self.deviations or ():
-            check_name("deviation", switch, DEVIATIONS)
 
     @property
     def name(self) -> str:
@@ -92,8 +89,6 @@ class Cell:
         )
         if self.epochs is not None:
             changes["epochs"] = self.epochs
-        if self.deviations is not None:
-            changes["deviations"] = dict.fromkeys(self.deviations, True)
         return changes
 
     @property
@@ -101,8 +96,7 @@ class Cell:
         """The recipe's name and what is changed in it."""
         counts = ((self.epochs, "epochs"), (self.demonstrations, "demos"))
         changed = tuple(f"{count}{unit}" for count, unit in counts if count is not None)
-        switches = ("none",) if self.deviations == () else self.deviations or ()
-        return "+".join((Path(self.recipe).stem, *switches, *self.change, *changed))
+        return "+".join((Path(self.recipe).stem, *self.change, *changed))
 
 
 def train_cell(
@@ -142,7 +136,7 @@ def train_cell(
     recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
     dataset = thinned(dataset, recipe.frame_stride)
     begin = policies.load_policy(start) if start else None
-    features, beside = _encode(cell, dataset, recipe, stage, weights, accept_licence)
+    features = _encode(cell, dataset, stage, weights, accept_licence)
     parts: tuple[tuple[Any, Callable[..., Any]], ...] = (
         (cell.demonstrations, first_episodes),
         (subtask, subtask_of),
@@ -155,7 +149,7 @@ def train_cell(
         plugin = policies.policy_plugin(cell.policy)
         train(
             dataset, features, plugin, recipe, seed=cell.seed, out=out, progress=progress,
-            recipe_name=cell.recipe_label, start=begin, save_every=save_every, log=log, beside=beside,
+            recipe_name=cell.recipe_label, start=begin, save_every=save_every, log=log,
         )  # fmt: skip
 
 
@@ -166,62 +160,24 @@ def encode_cell(
     weights: str | None = None,
     *,
     accept_licence: bool = False,
-) -> tuple[list[Any], dict[str, bytes]]:
-    """Encode the cell's views, all frames that its recipe takes, or find them in the cache.
-
-    Returns:
-        The features of each view, and what of the encoder the checkpoint has to keep.
-    """
+) -> list[Features]:
+    """Encode the cell's views, all frames that its recipe takes, or find them in the cache."""
     from surgicai_vision.dataset.stride import thinned
     from surgicai_vision.training import policies
 
     recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
-    return _encode(
-        cell, thinned(dataset, recipe.frame_stride), recipe, stage, weights, accept_licence
-    )
+    return _encode(cell, thinned(dataset, recipe.frame_stride), stage, weights, accept_licence)
 
 
 def _encode(
-    cell: Cell, dataset: Any, recipe: Any, stage: Stage, weights: str | None, accept_licence: bool
-) -> tuple[list[Any], dict[str, bytes]]:
+    cell: Cell, dataset: Any, stage: Stage, weights: str | None, accept_licence: bool
+) -> list[Features]:
     """Encode the cell's views, all frames of `dataset`."""
     if not cell.encoder:
-        return [], {}
-    from surgicai_vision.features.cache import encode
-
-    encoder, beside = _encoder(cell, recipe.deviations, dataset, stage, weights, accept_licence)
+        return []
+    encoder = load_encoder(cell.encoder, weights, cell.pool, accept_licence)
     features = []
     for view in cell.view:
         with stage(f"features: {cell.encoder}, {view}", "frames") as progress:
             features.append(encode(dataset, view, encoder, progress=progress))
-    return features, beside
-
-
-def _encoder(
-    cell: Cell,
-    deviations: Deviations,
-    dataset: Any,
-    stage: Stage,
-    weights: str | None,
-    accept_licence: bool,
-) -> tuple[Any, dict[str, bytes]]:
-    """Load the cell's encoder; return it with what of it the checkpoint has to keep."""
-    from surgicai_vision.features import encoders
-
-    load = functools.partial(
-        encoders.load_encoder, str(cell.encoder), weights, cell.pool, accept_licence
-    )
-    if deviations == Deviations():
-        return load(), {}
-    encoder = load(deviations)
-    if not deviations.batch_norm_drift:
-        return encoder, {}
-    from surgicai_vision.training.checkpoint import ENCODER_STATISTICS
-    from surgicai_vision.training.reproduction import drift
-
-    with stage(f"drift: {cell.encoder}", "steps") as progress:
-        path = drift(
-            dataset, cell.view, encoder, weights=weights, accept_licence=accept_licence, seed=cell.seed,
-            progress=progress,
-        )  # fmt: skip
-    return load(deviations, path), {ENCODER_STATISTICS: path.read_bytes()}
+    return features

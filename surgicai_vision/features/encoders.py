@@ -6,12 +6,11 @@
 """
 
 import importlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from surgicai_vision.core.config import Deviations
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.plugins import resolve
 
@@ -80,8 +79,6 @@ def load_encoder(
     weights: Path | str | None = None,
     pool: str = "global",
     accept_licence: bool = False,
-    deviations: Deviations | None = None,
-    statistics: Path | None = None,
 ) -> Any:
     """Load an encoder by name, frozen for good.
 
@@ -91,8 +88,6 @@ def load_encoder(
             $SURGICAI_VISION_WEIGHTS, the hub's cache and a download are tried, in this order.
         pool: "global", "spatial" or "tokens".
         accept_licence: accept weights under a non-commercial licence.
-        deviations: use it as the released code did.
-        statistics: file with the BatchNorm statistics it drifted to there.
 
     Raises:
         UnknownName: a name or pool that does not exist.
@@ -104,29 +99,7 @@ def load_encoder(
     base = importlib.import_module("encoders.base")
     check_name("pool", pool, POOLS)
     card, network = plugin.build(plugin.card, path)
-    if not deviations:
-        return base.Encoder(card, network, pool)
-    released = importlib.import_module("encoders.released")
-    if statistics:
-        released.restore(network, statistics)
-    # Normalised twice, images hardly vary; bfloat16 would round away most of what is left of them.
-    dtype = importlib.import_module("torch").float32 if deviations.preprocessing else None
-    return base.Encoder(released.changed(plugin, card, deviations), network, pool, dtype=dtype)
-
-
-def released_noise(name: str) -> float:
-    """Half width of the noise that the released code's evaluation added to an encoder's actions."""
-    return float(encoder_plugin(name).released.action_noise)
-
-
-def drifted_statistics(
-    name: str, weights: Path | str | None, accept_licence: bool, batches: Iterable[Any]
-) -> bytes:
-    """Let a network that is not frozen see images; see `encoders.released.drifted`."""
-    plugin = encoder_plugin(name)
-    _, network = plugin.build(plugin.card, find_weights(name, weights, accept_licence))
-    statistics: bytes = importlib.import_module("encoders.released").drifted(network, batches)
-    return statistics
+    return base.Encoder(card, network, pool)
 
 
 def find_weights(

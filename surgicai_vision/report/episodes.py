@@ -116,7 +116,6 @@ def _facts(result: Result) -> list[tuple[str, str]]:
         ("dataset fingerprint", checkpoint.get("dataset") or result.about.get("dataset")),
         ("scene, sha256", result.about.get("scene_hash")),
         ("demonstrations trained on", checkpoint.get("demonstrations")),
-        ("rounds", result.about.get("rounds")),
     )
     return [(name, str(value)) for name, value in facts if value]
 

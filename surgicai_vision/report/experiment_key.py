@@ -91,8 +91,6 @@ class Condition:
 
 def condition_of(cell: Mapping[str, Any]) -> Condition:
     """Return the condition of a sweep's cell, from its own fields."""
-    deviations = cell.get("deviations")
-    switches = [] if deviations is None else list(deviations) or ["none"]
     epochs = [f"{cell['epochs']}epochs"] if cell.get("epochs") else []
     return Condition(
         task=str(cell["task"]),
@@ -104,7 +102,7 @@ def condition_of(cell: Mapping[str, Any]) -> Condition:
         trained_by=cell.get("policy", "bc"),
         pool=cell.get("pool", "global"),
         recipe=Path(str(cell.get("recipe", "paper"))).stem,
-        changes=_told([*switches, *cell.get("change", ()), *epochs]),
+        changes=_told([*cell.get("change", ()), *epochs]),
         demonstrations=cell.get("demonstrations"),
         swap=str(cell.get("swap") or ""),
     )

@@ -119,7 +119,7 @@ def evaluate_command(result: Result) -> str | None:
     """
     about, seeds = result.about, [row["seed"] for row in result.rows]
     whole = seeds == list(range(seeds[0], seeds[0] + len(seeds)))
-    if not whole or not result.condition.plain or about.get("chain") or about.get("rounds"):
+    if not whole or not result.condition.plain or about.get("chain"):
         return None
     ending = f"--task {result.summary['task']} --episodes {len(seeds)} --seed {seeds[0]} --json"
     name = result.summary["policy"]

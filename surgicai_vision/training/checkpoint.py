@@ -26,12 +26,8 @@ from surgicai_vision.core.config import TaskConfig, digest, from_mapping, to_map
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_json, write_bytes, write_json
 
-FORMAT = 1
+FORMAT = 2
 CARD, WEIGHTS = "checkpoint.json", "policy.safetensors"
-ENCODER_STATISTICS = "encoder_statistics.safetensors"
-"""BatchNorm statistics of an encoder that drifted (`config.Deviations`); the encoder's hash covers
-them.
-"""
 
 
 @dataclass(frozen=True)
@@ -63,7 +59,7 @@ class Checkpoint:
         task: the task's configuration.
         policy: registered name of the policy.
         recipe: the recipe's settings as plain data.
-        recipe_name: "paper", "released" or "custom".
+        recipe_name: a name of configs/recipes with its changes, or "custom".
         views: cameras, in the order of the features; empty for proprioception alone.
         image_size: side of the images it was trained on [px].
         encoder: the encoder's record; None without views.

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from surgicai_vision.core.config import Deviations, from_mapping
+from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, UnknownName, check_name
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.core.plugins import resolve
@@ -103,15 +103,10 @@ def load_encoder_of(
     Raises:
         InputError: the encoder at hand is not the one trained on; else as `load_encoder`.
     """
-    from surgicai_vision.training.checkpoint import ENCODER_STATISTICS, check_encoder
+    from surgicai_vision.training.checkpoint import check_encoder
 
     record, encoder = checkpoint.encoder, None
     if record:
-        deviations = from_mapping(Deviations, checkpoint.recipe.get("deviations") or {})
-        statistics = checkpoint.folder / ENCODER_STATISTICS if deviations.batch_norm_drift else None
-        active = deviations if deviations != Deviations() else None
-        encoder = load_encoder(
-            record.name, weights, record.pool, accept_licence, active, statistics
-        )
+        encoder = load_encoder(record.name, weights, record.pool, accept_licence)
     check_encoder(checkpoint, encoder)
     return encoder

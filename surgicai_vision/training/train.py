@@ -25,7 +25,7 @@ import io
 import json
 import math
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +75,6 @@ def train(
     start: Any = None,
     device: str = "cpu",
     log: Log | None = None,
-    beside: Mapping[str, bytes] | None = None,
 ) -> Checkpoint:
     """Train a policy and write its checkpoint.
 
@@ -93,14 +92,13 @@ def train(
         start: a trained policy with the same inputs to start from (fine-tuning).
         device: torch device to train on.
         log: called with (epoch, losses by name) after each epoch.
-        beside: files to keep beside each checkpoint, by name.
 
     Raises:
         InputError: features of another dataset or of several encoders, or nothing to train on.
         OutputExists: `out` holds something else.
         SurgicaiError: the loss is not finite.
     """
-    task = _Task(dataset, tuple(features), policy, recipe, seed, recipe_name, dict(beside or {}))
+    task = _Task(dataset, tuple(features), policy, recipe, seed, recipe_name)
     out = Path(out)
     _check(task)
     request = _request(task, start)
@@ -156,7 +154,6 @@ class _Task:
     recipe: Any
     seed: int
     recipe_name: str
-    beside: dict[str, bytes]
 
     def untrained(self) -> Any:
         """Return the policy as it is before training."""
@@ -388,8 +385,6 @@ class _Training:
         """Write the policy as it stands."""
         task, dataset = self.task, self.task.dataset
         folder.mkdir(parents=True, exist_ok=True)
-        for name, content in task.beside.items():
-            write_bytes(folder / name, content)
         checkpoint = Checkpoint(
             task=dataset.config,
             policy=task.policy.name,

@@ -220,12 +220,12 @@ def test_features_are_made_once_for_all_cells(tmp_path):
         ("random",),
         (("front",), ("front", "back")),
         seed=(0, 1),
-        deviation=((), ("bgr",)),
+        recipe=("paper", "best"),
     )
     jobs = Jobs(grid, tmp_path)
     seen = {job.key() for cell in grid.cells for job in jobs.features(cell)}
     assert len(grid.cells) == 8
-    assert len(seen) == 4, "two views, as they are and with their channels swapped"
+    assert len(seen) == 4, "two views, all frames and every fifth"
 
 
 def test_depth_is_seen_as_grey():

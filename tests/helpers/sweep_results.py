@@ -64,7 +64,7 @@ def checkpoint(seed, recipe="paper", demonstrations=45):
 
 def cell(task, encoder, view, seed, **more):
     return {"task": task, "encoder": encoder, "view": list(view), "seed": seed, "policy": "bc", "recipe": "paper",
-            "pool": "global", "privileged": False, "epochs": None, "deviations": None, **more}  # fmt: skip
+            "pool": "global", "privileged": False, "epochs": None, **more}  # fmt: skip
 
 
 def store_cell(out, key, described, rate, generator, **about):

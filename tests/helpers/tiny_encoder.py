@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from encoders.card import EncoderCard, Plugin, Released
+from encoders.card import EncoderCard, Plugin
 from encoders.random_resnet import CARD
 
 
@@ -15,6 +15,4 @@ def build(card: EncoderCard, path: object) -> tuple[EncoderCard, torch.nn.Module
         return card, torch.nn.Sequential(*layers, torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten())
 
 
-TINY = Plugin(
-    replace(CARD, name="tiny", input_size=32, dim=8), build, released=Released(action_noise=0.3)
-)
+TINY = Plugin(replace(CARD, name="tiny", input_size=32, dim=8), build)

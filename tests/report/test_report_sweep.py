@@ -253,7 +253,7 @@ def test_a_folder_where_every_cell_failed_has_a_report(tmp_path, monkeypatch):
 def test_a_cell_and_its_record_have_the_same_condition(tmp_path):
     """A failed seed and a done one must fall into one group, whatever the cell's variant."""
     described = cell(
-        "grasp", "random", ("front",), 1, policy="act", deviations=["bgr"], demonstrations=30
+        "grasp", "random", ("front",), 1, policy="act", change=["clock=true"], demonstrations=30
     )
     store_cell(tmp_path, "done", {**described, "seed": 0}, 0.5, np.random.default_rng(0))
     (tmp_path / "cells/broken").mkdir()
@@ -262,7 +262,7 @@ def test_a_cell_and_its_record_have_the_same_condition(tmp_path):
     )
     (item,) = group(collect(tmp_path))
     assert (len(item.results), len(item.missing)) == (1, 1)
-    assert item.condition.variant == "act · bgr"
+    assert item.condition.variant == "act · clock=true"
     assert item.condition.demonstrations == 30
 
 

@@ -241,7 +241,7 @@ def test_labels_of_phases_are_ahead_within_their_episode() -> None:
     plugin = policies.policy_plugin("hlp")
     assert 0 < plugin.ahead < suture.DWELL
     recipe = policies.load_recipe("hlp", "paper", {"validation": 0.0})
-    task = train._Task(Dataset(), (), replace(plugin, ahead=3), recipe, 0, "", {})
+    task = train._Task(Dataset(), (), replace(plugin, ahead=3), recipe, 0, "")
     with torch.random.fork_rng():
         target = train._Training(task, None, torch.device("cpu")).target
     assert target[:10].tolist() == [1, 2, 2, 3, 3, 4, 4, 4, 4, 4]

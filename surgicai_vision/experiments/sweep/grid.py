@@ -29,7 +29,6 @@ AXES = (
     "view",
     "recipe",
     "policy",
-    "deviation",
     "demonstrations",
     "seed",
     "chain",
@@ -91,7 +90,6 @@ class Grid:
         policy: policies: those of `train`, and LeRobot's `act` and `diffusion`.
         recipe: recipes of the former.
         pool: what is taken from the encoders.
-        deviation: sets of `config.Deviations` switches to be on; none takes the recipe's.
         ablation: what is replaced one at a time in each cell that sees: ablations beside the whole.
         demonstrations: numbers of the expert's demonstrations of each task; the smaller set lies
             within the larger.
@@ -128,7 +126,6 @@ class Grid:
     policy: tuple[str, ...] = ("bc",)
     recipe: tuple[str, ...] = ("paper",)
     pool: str = "global"
-    deviation: tuple[tuple[str, ...], ...] = ()
     ablation: tuple[Ablation, ...] = ()
     demonstrations: tuple[int, ...] = (50,)
     demonstrator: str = "expert"
@@ -211,10 +208,7 @@ class Grid:
         """Yield the cells of a policy on a task."""
         ours = policy not in LEROBOT_POLICIES
         recipes = self.recipe if ours else ("paper",)
-        switches = self.deviation if ours and self.deviation else (None,)
-        for encoder, view, recipe, on in itertools.product(
-            self.encoder, self.view, recipes, switches
-        ):
+        for encoder, view, recipe in itertools.product(self.encoder, self.view, recipes):
             if ours and encoder == OWN:
                 continue  # `own` is for policies that see images themselves
             pool = self.pool if ours else "global"
@@ -225,7 +219,6 @@ class Grid:
                 policy=policy,
                 recipe=recipe,
                 pool=pool,
-                deviations=on,
                 **common,
             )
         for recipe in recipes if ours else ():

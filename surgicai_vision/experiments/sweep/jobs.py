@@ -42,7 +42,7 @@ def encode_features(
 ) -> None:
     """Job "sweep-features": put what a cell sees into the feature cache."""
     os.environ.update(environment)
-    features, _ = encode_cell(
+    features = encode_cell(
         _cell(cell), _dataset(dataset), silent_stage, accept_licence=accept_licence
     )
     write_json(folder / "features.json", [entry.folder.name for entry in features])
@@ -141,7 +141,7 @@ def run_probe(
 
     os.environ.update(environment)
     what, data = _cell(cell), _dataset(dataset)
-    features, _ = encode_cell(what, data, silent_stage, accept_licence=accept_licence)
+    features = encode_cell(what, data, silent_stage, accept_licence=accept_licence)
     row = {
         "task": what.task,
         "encoder": what.encoder,

@@ -26,8 +26,7 @@ REFERENCE_FILE = "reference.json"
 PROBE_FILE = "probe.json"
 CACHED, TO_DO, NOT_RUN, LEFT = "cached", "to do", "not run", "left"
 STATES = (TO_DO, CACHED, NOT_RUN, LEFT)
-FEATURE_SWITCHES = ("preprocessing", "batch_norm_drift", "bgr")
-"""Deviations that change features."""
+
 
 LEARN = (
     "scene",
@@ -196,7 +195,7 @@ class Jobs:
         jobs = {}
         for cell in cells:
             if cell.encoder and cell.encoder != OWN and not cell.chain:
-                seen = Cell(cell.task, cell.encoder, cell.view, pool=cell.pool, deviations=())
+                seen = Cell(cell.task, cell.encoder, cell.view, pool=cell.pool)
                 arguments = {"cell": to_mapping(seen), **self._common(seen)}
                 name = digest(to_mapping(seen))[:16]
                 jobs[name] = Job("sweep-probe", arguments, tuple(self._inputs(seen)), label=LABELS)
@@ -246,16 +245,11 @@ LABELS = ("dataset", "accept_licence", "command", "environment")
 
 def _seen(cell: Cell) -> list[Cell]:
     """Return what a cell sees, view by view where that is possible, so that cells share it."""
-    common: dict[str, Any] = {"pool": cell.pool, "deviations": ()}
-    on: tuple[str, ...] = ()
+    common: dict[str, Any] = {"pool": cell.pool}
     if cell.policy not in LEROBOT_POLICIES:
         recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
-        on = tuple(switch for switch in FEATURE_SWITCHES if getattr(recipe.deviations, switch))
-        common["deviations"] = on
         if recipe.frame_stride > 1:
             common["change"] = (f"frame_stride={recipe.frame_stride}",)
-    if "batch_norm_drift" in on:  # the statistics are of these views and this seed
-        return [Cell(cell.task, cell.encoder, cell.view, cell.seed, **common)]
     return [Cell(cell.task, cell.encoder, (view,), **common) for view in cell.view]
 
 

@@ -43,7 +43,7 @@ def is_chosen(cell: Cell, choice: Choice) -> bool:
 
 def _value(cell: Cell, axis: str) -> str:
     """Return a cell's place on an axis in words."""
-    value: Any = cell.deviations if axis == "deviation" else getattr(cell, axis)
+    value: Any = getattr(cell, axis)
     if isinstance(value, tuple):
         return "+".join(value) or NONE
     return NONE if value is None else str(value)
