@@ -17,7 +17,6 @@ from surgicai_vision.commands.options import (
     POOL,
     SUBTASK,
     TASK,
-    UNIQUE,
     VIEWS,
     WEIGHTS,
     default_text,
