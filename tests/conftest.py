@@ -11,6 +11,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "2")
 os.environ.setdefault("LP_NUM_THREADS", "2")
 os.environ["SURGICAI_VISION_WEIGHTS"] = ""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -37,3 +38,15 @@ def shared() -> Path:
 def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep features of tests out of the user's cache."""
     monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+@pytest.fixture
+def tiny_encoder() -> Iterator[None]:
+    """Offer the encoder "tiny" for as long as a test runs."""
+    from tiny_encoder import TINY
+
+    from surgicai_vision.features import encoders
+
+    encoders.register_encoder("tiny", TINY)
+    yield
+    encoders.ENCODERS.unregister("tiny")

@@ -78,7 +78,7 @@ class Options:
     weights: Annotated[tuple[str, ...], WEIGHTS] = ()
     accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
     pool: Annotated[str, POOL] = "global"
-    policy: Annotated[str, Parameter(choices=tuple(policies.POLICIES))] = "bc"
+    policy: Annotated[str, Parameter(choices=policies.policy_names())] = "bc"
     recipe: Annotated[
         str,
         Parameter(

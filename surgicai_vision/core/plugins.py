@@ -97,14 +97,13 @@ class Registry[Part]:
         Args:
             name: the new name.
             part: the part itself.
-            distribution: who offers it, for messages; the part's top module by default.
+            distribution: who offers it, for messages; "register_<kind>()" by default.
 
         Raises:
             NameCollision: the name is taken.
         """
-        owner = distribution or type(part).__module__.partition(".")[0]
         self._search()
-        self._add(name, owner, lambda: part)
+        self._add(name, distribution or f"register_{self.kind}()", lambda: part)
 
     def unregister(self, name: str) -> None:
         """Forget the part called `name`; for tests of parts that are registered in them."""
@@ -116,12 +115,17 @@ class Registry[Part]:
         return self._targets[name][0]
 
     def _search(self) -> None:
-        """Read the entry points of the group, once."""
+        """Read the entry points of the group, once; a collision is told at every look-up."""
         if self._is_searched:
             return
+        before = dict(self._targets)
+        try:
+            for point in entry_points(group=self.group):
+                self._add(point.name, _owner(point), point.load)
+        except NameCollision:
+            self._targets = before
+            raise
         self._is_searched = True
-        for point in entry_points(group=self.group):
-            self._add(point.name, _owner(point), point.load)
 
     def _add(self, name: str, owner: str, load: Callable[[], object]) -> None:
         if name in self._targets:

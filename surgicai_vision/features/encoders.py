@@ -1,4 +1,4 @@
-"""Encoders by name, imported on first use.
+"""Encoders by name, imported on first use; other distributions add theirs (`core.plugins`).
 
 * `encoder_names()`, `check_encoder_name(name)`, `encoder_card(name)`, `find_weights(name, …)`.
 * `load_encoder(name, weights=None, pool="global", accept_licence=False) -> encoders.base.Encoder`:
@@ -9,12 +9,17 @@ import importlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 from surgicai_vision.core.errors import InputError, check_name
-from surgicai_vision.core.plugins import resolve
+from surgicai_vision.core.plugins import ENCODERS_GROUP, Registry, resolve
 
-ENCODERS: Mapping[str, str] = MappingProxyType(
+if TYPE_CHECKING:
+    from encoders.base import EncoderCard, Plugin
+
+ENCODERS: Final = Registry["Plugin"](
+    "encoder",
+    ENCODERS_GROUP,
     {
         "imagenet-lite": "encoders.imagenet_lite:IMAGENET_LITE",
         "imagenet-lite-early": "encoders.imagenet_lite_early:IMAGENET_LITE_EARLY",
@@ -29,9 +34,9 @@ ENCODERS: Mapping[str, str] = MappingProxyType(
         "dinov2": "encoders.timm_models:DINOV2",
         "siglip2": "encoders.timm_models:SIGLIP2",
         "vc1": "encoders.vc1:VC1",
-    }
+    },
 )
-"""Encoder name → "module:attribute" of its `encoders.base.Plugin`."""
+"""Encoder name → its `encoders.base.Plugin`."""
 
 OPEN_ENCODERS: Mapping[str, str] = MappingProxyType({"timm:": "encoders.timm_models:plugin_for"})
 """Prefix of open names → "module:function" that makes the plug-in of such a name."""
@@ -43,33 +48,48 @@ OFFLINE_ENCODERS = ("imagenet-lite", "imagenet-lite-early", "random", "random-co
 """Encoders that never download; a test compares this with their cards."""
 
 
+def register_encoder(name: str, plugin: "Plugin", distribution: str = "") -> None:
+    """Offer an encoder under a new name in this process; see `Registry.register`.
+
+    Raises:
+        NameCollision: the name is taken.
+    """
+    ENCODERS.register(name, plugin, distribution)
+
+
 def encoder_names() -> tuple[str, ...]:
     """Return every registered encoder name."""
-    return tuple(ENCODERS)
+    return ENCODERS.names()
 
 
-def encoder_plugin(name: str) -> Any:
+def encoder_plugin(name: str) -> "Plugin":
     """Import the plug-in of `name`; `UnknownName` lists what exists."""
     check_encoder_name(name)
     for prefix, target in OPEN_ENCODERS.items():
         if name.startswith(prefix):
-            return resolve(target)(name)
-    return resolve(ENCODERS[name])
+            plugin: Plugin = resolve(target)(name)
+            return plugin
+    return ENCODERS.load(name)
+
+
+def _choices() -> tuple[str, ...]:
+    """Return the registered names and the forms of the open ones."""
+    return (*ENCODERS.names(), *(f"{prefix}<name>" for prefix in OPEN_ENCODERS))
 
 
 def check_encoder_name(name: str) -> str:
     """Return `name` if an encoder may be called so; imports nothing."""
     if not name.startswith(tuple(OPEN_ENCODERS)):
-        check_name("encoder", name, (*ENCODERS, *(f"{prefix}<name>" for prefix in OPEN_ENCODERS)))
+        check_name("encoder", name, _choices())
     return name
 
 
 def encoder_choices() -> str:
     """Return the encoder names as `--help` lists them."""
-    return ", ".join((*ENCODERS, *(f"{prefix}<name>" for prefix in OPEN_ENCODERS)))
+    return ", ".join(_choices())
 
 
-def encoder_card(name: str) -> Any:
+def encoder_card(name: str) -> "EncoderCard":
     """Return an encoder's card without loading any weights."""
     return encoder_plugin(name).card
 

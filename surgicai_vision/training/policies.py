@@ -1,4 +1,4 @@
-"""Policies by name, their recipes, and the policy of a checkpoint.
+"""Policies by name (other distributions add theirs), their recipes, a checkpoint's policy.
 
 * `load_recipe(policy, recipe, changes) -> recipe object`: the frozen settings of a policy from
   configs/recipes, with changes.
@@ -8,26 +8,42 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 import yaml
 
 from surgicai_vision.core.config import from_mapping
-from surgicai_vision.core.errors import BadFile, UnknownName, check_name
+from surgicai_vision.core.errors import BadFile, check_name
 from surgicai_vision.core.files import configs_folder
-from surgicai_vision.core.plugins import resolve
+from surgicai_vision.core.plugins import POLICIES_GROUP, Registry
 from surgicai_vision.features.encoders import load_encoder
 
-POLICIES: Mapping[str, str] = MappingProxyType({"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP"})
-"""Policy name → "module:attribute" of its `policies.base.Plugin`."""
+if TYPE_CHECKING:
+    from policies.base import Plugin
+
+POLICIES: Final = Registry["Plugin"](
+    "policy", POLICIES_GROUP, {"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP"}
+)
+"""Policy name → its `policies.base.Plugin`."""
 
 
-def policy_plugin(name: str) -> Any:
+def register_policy(name: str, plugin: "Plugin", distribution: str = "") -> None:
+    """Offer a policy under a new name in this process; see `Registry.register`.
+
+    Raises:
+        NameCollision: the name is taken.
+    """
+    POLICIES.register(name, plugin, distribution)
+
+
+def policy_names() -> tuple[str, ...]:
+    """Return every registered policy name."""
+    return POLICIES.names()
+
+
+def policy_plugin(name: str) -> "Plugin":
     """Import the policy plug-in of `name`; `UnknownName` lists what exists."""
-    if name not in POLICIES:
-        raise UnknownName("policy", name, POLICIES)
-    return resolve(POLICIES[name])
+    return POLICIES.load(name)
 
 
 def recipe_names() -> tuple[str, ...]:
@@ -41,7 +57,7 @@ def load_recipe(
     """Read a recipe and apply changes.
 
     Args:
-        policy: one of `POLICIES`.
+        policy: one of `policy_names()`.
         recipe: a name of `recipe_names()`, or the path of a YAML file.
         changes: keys to replace.
 

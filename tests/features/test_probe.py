@@ -13,7 +13,6 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnknownName, check_name
-from surgicai_vision.features import encoders
 from surgicai_vision.features.cache import Features
 from surgicai_vision.features.probe import FRAMES, _Ridge, _targets, probe, spread
 from surgicai_vision.scene import rotations
@@ -143,7 +142,10 @@ def test_what_cannot_be_probed_is_refused() -> None:
 
 
 def test_verb_writes_a_row_a_view_set(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tiny_encoder: None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def open_dataset(folder: str | None, task: str, views: tuple[str, ...]) -> Dataset:
         for view in views:
@@ -153,8 +155,6 @@ def test_verb_writes_a_row_a_view_set(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(folders, "open_dataset", open_dataset)
-    monkeypatch.setitem(encoders.ENCODERS.copy(), "tiny", "")
-    monkeypatch.setattr(encoders, "ENCODERS", {**encoders.ENCODERS, "tiny": "tiny_encoder:TINY"})
     assert main(["probe", "--encoder", "tiny", "--view", "front,back", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
     assert [row["view"] for row in rows] == ["front", "back", "front+back"]

@@ -60,7 +60,7 @@ class Dataset:
 
 
 @pytest.fixture(autouse=True)
-def noise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def noise(tiny_encoder: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run in an empty folder, on a dataset of noise, with a tiny encoder and a cache of its own."""
 
     def open_dataset(folder: str | None, task: str, views: tuple[str, ...]) -> Dataset:
@@ -71,7 +71,6 @@ def noise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(folders, "open_dataset", open_dataset)
-    monkeypatch.setattr(encoders, "ENCODERS", {**encoders.ENCODERS, "tiny": "tiny_encoder:TINY"})
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict:

@@ -154,7 +154,7 @@ class Grid:
             if name != OWN:
                 encoders.check_encoder_name(name)
         for name in self.policy:
-            check_name("policy", name, (*policies.POLICIES, *LEROBOT_POLICIES))
+            check_name("policy", name, (*policies.policy_names(), *LEROBOT_POLICIES))
         check_name("demonstrator", self.demonstrator, TEACHERS)
         check_name("bank of starts", self.starts, BANKS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
