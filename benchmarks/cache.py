@@ -1,5 +1,6 @@
-"""Measure random reads of the feature cache: rows of 2,048 float16 values, in random order, as
-training takes them.
+"""Measure random reads of the feature cache.
+
+Rows of 2,048 float16 values, in random order, as training takes them.
 
     python benchmarks/cache.py --json
 

@@ -1,5 +1,6 @@
-"""Render on a Ray cluster of two nodes while its workers are killed and a node is lost; compare
-with a quiet run.
+"""Render on a Ray cluster of two nodes while its workers are killed and a node is lost.
+
+Compare with a quiet run.
 
     python benchmarks/cluster.py --kills 10 --losses 1 --json
 
@@ -64,8 +65,9 @@ def two_nodes() -> Iterator[TwoNodes]:
 
 
 def busy_workers() -> list[int]:
-    """Return the processes in which Ray runs a task of the executor now: Ray gives them its
-    name.
+    """Return the processes in which Ray runs a task of the executor now.
+
+    Ray gives them its name.
     """
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):

@@ -1,5 +1,6 @@
-"""What the benchmarks share: workers, medians, and one JSON line that says where and with what it
-was measured.
+"""What the benchmarks share.
+
+Workers, medians, and one JSON line that says where and with what it was measured.
 """
 
 import json
@@ -23,9 +24,7 @@ def emit(name: str, row: dict[str, Any], *, render: bool = False) -> None:
 
 
 def spread(function: Callable[[Job], Result], jobs: Iterable[Job], workers: int) -> list[Result]:
-    """Return the results of `function` over `jobs`, in order, from `workers` processes (0: this
-    one).
-    """
+    """Return the results of `function` over `jobs`, in order; 0 workers run in this process."""
     if workers < 1:
         return [function(job) for job in jobs]
     with ProcessPoolExecutor(

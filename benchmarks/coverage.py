@@ -112,8 +112,9 @@ def lengths(
 
 
 def areas(starts: int, spread: float, repeats: int) -> Iterator[tuple[float, Interval]]:
-    """Draw curves of successes and the intervals of their areas; a start fails from Beta(spread,
-    spread) on.
+    """Draw curves of successes and the intervals of their areas.
+
+    A start fails from Beta(spread, spread) on.
     """
     rng = np.random.default_rng((starts, round(100 * spread)))
     curves = [

@@ -1,5 +1,4 @@
-"""Count how often movement primitives learned from demonstrations succeed when executed, from
-starts not shown.
+"""Count how often movement primitives learned from demonstrations succeed from new starts.
 
     python benchmarks/dmp.py                                             # taught by our expert,
     every subtask python benchmarks/dmp.py --task insert --npz surgicai_insert_v2.npz  # taught by

@@ -1,5 +1,6 @@
-"""Measure encoding speed: `Encoder` and the cached `encode` against a bare torch loop of the same
-network and batch.
+"""Measure encoding speed.
+
+`Encoder` and the cached `encode` against a bare torch loop of the same network and batch.
 
     python benchmarks/encode.py --json
     python benchmarks/encode.py --encoder random --frames 512 --repeats 3

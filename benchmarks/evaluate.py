@@ -1,5 +1,6 @@
-"""Measure closed-loop evaluation: what `evaluate` does by default against one env at a time in one
-process.
+"""Measure closed-loop evaluation.
+
+What `evaluate` does by default against one env at a time in one process.
 
     python benchmarks/evaluate.py
     python benchmarks/evaluate.py --episodes 8 --steps 40 --repeats 1
@@ -54,9 +55,7 @@ def make_agent() -> Agent:
 
 
 def same(one: list[Episode], other: list[Episode]) -> int:
-    """Return how many episodes have the same row (NaN equals NaN) and the same states on both
-    sides.
-    """
+    """Return how many episodes have the same row (NaN equals NaN) and states on both sides."""
     pairs = zip(one, other, strict=True)
     return sum(
         repr(a.row) == repr(b.row) and np.array_equal(a.film.states, b.film.states)

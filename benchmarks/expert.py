@@ -53,7 +53,10 @@ def _episode(env: envs.SuturingEnv, seed: int) -> Episode:
                 break
     except SurgicaiError as error:  # no physical start, or a way that cannot be reached
         return Episode(seed, False, False, steps, f"{type(error).__name__}: {error}")
-    end = f"{names.SUBTASKS[info['phase']]} {info['d_trans'] * 1e3:.1f} mm, {info['holes_passed']} holes"
+    end = (
+        f"{names.SUBTASKS[info['phase']]} {info['d_trans'] * 1e3:.1f} mm, {info['holes_passed']}"
+        " holes"
+    )
     return Episode(seed, info["is_success"], info["physics_error"], steps, end)
 
 

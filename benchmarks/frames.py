@@ -1,5 +1,6 @@
-"""Render many frames and compare every one with a live image of its state: none dropped, black or
-misaligned.
+"""Render many frames and compare every one with a live image of its state.
+
+None dropped, black or misaligned.
 
     python benchmarks/frames.py --frames 10000 --workers 2 --json
 
@@ -30,8 +31,9 @@ VIEWS = ("front", "back")
 
 
 def compare(demos: Path, dataset_folder: Path, size: int, frame_stride: int) -> dict:
-    """Count what is wrong with a dataset's frames; `every` so many episodes one is stepped through
-    live.
+    """Count what is wrong with a dataset's frames.
+
+    `every` so many episodes one is stepped through live.
     """
     from surgicai_vision import envs
     from surgicai_vision.dataset import open_dataset

@@ -92,7 +92,9 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--only", choices=tuple(SUITES))
-    parser.add_argument("--tolerance", type=float, default=0.0, help="largest difference of a number")
+    parser.add_argument(
+        "--tolerance", type=float, default=0.0, help="largest difference of a number"
+    )
     parser.add_argument("--write", action="store_true", help="store the rows in tests/golden")
     chosen = parser.parse_args()
     counts = {}

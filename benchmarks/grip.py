@@ -1,5 +1,6 @@
-"""Measure how far the needle drifts in PSM2's jaws: 10 s of motion at 30 mm/s and 60 °/s, friction
-only.
+"""Measure how far the needle drifts in PSM2's jaws.
+
+10 s of motion at 30 mm/s and 60 °/s, friction only.
 
     python benchmarks/grip.py --json
 
@@ -82,8 +83,14 @@ def main() -> None:
     }
     for column, name in enumerate(("drift_mm", "drift_deg")):
         values = table[:, column]
-        row[name] = {key: round(float(value), 3) for key, value in (
-            ("median", np.median(values)), ("p95", np.quantile(values, 0.95)), ("max", values.max()))}  # fmt: skip
+        row[name] = {
+            key: round(float(value), 3)
+            for key, value in (
+                ("median", np.median(values)),
+                ("p95", np.quantile(values, 0.95)),
+                ("max", values.max()),
+            )
+        }
     print(json.dumps(row))
 
 

@@ -1,5 +1,4 @@
-"""Kill `render-demos` with SIGKILL at random moments, run it again to the end, and compare with an
-undisturbed run.
+"""Kill `render-demos` with SIGKILL at random moments, and compare with a quiet run.
 
     python benchmarks/kill.py --kills 100 --together 2 --json
 

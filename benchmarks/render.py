@@ -1,5 +1,6 @@
-"""Measure two-view steps/s written: `render-demos` with 1 and 2 workers against LeRobot's own
-writer in one process.
+"""Measure two-view steps/s written.
+
+`render-demos` with 1 and 2 workers against LeRobot's own writer in one process.
 
     python benchmarks/render.py --episodes 12 --repeats 3 --json
 

@@ -1,5 +1,6 @@
-"""Measure speed: physics, images, resets and workers, each against the bare thing at equal
-settings.
+"""Measure speed.
+
+Physics, images, resets and workers, each against the bare thing at equal settings.
 
     python benchmarks/speed.py
     python benchmarks/speed.py --only step --repeats 40
@@ -49,8 +50,9 @@ SIZE, CAMERA, POSES = 224, "front", 16
 
 
 class Recording(NamedTuple):
-    """An expert's episode: the env, its first state, the actions, and the servo commands they
-    became.
+    """An expert's episode.
+
+    The env, its first state, the actions, and the servo commands they became.
     """
 
     env: envs.SuturingEnv
@@ -78,8 +80,9 @@ def timed(function: Callable[[], Any]) -> float:
 def in_turns(
     one: Callable[[], None], other: Callable[[], None], repeats: int
 ) -> tuple[list[float], list[float]]:
-    """Return the times of two calls [s] that take turns, first one first, then the other; the first
-    turn is lost.
+    """Return the times of two calls [s] that take turns, first one first, then the other.
+
+    The first turn is lost.
     """
     times: tuple[list[float], list[float]] = ([], [])
     for turn in range(repeats + 1):

@@ -1,5 +1,6 @@
-"""Run a sweep of many small cells while its workers, its driver and a node are killed; compare with
-a quiet run.
+"""Run a sweep of many small cells while its workers, its driver and a node are killed.
+
+Compare with a quiet run.
 
     python benchmarks/sweep_kill.py --cells 300 --json
 

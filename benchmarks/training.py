@@ -1,5 +1,6 @@
-"""Measure training from the feature cache: 30 epochs of 5,000 transitions by the recipe `paper`,
-two views of 2,048.
+"""Measure training from the feature cache.
+
+30 epochs of 5,000 transitions by the recipe `paper`, two views of 2,048.
 
     python benchmarks/training.py --json
     python benchmarks/training.py --views 1 --dim 1280

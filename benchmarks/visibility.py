@@ -1,5 +1,4 @@
-"""Count the needle's pixels at the end of successful expert episodes, in the views a policy learns
-from.
+"""Count the needle's pixels at the end of successful expert episodes, view by view.
 
     python benchmarks/visibility.py --episodes 100
 
@@ -36,9 +35,7 @@ class Job(NamedTuple):
 
 
 def count(job: Job) -> list[list[int] | None]:
-    """Return the needle's pixels per view at the end of each episode, None where the expert
-    failed.
-    """
+    """Return the needle's pixels per view at each episode's end, None where it failed."""
     env = envs.make(job.config)
     with FrameRenderer(env.model, SIZE, SIZE) as renderer:
         return [_pixels(env, seed, renderer, job.views) for seed in job.seeds]

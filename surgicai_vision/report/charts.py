@@ -1,5 +1,4 @@
-"""Charts: small SVG drawings with their intervals visible, in colours a colour-blind reader can
-tell apart.
+"""Charts: small SVG drawings with their intervals visible, safe for the colour-blind.
 
 Series have Okabe and Ito's colours and a marker of their own, so that no chart rests on colour
 alone. Colours of text and axes come from the page's style sheet.
@@ -64,9 +63,9 @@ def heat(rate: float) -> tuple[str, str]:
     red, green, blue = (
         round((1 - share) * a + share * b) for a, b in zip(_HEAT[low], _HEAT[low + 1], strict=True)
     )
-    return f"#{red:02x}{green:02x}{blue:02x}", "#ffffff" if _luminance(
-        red, green, blue
-    ) < _MIDDLE else "#000000"
+    return f"#{red:02x}{green:02x}{blue:02x}", (
+        "#ffffff" if _luminance(red, green, blue) < _MIDDLE else "#000000"
+    )
 
 
 def _luminance(*channels: int) -> float:
@@ -85,8 +84,9 @@ def interval(
     label: str,
     paper: tuple[float, float, float] | None = None,
 ) -> Markup:
-    """Draw a rate with its interval on an axis from 0 to 1; below it the paper's rate and interval,
-    where it has one.
+    """Draw a rate with its interval on an axis from 0 to 1.
+
+    Below it the paper's rate and interval, where it has one.
 
     Args:
         rate: ours.
@@ -105,11 +105,12 @@ def interval(
             f'<path class="paper" d="M{at:.1f} 13 l4.5 5 l-4.5 5 l-4.5 -5 z"/>'
         )
     return Markup(
-        f'<svg class="interval" viewBox="0 0 176 24" role="img" aria-label="{escape(label)}">'
-        '<line class="axis" x1="8" x2="168" y1="12" y2="12"/><line class="axis" x1="8" x2="8" y1="6" y2="18"/>'
-        '<line class="axis" x1="88" x2="88" y1="9" y2="15"/><line class="axis" x1="168" x2="168" y1="6" y2="18"/>'
-        f'<line class="range" x1="{x[0]:.1f}" x2="{x[1]:.1f}" y1="{y}" y2="{y}"/>'
-        f'<circle class="point" cx="{x[2]:.1f}" cy="{y}" r="{5 if paper is None else 4.5}"/>{theirs}</svg>'
+        f'<svg class="interval" viewBox="0 0 176 24" role="img" aria-label="{escape(label)}"><line'
+        ' class="axis" x1="8" x2="168" y1="12" y2="12"/><line class="axis" x1="8" x2="8" y1="6"'
+        ' y2="18"/><line class="axis" x1="88" x2="88" y1="9" y2="15"/><line class="axis" x1="168"'
+        f' x2="168" y1="6" y2="18"/><line class="range" x1="{x[0]:.1f}" x2="{x[1]:.1f}" y1="{y}"'
+        f' y2="{y}"/><circle class="point" cx="{x[2]:.1f}" cy="{y}"'
+        f' r="{5 if paper is None else 4.5}"/>{theirs}</svg>'
     )
 
 
@@ -121,7 +122,8 @@ def outcomes(successes: int, failures: dict[str, int]) -> Markup:
         colour = KIND_COLOURS.get(kind, KIND_COLOURS["error"])
         title = f"<title>{escape(kind.replace('_', ' '))}: {count} of {total}</title>"
         parts.append(
-            f'<rect x="{at:.2f}" y="1" width="{width:.2f}" height="12" fill="{colour}">{title}</rect>'
+            f'<rect x="{at:.2f}" y="1" width="{width:.2f}" height="12"'
+            f' fill="{colour}">{title}</rect>'
         )
         at += width
     words = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in failures.items())
@@ -171,8 +173,8 @@ def curves(
         parts.append(_line(line, index, shift if joined else 0.0, place, joined))
     body = "".join(parts)
     return Markup(
-        f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(label or x_name)}">'
-        f"{body}</svg>"
+        f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img"'
+        f' aria-label="{escape(label or x_name)}">{body}</svg>'
     )
 
 
@@ -211,14 +213,16 @@ def _axes(xs: Sequence[float], place: object, x_name: str, ticks: Mapping[float,
         )
     middle = LEFT + (WIDTH - LEFT - RIGHT) / 2
     parts.append(
-        f'<text class="name" x="{middle:.1f}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_name)}</text>'
+        f'<text class="name" x="{middle:.1f}" y="{HEIGHT - 6}"'
+        f' text-anchor="middle">{escape(x_name)}</text>'
     )
     return "".join(parts)
 
 
 def _line(line: Series, index: int, shift: float, place: object, with_path: bool) -> str:
-    """Draw one series; `shift` moves it sideways, so that intervals at one x stand beside each
-    other.
+    """Draw one series.
+
+    `shift` moves it sideways, so that intervals at one x stand beside each other.
     """
     assert callable(place)
     colour, path, parts = COLOURS[index % len(COLOURS)], [], []
@@ -227,7 +231,10 @@ def _line(line: Series, index: int, shift: float, place: object, with_path: bool
         top, bottom = place(point.x, point.high)[1], place(point.x, point.low)[1]
         x += shift
         path.append(f"{x:.1f},{y:.1f}")
-        bar = f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{top:.1f}" y2="{bottom:.1f}" stroke-width="1.6" opacity=".6"/>'
+        bar = (
+            f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{top:.1f}" y2="{bottom:.1f}" stroke-width="1.6"'
+            ' opacity=".6"/>'
+        )
         title = escape(f"{line.name}: {point.text}")
         parts.append(f"<g><title>{title}</title>{bar}{_marker(index, x, y, colour)}</g>")
     joined = (

@@ -29,9 +29,7 @@ class Chart:
 
 
 def data_curves(groups: Sequence[Group]) -> list[Chart]:
-    """Success against the number of demonstrations, one chart a task, where a policy has several
-    numbers.
-    """
+    """Return success against the number of demonstrations, one chart a task with several."""
     found = []
     for task in names.TASKS:
         candidates = [item for item in groups if _evaluated(item, task) and item.condition.plain]
@@ -46,8 +44,9 @@ def data_curves(groups: Sequence[Group]) -> list[Chart]:
 
 
 def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
-    """Success against the strength of each shift, with the area under the curve; one chart a task
-    and axis.
+    """Success against the strength of each shift, with the area under the curve.
+
+    One chart a task and axis.
     """
     found = []
     for task in names.TASKS:
@@ -63,8 +62,9 @@ def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
 
 
 def _with_zero(groups: Sequence[Group], axis: str) -> list[Group]:
-    """Return the evaluations of one axis; an evaluation without a shift is strength 0 where none
-    was made.
+    """Return the evaluations of one axis.
+
+    An evaluation without a shift is strength 0 where none was made.
     """
     of_axis = [item for item in groups if item.condition.axis == axis]
     lacking = {_base(item) for item in of_axis} - {

@@ -1,5 +1,6 @@
-"""Episodes: what a click on a cell shows. Every episode's outcome, the commands, hashes and film
-strips.
+"""Episodes: what a click on a cell shows.
+
+Every episode's outcome, the commands, hashes and film strips.
 """
 
 import hashlib
@@ -51,8 +52,9 @@ def film_id(identity: tuple[str, int]) -> str:
 def group_details(
     item: Group, reel: Reel, commands: dict[str, list[str]], on_page: set[tuple[str, int]]
 ) -> dict[str, Any]:
-    """Return one condition: its cells with their episodes, its films, what was measured, what is
-    missing.
+    """Return one condition.
+
+    Its cells with their episodes, its films, what was measured, what is missing.
 
     Args:
         item: the condition.

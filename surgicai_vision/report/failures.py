@@ -16,8 +16,7 @@ DOTS, QUALITY = 60, 80
 
 
 def failure_sheet(groups: Sequence[Group], reel: Reel) -> bytes | None:
-    """Return a JPEG with failures of the best trained policy of each task, or None where no strip
-    shows one.
+    """Return a JPEG with failures of the best policy of each task; None without a strip.
 
     Each kind of failure stands once, as its policy's first view saw it; frames are evenly spaced
     over the episode.

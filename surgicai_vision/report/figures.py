@@ -1,5 +1,6 @@
-"""Show: the page's static images. What each view sees, a success and a failure, rollouts side by
-side.
+"""Show: the page's static images.
+
+What each view sees, a success and a failure, rollouts side by side.
 """
 
 import base64
@@ -21,9 +22,7 @@ SIZE = 224
 
 
 def static_images(groups: Sequence[Group], reel: Reel) -> dict[str, Any]:
-    """Return views, a success, a failure and the side-by-side rollouts, or the reason why there are
-    none.
-    """
+    """Return views, a success, a failure and rollouts side by side, or why there are none."""
     colours = ["#" + bytes(colour).hex() for colour in contact_sheet.PALETTE]
     parts = [
         {"name": name, "colour": colour} for name, colour in zip(names.PARTS, colours, strict=True)
@@ -62,8 +61,9 @@ def static_images(groups: Sequence[Group], reel: Reel) -> dict[str, Any]:
 
 
 def choose(groups: Sequence[Group], success: bool) -> Choice | None:
-    """Choose the episode for a film: the best trained policy's first, else another's, references
-    last.
+    """Choose the episode for a film.
+
+    The best trained policy's first, else another's, references last.
     """
     best = best_trained(groups)
     ordered = sorted(groups, key=lambda item: (item is not best, not item.condition.trained))
@@ -93,7 +93,10 @@ def _strip(choice: Choice | None, kind: str) -> dict[str, Any]:
         ]
     end = f"{row['d_trans_mm']:.1f} mm and {row['d_angle_deg']:.1f}° from the goal at the end"
     why = "" if row["success"] else f" ({row['failure']})"
-    words = f"{condition.policy}, start {row['seed']}, seen by {view}: {kind}{why} after {row['steps']} steps; {end}."
+    words = (
+        f"{condition.policy}, start {row['seed']}, seen by {view}: {kind}{why} after {row['steps']}"
+        f" steps; {end}."
+    )
     return {"title": f"A {kind} in {condition.task}", "frames": frames, "text": words}
 
 
@@ -108,8 +111,14 @@ def _rollout(choice: Choice, reel: Reel) -> dict[str, Any] | None:
     ]
     label = choice.group.label
     success = bool(choice.row["success"])
-    return {"id": film_id(choice.identity), "label": label, "outcome": strip.outcome, "success": success,
-            "view": strip.view, "frames": frames}  # fmt: skip
+    return {
+        "id": film_id(choice.identity),
+        "label": label,
+        "outcome": strip.outcome,
+        "success": success,
+        "view": strip.view,
+        "frames": frames,
+    }
 
 
 def _views(groups: Sequence[Group]) -> list[dict[str, Any]]:
@@ -134,8 +143,10 @@ def _views(groups: Sequence[Group]) -> list[dict[str, Any]]:
             views.append(
                 {
                     "name": view,
-                    "text": f"start {start}; the needle covers {share:.2f} % of the image. "
-                    "Depth: near is red, far is blue.",
+                    "text": (
+                        f"start {start}; the needle covers {share:.2f} % of the image. "
+                        "Depth: near is red, far is blue."
+                    ),
                     "images": [
                         {
                             "name": name.upper() if name == names.RGB else name,

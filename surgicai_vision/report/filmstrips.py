@@ -114,9 +114,7 @@ def make_reel(
 
 
 def comparison(groups: Sequence[Group], task: str) -> list[Choice]:
-    """Choose the start on which the policies of a task disagree most, and up to `COMPARED` rollouts
-    from it.
-    """
+    """Choose the start on which policies disagree most, and `COMPARED` rollouts from it."""
     shown = [item for item in of_task(groups, task) if item.episodes]
     trained = [item for item in shown if item.condition.trained]
     if len(shown) < 2 or not trained:

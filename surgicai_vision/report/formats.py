@@ -19,15 +19,29 @@ HEAD = (
     "steps",
 )
 CAPTION = (
-    "Intervals: exact (Clopper-Pearson), 95 %, episodes of all training seeds together; across training seeds: mean, "
-    "standard deviation and hierarchical bootstrap interval. Length and steps: mean and standard deviation over "
-    "successful episodes."
+    "Intervals: exact (Clopper-Pearson), 95 %, episodes of all training seeds together; across"
+    " training seeds: mean, standard deviation and hierarchical bootstrap interval. Length and"
+    " steps: mean and standard deviation over successful episodes."
 )
 _LATEX = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--", "±": r"$\pm$", "·": r"$\cdot$", "×": r"$\times$",
-    "°": r"$^\circ$", "<": "$<$", ">": "$>$",
-}  # fmt: skip  # fmt: skip
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "–": "--",
+    "±": r"$\pm$",
+    "·": r"$\cdot$",
+    "×": r"$\times$",
+    "°": r"$^\circ$",
+    "<": "$<$",
+    ">": "$>$",
+}
 
 
 def markdown(groups: Sequence[Group], title: str) -> str:
@@ -39,9 +53,10 @@ def markdown(groups: Sequence[Group], title: str) -> str:
             f"Success beside the paper's ({paper.SOURCE}); ours: k/n and exact 95 % interval.",
             "",
         ]
-        parts += _markdown(("task", "encoder", "front, paper", "front, ours", "back, paper", "back, ours"), [
-            (task, encoder, *_paired(task, encoder, pairs)) for task, encoder, pairs in rows
-        ])  # fmt: skip
+        parts += _markdown(
+            ("task", "encoder", "front, paper", "front, ours", "back, paper", "back, ours"),
+            [(task, encoder, *_paired(task, encoder, pairs)) for task, encoder, pairs in rows],
+        )
     parts += [
         f"Success from held-out starts. {CAPTION}",
         "",
@@ -58,8 +73,9 @@ def markdown(groups: Sequence[Group], title: str) -> str:
 
 
 def latex(groups: Sequence[Group], title: str) -> str:
-    """Return the tables as LaTeX; the document needs the package booktabs and, for many rows, a
-    smaller font.
+    """Return the tables as LaTeX.
+
+    The document needs the package booktabs and, for many rows, a smaller font.
     """
     parts = ["% needs \\usepackage{booktabs}"]
     rows = beside_paper(groups)
@@ -140,7 +156,17 @@ def _latex_table(
             body.append(r"\addlinespace")
         body.append(_latex_row(row))
     return [
-        r"\begin{table}", r"\centering\small", rf"\caption{{{escape_latex(caption)}}}", rf"\label{{{label}}}",
-        rf"\begin{{tabular}}{{{columns}}}", r"\toprule", *head, r"\midrule", *body, r"\bottomrule",
-        r"\end{tabular}", r"\end{table}", "",
-    ]  # fmt: skip
+        r"\begin{table}",
+        r"\centering\small",
+        rf"\caption{{{escape_latex(caption)}}}",
+        rf"\label{{{label}}}",
+        rf"\begin{{tabular}}{{{columns}}}",
+        r"\toprule",
+        *head,
+        r"\midrule",
+        *body,
+        r"\bottomrule",
+        r"\end{tabular}",
+        r"\end{table}",
+        "",
+    ]

@@ -129,17 +129,16 @@ class Group:
 
 
 def measured(row: Mapping[str, Any], column: str) -> float | None:
-    """Return a value of an episode; a needle that was never held has not slipped by 0 mm: it has no
-    slip.
+    """Return a value of an episode.
+
+    A needle that was never held has not slipped by 0 mm: it has no slip.
     """
     absent = column.startswith("slip") and row["failure"] == "missed"
     return None if absent else row.get(column)
 
 
 def group(collected: Collected) -> list[Group]:
-    """Return one group for each condition, in the order of the results, those without any at their
-    places.
-    """
+    """Return one group for each condition, in the order of the results."""
     conditions = {result.condition for result in collected.results}
     conditions |= {cell.condition for cell in collected.missing}
     alike = Counter(replace(condition, demonstrations=None) for condition in conditions)
@@ -155,8 +154,9 @@ def group(collected: Collected) -> list[Group]:
 
 
 def of_task(groups: Sequence[Group], task: str, *, plain: bool = True) -> list[Group]:
-    """Return the groups of a task; with `plain` only those without a shift and without a swapped
-    expert.
+    """Return the groups of a task.
+
+    With `plain` only those without a shift and without a swapped expert.
     """
     return [
         item
@@ -172,8 +172,9 @@ def best_trained(groups: Sequence[Group]) -> Group | None:
 
 
 def as_trained(groups: Sequence[Group]) -> list[Group]:
-    """Return the evaluations without a shift; where there are none, those at strength 0, else
-    all.
+    """Return the evaluations without a shift.
+
+    Where there are none, those at strength 0, else all.
     """
     evaluated = [item for item in groups if item.episodes]
     plain = [item for item in evaluated if item.condition.plain]

@@ -106,8 +106,9 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
 
 
 def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str]:
-    """Return the best of each task; the best of many is a choice after the fact, and the page says
-    so.
+    """Return the best of each task.
+
+    The best of many is a choice after the fact, and the page says so.
     """
     best = [found for task in tasks if (found := best_trained(of_task(evaluated, task)))]
     if not best:
@@ -127,14 +128,18 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
     low, high = min(item.rate for item in best), max(item.rate for item in best)
     span = text.percent(high) if low == high else f"{text.percent(low)} to {text.percent(high)}"
     parts = [
-        f"{item.condition.task} {item.successes}/{item.episodes} ({text.interval(item.interval)}; {item.label})"
+        f"{item.condition.task} {item.successes}/{item.episodes} ({text.interval(item.interval)};"
+        f" {item.label})"
         for item in best
     ]
     warning = (
         "Each is the best of several and was chosen after the fact, so its interval flatters it."
     )
     return {
-        "headline": f"The best trained policy of each of {len(best)} tasks solves {span} of its held-out starts",
+        "headline": (
+            f"The best trained policy of each of {len(best)} tasks solves {span} of its held-out"
+            " starts"
+        ),
         "lead": f"{'; '.join(parts)}. {warning}",
     }
 

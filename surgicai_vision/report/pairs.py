@@ -1,5 +1,4 @@
-"""Pairs: do two conditions differ? Exact McNemar on the same starts, Holm's correction within a
-task.
+"""Pairs: exact McNemar on the same starts, Holm's correction within a task.
 
 Compared are trained conditions of a task that differ in one thing (`FACTORS`); recipes as wholes,
 with the encoder, views and demonstrations of each; and each with images against proprioception

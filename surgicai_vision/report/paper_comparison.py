@@ -15,8 +15,7 @@ _DEMONSTRATIONS = 50
 def beside_paper(
     groups: Sequence[Group],
 ) -> list[tuple[str, str, list[tuple[float | None, Group | None]]]]:
-    """Return the paper's Table 2 and ours as rows (task, encoder, [(paper's rate, our condition)
-    for each view]).
+    """Return the paper's Table 2 and ours: (task, encoder, [(its rate, our condition) a view]).
 
     The paper's encoders come first in each task, then ours that it has not. Rates are None where
     the paper has none. Empty without a pretrained encoder of the paper's. Of several numbers of
@@ -69,8 +68,9 @@ def paper_rate(condition: Condition) -> float | None:
 
 
 def _comparable(condition: Condition) -> bool:
-    """Whether it is what the paper's Table 2 holds: one view of the two, everything else as
-    usual.
+    """Whether it is what the paper's Table 2 holds.
+
+    One view of the two, everything else as usual.
     """
     usual = condition.trained and condition.plain and not condition.variant
     return usual and len(condition.views) == 1 and condition.views[0] in paper.VIEWS

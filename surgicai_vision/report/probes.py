@@ -127,4 +127,7 @@ def _correlation(pairs: Sequence[tuple[float, float]]) -> str:
     from scipy.stats import spearmanr
 
     found = spearmanr(errors, rates)
-    return f"{found.statistic:.2f} over {len(pairs)} pairs (p {text.probability(float(found.pvalue), '= ')})"
+    return (
+        f"{found.statistic:.2f} over {len(pairs)} pairs (p"
+        f" {text.probability(float(found.pvalue), '= ')})"
+    )

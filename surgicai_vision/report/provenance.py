@@ -37,8 +37,9 @@ def origin(collected: Collected, groups: Sequence[Group]) -> dict[str, Any]:
 
 
 def commands(result: Result, run: dict[str, Any]) -> list[str]:
-    """Return the commands that make a cell's number again: from the stored policy, and from
-    nothing.
+    """Return the commands that make a cell's number again.
+
+    From the stored policy, and from nothing.
     """
     found = [evaluate_command(result), result.about.get("command") or run.get("command")]
     return list(dict.fromkeys(command for command in found if command))
@@ -77,7 +78,10 @@ def _starts(results: Sequence[Result]) -> str:
     seeds = sorted({row["seed"] for result in results for row in result.rows})
     if not seeds:
         return ""
-    return f"{seeds[0]}–{seeds[-1]} ({text.plural(len(seeds), 'start')}), the bank for tests: no training uses it"
+    return (
+        f"{seeds[0]}–{seeds[-1]} ({text.plural(len(seeds), 'start')}), the bank for tests: no"
+        " training uses it"
+    )
 
 
 def _distinct(values: Any, joint: str = ", ") -> str:

@@ -37,9 +37,9 @@ def paper_rows(groups: Sequence[Group], index: dict[Condition, int]) -> list[dic
                 {
                     "paper": paper_text(task, encoder, rate),
                     "ours": count,
-                    "interval": text.interval(item.interval)
-                    if item is not None and evaluated
-                    else "",
+                    "interval": (
+                        text.interval(item.interval) if item is not None and evaluated else ""
+                    ),
                     "drawing": drawing,
                     "group": index[item.condition] if item is not None else None,
                     "state": "" if evaluated else "absent",
@@ -64,9 +64,7 @@ def _of_paper(rate: float | None) -> tuple[float, float, float] | None:
 
 
 def ceilings(groups: Sequence[Group]) -> str:
-    """Return what the paper's state-based policies and ours reach, the ceiling of those that
-    see.
-    """
+    """Return what the paper's state-based policies and ours reach: the upper bound."""
     parts = []
     for task, rate in paper.STATE_BC.items():
         mine = [
@@ -81,8 +79,9 @@ def ceilings(groups: Sequence[Group]) -> str:
 
 
 def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, Any]]:
-    """Return one heat map a view set: task × policy; of several numbers of demonstrations the
-    largest counts.
+    """Return one heat map a view set: task × policy.
+
+    Of several numbers of demonstrations the largest counts.
     """
     plain = [
         item for item in groups if item.condition.plain and item.condition.task != names.SUTURE
@@ -213,9 +212,18 @@ def measures(groups: Sequence[Group]) -> dict[str, Any]:
             middle, _, rest = text.spread(item.values(column)).partition(" ")
             cells.append((middle, rest, found[1] if found else None))
         condition = item.condition
-        rows.append({"group": at, "task": condition.task, "policy": item.label, "cells": cells,
-                     "encoder": condition.encoder, "views": condition.view or text.ABSENT, "plain": condition.plain,
-                     "kind": "" if condition.trained else "reference"})  # fmt: skip
+        rows.append(
+            {
+                "group": at,
+                "task": condition.task,
+                "policy": item.label,
+                "cells": cells,
+                "encoder": condition.encoder,
+                "views": condition.view or text.ABSENT,
+                "plain": condition.plain,
+                "kind": "" if condition.trained else "reference",
+            }
+        )
     explained = "; ".join(f"{what} [{unit}]: {why}" for _, what, unit, why in kept)
     return {"head": [(what, unit) for _, what, unit, _ in kept], "rows": rows, "caption": explained}
 
@@ -293,8 +301,9 @@ def caption(groups: Sequence[Group]) -> str:
     }
     failures = "; ".join(f"{kind.replace('_', ' ')} = {meanings[kind]}" for kind in kinds(groups))
     return (
-        f"Successes of n episodes with the exact (Clopper–Pearson) interval; the same starts, seeds {first}–{last}, "
-        "for every policy. Trajectory length and time steps: mean ± standard deviation over successful episodes"
+        "Successes of n episodes with the exact (Clopper–Pearson) interval; the same starts, seeds"
+        f" {first}–{last}, for every policy. Trajectory length and time steps: mean ± standard"
+        " deviation over successful episodes"
         + (
             f", of at most {config.max_steps} steps. "
             if len({r.config.max_steps for r in results}) == 1

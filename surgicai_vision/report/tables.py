@@ -75,8 +75,9 @@ def condition_record(item: Group) -> dict[str, Any]:
 
 
 def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, Any]]:
-    """Yield one flat row a cell: what it is, its counts and measures, how to make it again, or why
-    there is none.
+    """Yield one flat row a cell.
+
+    What it is, its counts and measures, how to make it again, or why there is none.
     """
     for item in groups:
         for result in item.results:
@@ -114,9 +115,7 @@ def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, Any]]:
 
 
 def evaluate_command(result: Result) -> str | None:
-    """Return the command that counts a cell's successes again from its stored policy, where one
-    line does.
-    """
+    """Return the command that evaluates a cell's stored policy again, where one line does."""
     about, seeds = result.about, [row["seed"] for row in result.rows]
     whole = seeds == list(range(seeds[0], seeds[0] + len(seeds)))
     if not whole or not result.condition.plain or about.get("chain"):

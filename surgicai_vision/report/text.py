@@ -1,5 +1,6 @@
-"""Text: numbers as tables print them. Percentages are whole, intervals in brackets, absent is a
-dash.
+"""Text: numbers as tables print them.
+
+Percentages are whole, intervals in brackets, absent is a dash.
 """
 
 import math
@@ -34,8 +35,9 @@ def finite(values: Sequence[float | None]) -> list[float]:
 
 
 def quartiles(values: Sequence[float | None]) -> tuple[float, float, float] | None:
-    """Return lower quartile, median and upper quartile of the numbers among `values`; None without
-    any.
+    """Return lower quartile, median and upper quartile of the numbers among `values`.
+
+    None without any.
     """
     known = finite(values)
     if not known:
@@ -45,8 +47,7 @@ def quartiles(values: Sequence[float | None]) -> tuple[float, float, float] | No
 
 
 def spread(values: Sequence[float | None]) -> str:
-    """Return the median and quartiles as "0.8 (0.5–1.2)", with two digits that count at the upper
-    quartile.
+    """Return the median and quartiles as "0.8 (0.5–1.2)", with two significant digits.
 
     Of how many is said where some are missing.
     """
@@ -62,8 +63,9 @@ def spread(values: Sequence[float | None]) -> str:
 
 
 def probability(p: float, sign: str = "") -> str:
-    """Return a p-value: "0.031", or "< 0.001" below that; `sign` stands before a number that is
-    given.
+    """Return a p-value: "0.031", or "< 0.001" below that.
+
+    `sign` stands before a number that is given.
     """
     return "< 0.001" if p < 0.001 else f"{sign}{p:.3f}"
 
