@@ -42,7 +42,11 @@ class Filler:
     """An encoder whose row says which frame it is of."""
 
     card = encoders.encoder_card("random")
-    pool, dim, shape, fingerprint, weights_sha256 = "global", DIM, (DIM,), "filler", ""
+    pool = "global"
+    dim = DIM
+    shape = (DIM,)
+    fingerprint = "filler"
+    weights_sha256 = ""
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
         """Return (B, DIM) float32 rows."""

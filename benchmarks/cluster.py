@@ -33,7 +33,8 @@ class TwoNodes:
     """A local Ray cluster of a head and another node, with one worker each."""
 
     def __init__(self, cluster):
-        self._cluster, self.address = cluster, cluster.address
+        self._cluster = cluster
+        self.address = cluster.address
         self._node = cluster.add_node(**_node())
 
     def lose_node(self) -> bool:
@@ -132,7 +133,8 @@ def main() -> int:
     began = time.monotonic()
     reference = finish(start(script, root / "demos", root / "reference", 2))
     quiet = time.monotonic() - began
-    moments, said = random.Random(arguments.seed), {"kills": 0, "losses": 0}
+    moments = random.Random(arguments.seed)
+    said = {"kills": 0, "losses": 0}
     with two_nodes() as cluster:
 
         def lose() -> bool:

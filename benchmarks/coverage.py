@@ -75,13 +75,13 @@ def percentile(groups: np.ndarray, rng: np.random.Generator, resamples: int) -> 
 
 def count(draws: Iterator[tuple[float, Interval]]) -> tuple[float, float]:
     """Return how often the interval held the truth, and its mean width."""
-    held, width, total = 0, 0.0, 0
+    held = 0
+    width = 0.0
+    total = 0
     for truth, (low, high) in draws:
-        held, width, total = (
-            held + (low - 1e-12 <= truth <= high + 1e-12),
-            width + high - low,
-            total + 1,
-        )
+        held = held + (low - 1e-12 <= truth <= high + 1e-12)
+        width = width + high - low
+        total = total + 1
     return held / total, width / total
 
 

@@ -48,7 +48,8 @@ def measure(task: str, demos: list[Path], episodes: int, seed: int, scaled: bool
     """Execute the primitives learned from `demos` from `episodes` starts."""
     env = envs.make(TaskConfig(task))
     imitator = Imitator(env, demos, scaled)
-    successes, steps = 0, []
+    successes = 0
+    steps = []
     for number in range(seed, seed + episodes):
         rollout = roll(env, Imitator(env, demos, scaled), number, "dmp")
         successes += rollout.success

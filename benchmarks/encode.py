@@ -44,7 +44,8 @@ class Memory:
     fingerprint = "memory"
 
     def __init__(self, frames: np.ndarray):
-        self._frames, self.length = frames, len(frames)
+        self._frames = frames
+        self.length = len(frames)
 
     def frames(self, view: str, start: int, stop: int) -> np.ndarray:
         """Return frames start..stop."""
@@ -91,7 +92,8 @@ def ways(
     name: str, weights: str | None, frames: np.ndarray, dataset: Any
 ) -> dict[str, Callable[[], int]]:
     """Return what is timed, by name; each returns how many frames it encoded."""
-    loop, encoder = bare(name, weights), encoders.load_encoder(name, weights)
+    loop = bare(name, weights)
+    encoder = encoders.load_encoder(name, weights)
     batch = CUDA_BATCH if torch.cuda.is_available() else BATCH
     error = np.abs(loop(frames[:batch], batch).astype(np.float32) - encoder(frames[:batch])).max()
     print(f"{name}: largest difference between the ways {error:.4f}", file=sys.stderr)

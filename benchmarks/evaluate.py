@@ -31,7 +31,9 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.rollout import Agent, Episode, evaluate
 
-ENCODER, VIEW, SIZE = "imagenet-lite", "front", 224
+ENCODER = "imagenet-lite"
+VIEW = "front"
+SIZE = 224
 
 
 class Head:
@@ -71,10 +73,8 @@ def cpu_time() -> float:
 
 def measure(episodes: int, steps: int, repeats: int) -> dict[str, Any]:
     """Time both and compare them row by row."""
-    config, seeds = (
-        TaskConfig("grasp", max_steps=steps),
-        range(names.TEST_SEED, names.TEST_SEED + episodes),
-    )
+    config = TaskConfig("grasp", max_steps=steps)
+    seeds = range(names.TEST_SEED, names.TEST_SEED + episodes)
     kinds: tuple[dict[str, Any], ...] = ({"batch": 1, "workers": 1}, {})
     times: tuple[list[float], list[float]] = ([], [])
     cpu: tuple[list[float], list[float]] = ([], [])
@@ -83,7 +83,8 @@ def measure(episodes: int, steps: int, repeats: int) -> dict[str, Any]:
     for turn in range(repeats):
         found: dict[int, list[Episode]] = {}
         for index in (0, 1) if turn % 2 else (1, 0):
-            start, used = time.perf_counter(), cpu_time()
+            start = time.perf_counter()
+            used = cpu_time()
             found[index] = evaluate(make_agent, config, seeds, **kinds[index])
             times[index].append(time.perf_counter() - start)
             cpu[index].append((cpu_time() - used) / processes[index])

@@ -44,7 +44,9 @@ def play(job: Job) -> list[Episode]:
 
 
 def _episode(env: envs.SuturingEnv, seed: int) -> Episode:
-    expert, info, steps = Expert(env), {}, 0
+    expert = Expert(env)
+    info = {}
+    steps = 0
     try:
         _, info = env.reset(seed=seed)
         for steps in range(1, env.config.max_steps + 1):  # noqa: B007

@@ -40,10 +40,8 @@ def compare(demos: Path, dataset_folder: Path, size: int, frame_stride: int) -> 
     from surgicai_vision.demos.store import list_demos, read_demo
 
     dataset = open_dataset(dataset_folder)
-    bounds, found = (
-        dataset.bounds(),
-        {"dropped": 0, "black": 0, "misaligned": 0, "shifted": 0, "compared": 0},
-    )
+    bounds = dataset.bounds()
+    found = {"dropped": 0, "black": 0, "misaligned": 0, "shifted": 0, "compared": 0}
     env = None
     for number, path in enumerate(list_demos(demos)):
         demo = read_demo(path)
@@ -103,7 +101,8 @@ def main() -> int:
     from surgicai_vision.demos.record import record
     from surgicai_vision.demos.store import list_demos, read_demo
 
-    root, began = Path(tempfile.mkdtemp(prefix="surgicai-vision-frames-")), time.monotonic()
+    root = Path(tempfile.mkdtemp(prefix="surgicai-vision-frames-"))
+    began = time.monotonic()
     total: dict[str, int] = {
         "frames": 0,
         "dropped": 0,
@@ -114,7 +113,9 @@ def main() -> int:
     }
     for task in names.SUBTASKS:
         wanted = -(-arguments.frames // (len(names.SUBTASKS) * len(VIEWS)))
-        demos, episodes, steps = root / task, 1, 0
+        demos = root / task
+        episodes = 1
+        steps = 0
         while steps < wanted:
             shutil.rmtree(demos, ignore_errors=True)
             episodes = max(episodes + 1, -(-episodes * wanted // steps)) if steps else 1

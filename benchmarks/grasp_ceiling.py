@@ -31,13 +31,18 @@ WAYS: dict[str, Callable[[Any], Searcher]] = {"once": Once, "search": Searcher}
 
 def play(seeds: range, way: str) -> list[tuple[bool, int]]:
     """Play the seeds; success and steps of each."""
-    env, rows = envs.make(TaskConfig("grasp")), []
+    env = envs.make(TaskConfig("grasp"))
+    rows = []
     for seed in seeds:
         env.reset(seed=seed)
-        actor, ended, steps, info = WAYS[way](env), False, 0, {"is_success": False}
+        actor = WAYS[way](env)
+        ended = False
+        steps = 0
+        info = {"is_success": False}
         while not ended:
             _, _, terminated, truncated, info = env.step(actor.action())
-            ended, steps = terminated or truncated, steps + 1
+            ended = terminated or truncated
+            steps = steps + 1
         rows.append((bool(info["is_success"]), steps))
     return rows
 

@@ -26,7 +26,9 @@ from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import hold_needle
 from surgicai_vision.scene import build_scene
 
-SECONDS, SPEED, TURN = 10.0, 0.030, math.radians(60.0)
+SECONDS = 10.0
+SPEED = 0.030
+TURN = math.radians(60.0)
 PLACE = (-0.02, 0.05, 0.115)
 """Where the needle is held [m, world]."""
 
@@ -60,7 +62,8 @@ def main() -> None:
     simulation = Simulation(build_scene(SceneConfig(thread=arguments.thread)))
     stitch = Stitch.of(simulation.scene.pair)
     rng = np.random.default_rng(arguments.seed)
-    drifts, lost = [], 0
+    drifts = []
+    lost = 0
     needle_pose = np.eye(4)
     needle_pose[:3, 3] = PLACE
     while len(drifts) + lost < arguments.trials:

@@ -87,7 +87,9 @@ class Trials:
     """
 
     def __init__(self, root: Path, episodes: int, workers: int, together: int):
-        self.root, self.workers, self.script = root, workers, root / "render.py"
+        self.root = root
+        self.workers = workers
+        self.script = root / "render.py"
         self.script.write_text(RENDER)
         make_demos(root / "demos", episodes)
         began = time.monotonic()
@@ -96,7 +98,8 @@ class Trials:
             for n in range(together)
         ]
         results = [finish(process) for process in runs]
-        self.duration, self.reference = time.monotonic() - began, results[0]
+        self.duration = time.monotonic() - began
+        self.reference = results[0]
         assert all(result == self.reference for result in results)
 
     def run(self, trial: int, moment: float) -> dict:
@@ -107,7 +110,9 @@ class Trials:
         process.send_signal(signal.SIGKILL)
         process.communicate()
         time.sleep(0.6)  # its workers notice within half a second
-        kept, lost, whole = committed(out), half_done(out), out.exists()
+        kept = committed(out)
+        lost = half_done(out)
+        whole = out.exists()
         result = finish(start(self.script, self.root / "demos", out, self.workers))
         left = sorted(path.name for path in self.root.glob(f"*set{trial}[!0-9]*"))
         row = {

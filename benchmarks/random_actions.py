@@ -53,14 +53,16 @@ class Job(NamedTuple):
 
 def play(job: Job) -> Counter[str]:
     """Play the job's episodes and count."""
-    env, counts = envs.make(job.config), Counter[str]()
+    env = envs.make(job.config)
+    counts = Counter[str]()
     for seed in job.seeds:
         counts.update(_episode(env, seed, job.hold))
     return counts
 
 
 def _episode(env: envs.SuturingEnv, seed: int, hold: int) -> Counter[str]:
-    rng, counts = np.random.default_rng(seed), Counter(episodes=1)
+    rng = np.random.default_rng(seed)
+    counts = Counter(episodes=1)
     env.reset(seed=seed)
     action = np.zeros(7, np.float32)
     for step in range(STEPS):

@@ -71,7 +71,8 @@ WAYS = {"lerobot": (THEIRS, 0), "one_worker": (OURS, 1), "two_workers": (OURS, 2
 def measure(root: Path, name: str, size: int) -> float:
     """Return the steps/s of one way."""
     code, workers = WAYS[name]
-    script, out = root / f"write_{name}.py", root / "set"
+    script = root / f"write_{name}.py"
+    out = root / "set"
     script.write_text(code)
     environment = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_DATASETS_DISABLE_PROGRESS_BARS": "1"}
     environment["HF_DATASETS_CACHE"] = str(root / "cache")

@@ -46,7 +46,9 @@ from surgicai_vision.demos.expert import Expert
 from surgicai_vision.scene.rendering import QUALITIES, FrameRenderer
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-SIZE, CAMERA, POSES = 224, "front", 16
+SIZE = 224
+CAMERA = "front"
+POSES = 16
 
 
 class Recording(NamedTuple):
@@ -101,7 +103,10 @@ def record(thread: int) -> Recording:
     config = TaskConfig("suture", SceneConfig(thread=thread))
     env = envs.make(config)
     env.reset(seed=names.VALIDATION_SEED)
-    expert, start, actions, commands = Expert(env), env.get_state(), [], []
+    expert = Expert(env)
+    start = env.get_state()
+    actions = []
+    commands = []
     for _ in range(config.max_steps):
         actions.append(expert.action())
         ended = env.step(actions[-1])[2]
@@ -114,7 +119,9 @@ def record(thread: int) -> Recording:
 def measure_step(thread: int, repeats: int) -> dict[str, Any]:
     """Time the env's steps against the bare physics."""
     env, start, actions, commands = record(thread)
-    model, data, nstep = env.model, mujoco.MjData(env.model), env.frame_skip
+    model = env.model
+    data = mujoco.MjData(env.model)
+    nstep = env.frame_skip
 
     def through_env() -> None:
         for action in actions:
@@ -155,7 +162,8 @@ def measure_frames(repeats: int, frames: int) -> dict[str, Any]:
             states.append(copy.copy(env.data))
     model = copy.deepcopy(env.model)
     _set_quality(model)
-    ours, bare = FrameRenderer(env.model, SIZE, SIZE), mujoco.Renderer(model, SIZE, SIZE)
+    ours = FrameRenderer(env.model, SIZE, SIZE)
+    bare = mujoco.Renderer(model, SIZE, SIZE)
     bare.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
 
     def draw(state: mujoco.MjData) -> np.ndarray:
@@ -192,12 +200,11 @@ def measure_frames(repeats: int, frames: int) -> dict[str, Any]:
 
 def _set_quality(model: mujoco.MjModel) -> None:
     """Set a model to the settings of our quality "fast"."""
-    quality, visual = QUALITIES["fast"], model.vis.quality
-    visual.offsamples, visual.numslices, visual.numstacks = (
-        quality.samples,
-        quality.slices,
-        quality.stacks,
-    )
+    quality = QUALITIES["fast"]
+    visual = model.vis.quality
+    visual.offsamples = quality.samples
+    visual.numslices = quality.slices
+    visual.numstacks = quality.stacks
     visual.numquads = quality.quads
 
 
@@ -250,7 +257,8 @@ def measure_workers(repeats: int, steps: int, obs_type: str, share: int) -> dict
 
 def _vector(workers: int, share: int, chosen: dict[str, Any]) -> gymnasium.vector.VectorEnv:
     """Return a vector env of the subtask insert that never truncates."""
-    task, chosen = names.ENV_IDS["insert"], {"max_steps": 10**6, **chosen}
+    task = names.ENV_IDS["insert"]
+    chosen = {"max_steps": 10**6, **chosen}
     if share:
         return gymnasium.make_vec(task, workers * share, workers=workers, **chosen)
     return gymnasium.make_vec(task, workers, "async", vector_kwargs={"context": "spawn"}, **chosen)

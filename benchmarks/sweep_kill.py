@@ -61,7 +61,9 @@ class Sweep:
             str(out),
             "--json",
         ]
-        self.command, self.out, self.starts = [*command, "--workers", "2", *options], out, 0
+        self.command = [*command, "--workers", "2", *options]
+        self.out = out
+        self.starts = 0
         self.process: subprocess.Popen | None = None
 
     def start(self) -> None:
@@ -133,10 +135,12 @@ def main() -> int:
     os.environ.setdefault("MUJOCO_GL", "egl")
     root = Path(tempfile.mkdtemp(prefix="surgicai-vision-sweep-"))
     os.environ["SURGICAI_VISION_CACHE"] = str(root / "cache")
-    grid, moments = root / "grid.yaml", random.Random(arguments.seed)
+    grid = root / "grid.yaml"
+    moments = random.Random(arguments.seed)
     grid.write_text(GRID.format(seeds=list(range(arguments.cells))))
     quiet = Sweep(grid, root / "quiet")
-    result, again = quiet.run([]), quiet.run([])
+    result = quiet.run([])
+    again = quiet.run([])
     digest = result["digest"]
     row = {"cells": arguments.cells, "kills": arguments.kills, "quiet_seconds": result["seconds"]}
     row["second_run"] = {

@@ -32,10 +32,14 @@ EPISODE = 100  # transitions an episode: the paper's demonstrations of grasp hav
 class Noise:
     """A dataset of noise; the frames carry their number alone."""
 
-    task, image_size, fingerprint = "grasp", 224, "noise"
+    task = "grasp"
+    image_size = 224
+    fingerprint = "noise"
 
     def __init__(self, length: int, views: int):
-        self.length, self.views, self.config = length, names.CAMERAS[:views], TaskConfig("grasp")
+        self.length = length
+        self.views = names.CAMERAS[:views]
+        self.config = TaskConfig("grasp")
         self.episode_index = np.arange(length) // EPISODE
 
     def frames(self, view: str, start: int, stop: int) -> np.ndarray:
@@ -80,7 +84,8 @@ def main() -> None:
         "--json", action="store_true", help="accepted for symmetry; the output is always JSON"
     )
     arguments = parser.parse_args()
-    dataset, network = Noise(arguments.transitions, arguments.views), encoder(arguments.dim)
+    dataset = Noise(arguments.transitions, arguments.views)
+    network = encoder(arguments.dim)
     recipe = policies.load_recipe("bc", "paper", {"epochs": arguments.epochs})
     seconds = []
     with tempfile.TemporaryDirectory() as folder:

@@ -22,7 +22,9 @@ from surgicai_vision.evaluation.statistics import clopper_pearson
 from surgicai_vision.scene.rendering import FrameRenderer
 
 TASKS = ("grasp", "place", "insert", "handoff")
-SIZE, PIXELS, GOAL = 224, 25, 0.95
+SIZE = 224
+PIXELS = 25
+GOAL = 0.95
 """Side of an image, fewest needle pixels in it, share of the starts that must show as many."""
 
 
@@ -44,7 +46,8 @@ def count(job: Job) -> list[list[int] | None]:
 def _pixels(
     env: envs.SuturingEnv, seed: int, renderer: FrameRenderer, views: tuple[str, ...]
 ) -> list[int] | None:
-    expert, needle = Expert(env), names.PARTS.index("needle")
+    expert = Expert(env)
+    needle = names.PARTS.index("needle")
     try:
         env.reset(seed=seed)
         for _ in range(env.config.max_steps):
@@ -88,7 +91,8 @@ def main() -> None:
     parser.add_argument("--thread", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
-    scene, views = SceneConfig(thread=chosen.thread), tuple(chosen.view)
+    scene = SceneConfig(thread=chosen.thread)
+    views = tuple(chosen.view)
     seeds = chunks(chosen.seed, chosen.episodes)
     jobs = [Job(TaskConfig(task, scene), part, views) for task in chosen.task for part in seeds]
     done = list(zip(jobs, spread(count, jobs, chosen.workers), strict=True))

@@ -9,8 +9,10 @@ import sys
 
 EGL_PLATFORM_DEVICE_EXT = 0x313F
 EGL_OPENGL_API = 0x30A2
-EGL_SURFACE_TYPE, EGL_PBUFFER_BIT = 0x3033, 0x0001
-EGL_RENDERABLE_TYPE, EGL_OPENGL_BIT = 0x3040, 0x0008
+EGL_SURFACE_TYPE = 0x3033
+EGL_PBUFFER_BIT = 0x0001
+EGL_RENDERABLE_TYPE = 0x3040
+EGL_OPENGL_BIT = 0x0008
 EGL_NONE = 0x3038
 GL_RENDERER = 0x1F01
 
@@ -36,12 +38,14 @@ def extension(egl, name, result, *arguments):
 
 def displays(egl):
     """Yield the initialised display of each EGL device."""
-    pointer, number = ctypes.c_void_p, ctypes.c_int
+    pointer = ctypes.c_void_p
+    number = ctypes.c_int
     query = extension(egl, b"eglQueryDevicesEXT", ctypes.c_uint, number, pointer, pointer)
     get_display = extension(
         egl, b"eglGetPlatformDisplayEXT", pointer, ctypes.c_uint, pointer, pointer
     )
-    devices, count = (pointer * 16)(), number()
+    devices = (pointer * 16)()
+    count = number()
     query(16, devices, ctypes.byref(count))
     for device in devices[: count.value]:
         display = get_display(EGL_PLATFORM_DEVICE_EXT, device, None)
@@ -51,9 +55,11 @@ def displays(egl):
 
 def renderer(egl, gl, display):
     """Return the GL renderer string of a context on `display`, or None where none can be made."""
-    pointer, number = ctypes.c_void_p, ctypes.c_int
+    pointer = ctypes.c_void_p
+    number = ctypes.c_int
     wanted = (EGL_SURFACE_TYPE, EGL_PBUFFER_BIT, EGL_RENDERABLE_TYPE, EGL_OPENGL_BIT, EGL_NONE)
-    config, count = pointer(), number()
+    config = pointer()
+    count = number()
     egl.eglBindAPI(EGL_OPENGL_API)
     egl.eglChooseConfig(
         display, (number * len(wanted))(*wanted), ctypes.byref(config), 1, ctypes.byref(count)

@@ -32,7 +32,8 @@ __all__ = [
     "write_report",
 ]
 
-PAGE_FILE, FAILURES_FILE = "report.html", "failures.jpg"
+PAGE_FILE = "report.html"
+FAILURES_FILE = "failures.jpg"
 Progress = Callable[..., None]
 
 

@@ -31,8 +31,12 @@ _HEAT = ((247, 251, 255), (198, 219, 239), (107, 174, 214), (33, 113, 181), (8, 
 _MARKERS = ("circle", "square", "triangle", "diamond")
 _MIDDLE = 0.179
 """Relative luminance at which black and white letters have the same contrast (WCAG 2)."""
-WIDTH, HEIGHT = 340, 210
-LEFT, RIGHT, TOP, BOTTOM = 38, 22, 10, 40
+WIDTH = 340
+HEIGHT = 210
+LEFT = 38
+RIGHT = 22
+TOP = 10
+BOTTOM = 40
 """Size and margins of a curve's drawing, in its own units."""
 
 
@@ -116,7 +120,9 @@ def interval(
 
 def outcomes(successes: int, failures: dict[str, int]) -> Markup:
     """Draw how episodes ended as one stacked bar."""
-    total, at, parts = successes + sum(failures.values()), 0.0, []
+    total = successes + sum(failures.values())
+    at = 0.0
+    parts = []
     for kind, count in {"success": successes, **failures}.items():
         width = 160 * count / total
         colour = KIND_COLOURS.get(kind, KIND_COLOURS["error"])
@@ -225,10 +231,13 @@ def _line(line: Series, index: int, shift: float, place: object, with_path: bool
     `shift` moves it sideways, so that intervals at one x stand beside each other.
     """
     assert callable(place)
-    colour, path, parts = COLOURS[index % len(COLOURS)], [], []
+    colour = COLOURS[index % len(COLOURS)]
+    path = []
+    parts = []
     for point in line.points:
         x, y = place(point.x, point.rate)
-        top, bottom = place(point.x, point.high)[1], place(point.x, point.low)[1]
+        top = place(point.x, point.high)[1]
+        bottom = place(point.x, point.low)[1]
         x += shift
         path.append(f"{x:.1f},{y:.1f}")
         bar = (

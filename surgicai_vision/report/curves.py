@@ -160,7 +160,8 @@ def _chart(
 
 def survival(groups: Sequence[Group]) -> Chart | None:
     """How many episodes of the whole procedure finished each subtask and all before it."""
-    lines, rows = [], []
+    lines = []
+    rows = []
     for item in groups:
         if not _evaluated(item, names.SUTURE, trained=False):
             continue

@@ -87,7 +87,8 @@ def _cell(result: Result, commands: Sequence[str]) -> dict[str, Any]:
     """Return one training seed: counts, episodes in short form, facts."""
     from surgicai_vision.evaluation.statistics import clopper_pearson
 
-    rows, k = result.rows, sum(bool(row["success"]) for row in result.rows)
+    rows = result.rows
+    k = sum(bool(row["success"]) for row in result.rows)
     return {
         "seed": result.seed if result.trained else None,
         "count": f"{k}/{len(rows)}",

@@ -11,7 +11,8 @@ from surgicai_vision.report.groups import Group, best_trained, of_task
 
 MOST = 8
 """Strips of the image at most."""
-DOTS, QUALITY = 60, 80
+DOTS = 60
+QUALITY = 80
 """Dots per inch, of 2.1 inches a frame, and JPEG quality: eight strips stay below 300 kB."""
 
 
@@ -35,7 +36,8 @@ def failure_sheet(groups: Sequence[Group], reel: Reel) -> bytes | None:
 def _failures(groups: Sequence[Group], reel: Reel) -> Iterator[Strip]:
     """Yield the strips of failures that were rendered, task by task."""
     for task in names.TASKS:
-        best, seen = best_trained(of_task(groups, task)), set()
+        best = best_trained(of_task(groups, task))
+        seen = set()
         for strip in reel.strips.values():
             row = strip.choice.row
             if strip.choice.group is best and not row["success"] and row["failure"] not in seen:

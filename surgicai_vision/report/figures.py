@@ -83,7 +83,8 @@ def _strip(choice: Choice | None, kind: str) -> dict[str, Any]:
             "frames": [],
             "text": f"No episode of any policy was a {kind}.",
         }
-    row, condition = choice.row, choice.group.condition
+    row = choice.row
+    condition = choice.group.condition
     view = next(iter(condition.views), "front")
     film = read_film(choice.result.folder, row["seed"])
     with contact_sheet.stage(choice.result.config, SIZE) as image:
@@ -128,7 +129,8 @@ def _views(groups: Sequence[Group]) -> list[dict[str, Any]]:
     chosen = choose(groups, success=True) or choose(groups, success=False)
     if chosen is None:
         return []
-    film, start = read_film(chosen.result.folder, chosen.row["seed"]), chosen.row["seed"]
+    film = read_film(chosen.result.folder, chosen.row["seed"])
+    start = chosen.row["seed"]
     views = []
     with contact_sheet.stage(chosen.result.config, SIZE) as image:
         for view in shown:

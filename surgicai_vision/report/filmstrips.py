@@ -21,7 +21,9 @@ from surgicai_vision.evaluation.storage import read_film
 from surgicai_vision.report.groups import Group, of_task
 from surgicai_vision.report.reader import Result
 
-FRAMES, SIZE, QUALITY = 8, 128, 72
+FRAMES = 8
+SIZE = 128
+QUALITY = 72
 """Frames of a strip, their height and width [px] and their JPEG quality."""
 BUDGET = 4_000_000
 """Characters of base64 that all strips together may take: with the rest the page stays below 8

@@ -124,7 +124,8 @@ class Group:
         """Return "31.0 ± 4.2 % (22–40 %)", or a dash for one training seed."""
         if self.across is None:
             return text.ABSENT
-        mean, std = 100 * self.across.mean, 100 * self.across.std
+        mean = 100 * self.across.mean
+        std = 100 * self.across.std
         return f"{mean:.1f} ± {std:.1f} % ({text.interval(self.across.interval)})"
 
 

@@ -85,7 +85,8 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
     if len(tasks) > 1:
         return _headline_of_many(evaluated, tasks)
     shown = best_trained(evaluated) or evaluated[0]
-    task, label = shown.condition.task, shown.label
+    task = shown.condition.task
+    label = shown.label
     count = f"{shown.successes} of {shown.episodes} held-out starts of {task}"
     sentence = f"{label} solves {count}"
     if shown.condition.trained and not shown.successes:
@@ -125,7 +126,8 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
             "headline": sentence,
             "lead": f"{episodes:,} episodes; the intervals of each policy stand below.",
         }
-    low, high = min(item.rate for item in best), max(item.rate for item in best)
+    low = min(item.rate for item in best)
+    high = max(item.rate for item in best)
     span = text.percent(high) if low == high else f"{text.percent(low)} to {text.percent(high)}"
     parts = [
         f"{item.condition.task} {item.successes}/{item.episodes} ({text.interval(item.interval)};"

@@ -89,11 +89,13 @@ def _pair(first: Group, second: Group) -> Pair | None:
     differs = factor(first.condition, second.condition)
     if not differs:
         return None
-    one, other = _outcomes(first), _outcomes(second)
+    one = _outcomes(first)
+    other = _outcomes(second)
     common = sorted(one.keys() & other.keys())
     if not common:
         return None
-    a, b = [one[key] for key in common], [other[key] for key in common]
+    a = [one[key] for key in common]
+    b = [other[key] for key in common]
     first_only = sum(x and not y for x, y in zip(a, b, strict=True))
     second_only = sum(y and not x for x, y in zip(a, b, strict=True))
     return Pair(

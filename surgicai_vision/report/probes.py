@@ -38,9 +38,12 @@ def probes(found: Sequence[dict[str, Any]], groups: Sequence[Group]) -> Probes |
 
 def _row(probe: dict[str, Any], mine: Sequence[Group]) -> dict[str, Any]:
     """Return one probe with the pooled success of its policies."""
-    k, n = sum(item.successes for item in mine), sum(item.episodes for item in mine)
+    k = sum(item.successes for item in mine)
+    n = sum(item.episodes for item in mine)
     tip, angle = (text.finite([probe.get(name)]) for name in ("tip_mm", "angle_deg"))
-    encoder, view, point = str(probe.get("encoder")), _view(probe), None
+    encoder = str(probe.get("encoder"))
+    view = _view(probe)
+    point = None
     if n and tip:
         low, high = statistics.clopper_pearson(k, n)
         point = Point(tip[0], k / n, low, high, f"{view}: {tip[0]:.1f} mm, {k}/{n}")

@@ -14,7 +14,8 @@ FLOW = ("demos", "dataset", "features", "policy", "evaluation", "report")
 
 def origin(collected: Collected, groups: Sequence[Group]) -> dict[str, Any]:
     """Return versions, seeds, machine, renderer and hashes; where cells differ, every value."""
-    run, results = collected.run, collected.results
+    run = collected.run
+    results = collected.results
     made = [run["provenance"]] if run.get("provenance") else []
     made += [result.about["provenance"] for result in results if result.about.get("provenance")]
     facts = [

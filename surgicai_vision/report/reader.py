@@ -37,7 +37,9 @@ REFERENCES = ("expert", "random", "zero", "replay")
 """Policies that were not trained: what the trained ones stand beside."""
 PROBES = ("probes.parquet", "probe.json")
 
-FAILED, NOT_RUN, PENDING = "failed", "not run", "pending"
+FAILED = "failed"
+NOT_RUN = "not run"
+PENDING = "pending"
 PROBLEM = re.compile(r"(failed|not run): (\w+), (.+), seed (\d+): (.*)", re.DOTALL)
 """A line of `run.json`'s "not_run"."""
 
@@ -234,7 +236,8 @@ def _missing(
     found: dict[tuple[Condition, int], Missing] = {}
 
     def add(cell: Mapping[str, Any], state: str, reason: str, key: str) -> None:
-        condition, seed = condition_of({**shared, **_filled(cell)}), int(cell.get("seed") or 0)
+        condition = condition_of({**shared, **_filled(cell)})
+        seed = int(cell.get("seed") or 0)
         if (condition, seed) not in done:
             found.setdefault((condition, seed), Missing(condition, seed, state, reason, key))
 

@@ -110,7 +110,8 @@ def _heat(item: Group | None, index: dict[Condition, int]) -> dict[str, Any]:
             "group": None,
             "state": "none",
         }
-    title, group = item.label, index[item.condition]
+    title = item.label
+    group = index[item.condition]
     if not item.episodes:
         cell = item.missing[0]
         return {
@@ -157,7 +158,8 @@ def success_row(at: int, item: Group, best: Group | None) -> dict[str, Any]:
             "sort": {},
         }
     low, high = item.interval
-    length, steps = item.on_successes("trajectory_length_mm"), item.on_successes("steps")
+    length = item.on_successes("trajectory_length_mm")
+    steps = item.on_successes("steps")
     label = f"{text.percent(item.rate)}, 95 % interval {text.interval((low, high))}"
     failures = ", ".join(
         f"{count} {kind.replace('_', ' ')}" for kind, count in item.failures.items()

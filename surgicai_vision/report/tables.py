@@ -81,7 +81,8 @@ def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, Any]]:
     """
     for item in groups:
         for result in item.results:
-            k, n = result.summary["successes"], len(result.rows)
+            k = result.summary["successes"]
+            n = len(result.rows)
             low, high = statistics.clopper_pearson(k, n)
             checkpoint = result.checkpoint
             yield {
@@ -116,7 +117,8 @@ def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, Any]]:
 
 def evaluate_command(result: Result) -> str | None:
     """Return the command that evaluates a cell's stored policy again, where one line does."""
-    about, seeds = result.about, [row["seed"] for row in result.rows]
+    about = result.about
+    seeds = [row["seed"] for row in result.rows]
     whole = seeds == list(range(seeds[0], seeds[0] + len(seeds)))
     if not whole or not result.condition.plain or about.get("chain"):
         return None
