@@ -1,11 +1,9 @@
-"""Agents: what acts in an evaluation. The expert, two baselines, and a policy with its frozen
-encoder.
-"""
+"""Agents: the expert, the baselines, blind replay, and a policy with its frozen encoder."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
-from typing import Any, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,28 +11,39 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import clock
 from surgicai_vision.core.errors import UnreachablePose
+from surgicai_vision.evaluation.agent import (
+    Actions,
+    Agent,
+    Env,
+    FeatureTable,
+    Observation,
+    images_of,
+)
+
+if TYPE_CHECKING:
+    from encoders.base import Encoder
+    from policies.base import Policy
+    from surgicai_vision.demos.expert import Expert
 
 
 @final
-class ExpertAgent:
+class ExpertAgent(Agent):
     """The scripted expert: reads the env's state, needs no images."""
 
     name = "expert"
-    cameras: tuple[str, ...] = ()
-    image_size = 224
 
     def __init__(self) -> None:
-        self._experts: dict[int, Any] = {}
+        self._experts: dict[int, Expert] = {}
 
-    def begin(self, slot: int, env: Any, seed: int) -> None:
+    def reset(self, slot: int, env: Env, seed: int) -> None:
         """Make an expert for the slot's episode."""
         from surgicai_vision.demos.expert import Expert
 
         self._experts[slot] = Expert(env)
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
+        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+    ) -> Actions:
         """Return the experts' actions (n, 7); not a number where the expert knows no way on."""
         actions = np.full((len(slots), 7), np.nan, np.float32)
         for row, slot in enumerate(slots):
@@ -46,23 +55,21 @@ class ExpertAgent:
 
 
 @final
-class RandomAgent:
+class RandomAgent(Agent):
     """Uniform actions, drawn from the episode's own seed."""
 
     name = "random"
-    cameras: tuple[str, ...] = ()
-    image_size = 224
 
     def __init__(self) -> None:
         self._generators: dict[int, np.random.Generator] = {}
 
-    def begin(self, slot: int, env: Any, seed: int) -> None:
+    def reset(self, slot: int, env: Env, seed: int) -> None:
         """Seed the slot's generator."""
         self._generators[slot] = np.random.default_rng(seed)
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
+        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+    ) -> Actions:
         """Return actions (n, 7) in [-1, 1]."""
         return np.stack(
             [self._generators[slot].uniform(-1, 1, 7).astype(np.float32) for slot in slots]
@@ -70,46 +77,42 @@ class RandomAgent:
 
 
 @final
-class ZeroAgent:
+class ZeroAgent(Agent):
     """Zero actions."""
 
     name = "zero"
-    cameras: tuple[str, ...] = ()
-    image_size = 224
 
-    def begin(self, slot: int, env: Any, seed: int) -> None:
+    def reset(self, slot: int, env: Env, seed: int) -> None:
         """Nothing to forget."""
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
+        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+    ) -> Actions:
         """Return zeros (n, 7)."""
         return np.zeros((len(slots), 7), np.float32)
 
 
 @final
-class ReplayAgent:
-    """Blind replay: the same actions in every episode, then none. What it reaches needs no seeing.
+class ReplayAgent(Agent):
+    """Blind replay: the same actions in every episode, then none.
 
     Args:
         actions: (T, 7), one for each control step.
     """
 
     name = "replay"
-    cameras: tuple[str, ...] = ()
-    image_size = 224
 
     def __init__(self, actions: NDArray[np.float32]):
         self._actions = np.concatenate([actions, np.zeros((1, 7), np.float32)])
         self._steps: dict[int, int] = {}
 
-    def begin(self, slot: int, env: Any, seed: int) -> None:
+    def reset(self, slot: int, env: Env, seed: int) -> None:
         """Start from the first action."""
         self._steps[slot] = 0
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
+        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+    ) -> Actions:
         """Return the actions of the slots' steps (n, 7)."""
         steps = [min(self._steps[slot], len(self._actions) - 1) for slot in slots]
         self._steps.update({slot: self._steps[slot] + 1 for slot in slots})
@@ -119,8 +122,9 @@ class ReplayAgent:
 def mean_demonstration(
     action: NDArray[np.float32], episode_index: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """Return the mean action of each control step (T, 7) over the demonstrations that still run
-    then.
+    """Return the mean action of each control step (T, 7).
+
+    The mean is over the demonstrations that still run at that step.
 
     Args:
         action: (N, 7) actions of all frames.
@@ -134,7 +138,7 @@ def mean_demonstration(
     return np.stack(steps).astype(np.float32)
 
 
-VECTORS: Mapping[str, Callable[[Any], NDArray[np.float32]]] = MappingProxyType(
+VECTORS: Mapping[str, Callable[[Env], NDArray[np.float32]]] = MappingProxyType(
     {
         names.STATE: lambda env: env.agent_pos(),
         names.CLOCKED_STATE: lambda env: env.agent_pos(),  # the agent itself adds the clock
@@ -144,16 +148,14 @@ VECTORS: Mapping[str, Callable[[Any], NDArray[np.float32]]] = MappingProxyType(
 )
 """What a policy may be fed beside features: dataset key → how the env says it."""
 
-BASELINES = {agent.name: agent for agent in (ExpertAgent, RandomAgent, ZeroAgent)}
+BASELINES: Mapping[str, Callable[[], Agent]] = MappingProxyType(
+    {ExpertAgent.name: ExpertAgent, RandomAgent.name: RandomAgent, ZeroAgent.name: ZeroAgent}
+)
 """Name → agent that needs no checkpoint."""
 
 
-Shared = dict[tuple[str, tuple[str, ...]], dict[int, NDArray[np.float32]]]
-"""(encoder's fingerprint, views) → id of an observation → its features."""
-
-
 @final
-class PolicyAgent:
+class PolicyAgent(Agent):
     """A trained policy; sees the images of its views and the measured pose of its tip, nothing
     else.
 
@@ -169,27 +171,29 @@ class PolicyAgent:
     def __init__(
         self,
         name: str,
-        policy: Any,
-        encoder: Any,
+        policy: "Policy",
+        encoder: "Encoder | None",
         views: tuple[str, ...],
         image_size: int,
         vector: str = names.STATE,
     ):
-        self.name, self.views, self.image_size = name, views, image_size
+        self.name = name
+        self.views = views
+        self.image_size = image_size
         self.cameras = tuple(dict.fromkeys(map(names.camera_of, views)))
         self.depth = any(view in names.DEPTH_VIEWS for view in views)
-        self._policy, self._encoder, self._vector = policy, encoder, VECTORS[vector]
+        self._policy = policy
+        self._encoder = encoder
+        self._vector = VECTORS[vector]
         self._clocked = vector == names.CLOCKED_STATE
         self._ticks: dict[int, int] = {}
-        self._shared: Shared | None = None
+        self._shared: FeatureTable | None = None
 
-    def share(self, features: "Shared") -> None:
-        """Look features up in a table that agents share, and put new ones there; its owner empties
-        it each step.
-        """
+    def share(self, features: FeatureTable) -> None:
+        """Look features up in a table that agents share, and put new ones there."""
         self._shared = features
 
-    def begin(self, slot: int, env: Any, seed: int) -> None:
+    def reset(self, slot: int, env: Env, seed: int) -> None:
         """Start the slot's clock; the policy has no other memory."""
         self.restart(slot)
 
@@ -198,15 +202,18 @@ class PolicyAgent:
         self._ticks[slot] = 0
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
+        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+    ) -> Actions:
         """Return the policy's actions (n, 7)."""
         ticks = [self._ticks[slot] for slot in slots]
         self._ticks.update({slot: tick + 1 for slot, tick in zip(slots, ticks, strict=True)})
         return self.answer(envs, observations, ticks)
 
     def answer(
-        self, envs: Sequence[Any], observations: Sequence[Any], ticks: Sequence[int] | None = None
+        self,
+        envs: Sequence[Env],
+        observations: Sequence[Observation],
+        ticks: Sequence[int] | None = None,
     ) -> NDArray[np.float32]:
         """Return the policy's answers (n, …): actions, or a high-level policy's logits.
 
@@ -218,38 +225,37 @@ class PolicyAgent:
         with one_thread():
             vectors = np.stack([self._vector(env) for env in envs])
             if self._clocked and ticks is not None:
-                vectors = np.concatenate(
-                    [vectors, clock(np.array(ticks))], axis=1, dtype=np.float32
-                )
+                clocks = clock(np.array(ticks))
+                vectors = np.concatenate([vectors, clocks], axis=1, dtype=np.float32)
             return np.asarray(self._policy.act(self._features(observations), vectors), np.float32)
 
-    def _features(self, observations: Sequence[Any]) -> NDArray[np.float32] | None:
-        """Encode all views of all slots in one call, (n, views · dim): an encoder computes whole
-        batches.
-        """
-        if not self.cameras:
+    def _features(self, observations: Sequence[Observation]) -> NDArray[np.float32] | None:
+        """Encode all views of all slots in one call, (n, views · dim)."""
+        if self._encoder is None:
             return None
         if self._shared is None:
-            return self._encode(observations)
+            return self._encode(self._encoder, observations)
         known = self._shared.setdefault((self._encoder.fingerprint, self.views), {})
         new = [observation for observation in observations if id(observation) not in known]
         if new:
-            known.update(zip(map(id, new), self._encode(new), strict=True))
+            known.update(zip(map(id, new), self._encode(self._encoder, new), strict=True))
         return np.stack([known[id(observation)] for observation in observations])
 
-    def _encode(self, observations: Sequence[Any]) -> NDArray[np.float32]:
-        frames = np.stack([_frame(o, view) for o in observations for view in self.views])
-        return np.asarray(self._encoder(frames), np.float32).reshape(len(observations), -1)
+    def _encode(
+        self, encoder: "Encoder", observations: Sequence[Observation]
+    ) -> NDArray[np.float32]:
+        images = np.stack([_image(o, view) for o in observations for view in self.views])
+        return np.asarray(encoder(images), np.float32).reshape(len(observations), -1)
 
 
-def _frame(observation: Any, view: str) -> NDArray[np.uint8]:
-    """Return what a policy sees of a view, (H, W, 3)."""
+def _image(observation: Observation, view: str) -> NDArray[np.uint8]:
+    """Return what a policy sees of a view, (height, width, 3)."""
     if view in names.DEPTH_VIEWS:
         from surgicai_vision.dataset.codecs import grey
 
+        assert isinstance(observation, Mapping), "the env of an agent with cameras shows images"
         return grey(observation["depth"][names.camera_of(view)])
-    frame: NDArray[np.uint8] = observation["pixels"][view]
-    return frame
+    return images_of(observation)[view]
 
 
 @contextmanager

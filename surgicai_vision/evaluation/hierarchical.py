@@ -33,7 +33,8 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import DWELL, TaskConfig, digest, to_mapping
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.evaluation import lerobot_agent
-from surgicai_vision.evaluation.agents import BASELINES, Shared, one_thread
+from surgicai_vision.evaluation.agent import Actions, Agent, Env, FeatureTable, Observation
+from surgicai_vision.evaluation.agents import BASELINES, PolicyAgent, one_thread
 from surgicai_vision.evaluation.policy_spec import Subject, checkpoint_subject, policy_agent
 
 ORDER = "order"
@@ -174,7 +175,7 @@ class _Progress:
 
 
 @final
-class ChainAgent:
+class ChainAgent(Agent):
     """A high-level policy over low-level ones; see the module's docstring.
 
     It asks the env for nothing but both arms' measured poses and, with a privileged termination,
@@ -186,41 +187,36 @@ class ChainAgent:
     ):
         self.name, self.chain = name, chain
         self.cameras = _views(chain, weights, accept_licence)
-        self._low: list[Any] = [
+        self._low: list[Agent] = [
             BASELINES[policy]()
             if policy in BASELINES
             else _low_subject(policy, subtask, weights, accept_licence).make_agent()
             for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True)
         ]
-        high = (
-            None if chain.hlp == ORDER else policy_agent(Path(chain.hlp), weights, accept_licence)
-        )
-        self._high: Any = high
-        sizes = {
-            agent.image_size
-            for agent in (*self._low, self._high)
-            if agent is not None and agent.cameras
-        }
+        self._high: PolicyAgent | None = None
+        if chain.hlp != ORDER:
+            self._high = policy_agent(Path(chain.hlp), weights, accept_licence)
+        self._agents = [*self._low, *([self._high] if self._high else [])]
+        sizes = {agent.image_size for agent in self._agents if agent.cameras}
         if len(sizes) > 1:
             raise InputError(
                 f"The chain's policies see images of {sorted(sizes)} pixels; give policies of one size."
             )
         self.image_size = sizes.pop() if sizes else 224
         self._slots: dict[int, _Progress] = {}
-        self._features: Shared = {}
-        for agent in (*self._low, self._high):
-            if share := getattr(agent, "share", None):
-                share(self._features)
+        self._features: FeatureTable = {}
+        for agent in self._agents:
+            agent.share(self._features)
 
-    def begin(self, slot: int, env: Any, seed: int) -> None:
+    def reset(self, slot: int, env: Env, seed: int) -> None:
         """Forget the slot's last episode."""
         self._slots[slot] = _Progress()
         for agent in self._low:
-            agent.begin(slot, env, seed)
+            agent.reset(slot, env, seed)
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
+        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+    ) -> Actions:
         """Return the actions (n, 7) of the subtasks that are on, decided anew where one has
         ended.
         """
@@ -236,8 +232,11 @@ class ChainAgent:
                 if state.subtask == subtask and self._may_act(state)
             ]
             if rows:
-                group = ([items[row] for row in rows] for items in (slots, envs, observations))
-                actions[rows] = agent.act(*group)
+                actions[rows] = agent.act(
+                    [slots[row] for row in rows],
+                    [envs[row] for row in rows],
+                    [observations[row] for row in rows],
+                )
         for state in states:
             state.steps += 1
         return actions
@@ -270,8 +269,7 @@ class ChainAgent:
             if self._believes(state, env, choice):
                 state.subtask, state.steps, state.doubts = choice, 0, 0
                 state.decisions += 1
-                if restart := getattr(self._low[choice], "restart", None):
-                    restart(slots[row])
+                self._low[choice].restart(slots[row])
             if self._may_act(state):
                 env.begin(state.subtask)
 

@@ -31,6 +31,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
+from surgicai_vision.evaluation.agent import Actions, Agent, Env, Observation, images_of
 from surgicai_vision.evaluation.agents import one_thread
 from surgicai_vision.evaluation.policy_spec import Subject
 
@@ -167,7 +168,7 @@ def _table(path: Path) -> dict[str, Any]:
 
 
 @final
-class LeRobotAgent:
+class LeRobotAgent(Agent):
     """A policy of LeRobot.
 
     Args:
@@ -190,7 +191,7 @@ class LeRobotAgent:
         self._devices = ("cpu",) if device == "cpu" else ("cpu", device)
         self._slots: dict[int, tuple[Any, dict[str, Any]]] = {}
 
-    def begin(self, slot: int, env: Any, seed: int) -> None:
+    def reset(self, slot: int, env: Env, seed: int) -> None:
         """Give the slot a policy that remembers nothing, and the random numbers of its seed."""
         import torch
 
@@ -206,12 +207,12 @@ class LeRobotAgent:
         self._slots[slot] = policy, states
 
     def restart(self, slot: int) -> None:
-        """Forget what the slot's policy has planned: a chain begins the subtask anew."""
+        """Forget what the slot's policy has planned: its subtask begins anew."""
         self._slots[slot][0].reset()
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
+        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+    ) -> Actions:
         """Return the policy's actions (n, 7)."""
         import torch
 
@@ -229,8 +230,8 @@ class LeRobotAgent:
             return np.concatenate(actions)
 
     def _act(
-        self, policy: Any, envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
+        self, policy: Any, envs: Sequence[Env], observations: Sequence[Observation]
+    ) -> Actions:
         """Ask one policy for the actions of a batch, through LeRobot's pipeline."""
         import torch
         from lerobot.envs.utils import preprocess_observation
@@ -239,11 +240,11 @@ class LeRobotAgent:
         raw: dict[str, Any] = {"agent_pos": np.stack([env.agent_pos() for env in envs])}
         if self._encoder is None:
             raw["pixels"] = {
-                view: np.stack([o["pixels"][view] for o in observations]) for view in self.cameras
+                view: np.stack([images_of(o)[view] for o in observations]) for view in self.cameras
             }
         else:
             views = [
-                self._encoder(np.stack([o["pixels"][view] for o in observations]))
+                self._encoder(np.stack([images_of(o)[view] for o in observations]))
                 for view in self.cameras
             ]
             raw["environment_state"] = np.concatenate(views, axis=1)

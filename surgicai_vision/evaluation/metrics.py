@@ -25,7 +25,7 @@ MEASURED = (
 
 
 @dataclass(frozen=True)
-class EpisodeRow:
+class EpisodeMetrics:
     """One episode.
 
     Attributes:
@@ -91,7 +91,7 @@ def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, he
     return "time" if held else "dropped"
 
 
-def summary(rows: Sequence[EpisodeRow]) -> dict[str, Any]:
+def summary(rows: Sequence[EpisodeMetrics]) -> dict[str, Any]:
     """Return the counts of one policy on one task.
 
     Trajectory length and steps are those of successful episodes; what was measured is averaged over
@@ -120,7 +120,7 @@ def summary(rows: Sequence[EpisodeRow]) -> dict[str, Any]:
     }
 
 
-def survival(rows: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
+def survival(rows: Sequence[EpisodeMetrics]) -> list[dict[str, Any]]:
     """Return for each subtask how many episodes finished it and all before it: k of n, with the
     exact interval.
     """
@@ -131,7 +131,7 @@ def survival(rows: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
     return stages
 
 
-def _reached(rows: Sequence[EpisodeRow]) -> dict[str, int]:
+def _reached(rows: Sequence[EpisodeMetrics]) -> dict[str, int]:
     """Return how many episodes finished each subtask and all before it."""
     return {
         subtask: sum(row.stages > index for row in rows)
@@ -139,7 +139,7 @@ def _reached(rows: Sequence[EpisodeRow]) -> dict[str, int]:
     }
 
 
-def _finite(rows: Sequence[EpisodeRow], column: str) -> list[float]:
+def _finite(rows: Sequence[EpisodeMetrics], column: str) -> list[float]:
     values = [float(getattr(row, column)) for row in rows]
     return [value for value in values if math.isfinite(value)]
 
@@ -148,6 +148,6 @@ def _spread(values: list[float]) -> dict[str, float | None]:
     return {**mean_and_std(values), "n": len(values)}
 
 
-def as_table(rows: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
+def as_table(rows: Sequence[EpisodeMetrics]) -> list[dict[str, Any]]:
     """Return rows as plain data."""
     return [dataclasses.asdict(row) for row in rows]

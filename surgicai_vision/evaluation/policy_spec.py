@@ -17,7 +17,7 @@ from surgicai_vision.evaluation.agents import (
     ReplayAgent,
     mean_demonstration,
 )
-from surgicai_vision.evaluation.rollout import Agent, MakeAgent
+from surgicai_vision.evaluation.agent import Agent, MakeAgent
 
 
 @dataclass(frozen=True)
@@ -130,11 +130,10 @@ def expert() -> Agent:
 
 def baseline(name: str) -> Agent:
     """Make a baseline agent (in a worker process)."""
-    agent: Agent = BASELINES[name]()
-    return agent
+    return BASELINES[name]()
 
 
-def policy_agent(folder: Path, weights: str | None = None, accept_licence: bool = False) -> Agent:
+def policy_agent(folder: Path, weights: str | None = None, accept_licence: bool = False) -> PolicyAgent:
     """Make the agent of a checkpoint folder (in a worker process).
 
     Raises:

@@ -14,7 +14,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from surgicai_vision.core import processes
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError, SurgicaiError
-from surgicai_vision.evaluation.metrics import EpisodeRow, failure_kind
+from surgicai_vision.evaluation.agent import Agent, Env, MakeAgent, Observation
+from surgicai_vision.evaluation.metrics import EpisodeMetrics, failure_kind
 
 BATCH = 8
 """Slots of a process: what an encoder computes at once (`encoders.base`)."""
@@ -31,34 +32,6 @@ FILM_FRAMES = 10
 """States kept of each episode, evenly spaced from the first to the last."""
 
 Progress = Callable[[int, int], None]
-
-
-class Agent(Protocol):
-    """What acts in an episode.
-
-    Attributes:
-        name: how the agent is called in rows and tables.
-        cameras: views it needs, empty for none.
-        image_size: height and width of their images [px].
-    """
-
-    name: str
-    cameras: tuple[str, ...]
-    image_size: int
-
-    def begin(self, slot: int, env: Any, seed: int) -> None:
-        """Forget the slot's last episode; `env` has just been reset with `seed`."""
-
-    def act(
-        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
-        """Return the actions (len(slots), 7) of the running slots."""
-
-
-MakeAgent = Callable[[], Agent]
-"""Makes the agent inside a worker process; must be picklable (a function or a
-functools.partial).
-"""
 
 
 @dataclass(frozen=True)
@@ -73,11 +46,11 @@ class Film:
 class Episode:
     """A row and the film of its episode."""
 
-    row: EpisodeRow
+    row: EpisodeMetrics
     film: Film
 
 
-def env_of(agent: Agent, config: TaskConfig) -> Any:
+def env_of(agent: Agent, config: TaskConfig) -> Env:
     """Make an env that shows what the agent sees."""
     from surgicai_vision import envs
 
@@ -87,7 +60,7 @@ def env_of(agent: Agent, config: TaskConfig) -> Any:
         obs_type="pixels_agent_pos" if cameras else "state",
         cameras=cameras,
         image_size=agent.image_size,
-        depth=getattr(agent, "depth", False),
+        depth=agent.depth,
     )
 
 
@@ -185,7 +158,7 @@ class _Slot:
     error: str = ""
     diverged: bool = False
     touched: bool = False
-    observation: Any = None
+    observation: Observation = field(default_factory=lambda: np.zeros(0, np.float32))
     info: dict[str, Any] = field(default_factory=dict)
     states: list[NDArray[np.float64]] = field(default_factory=list)
 
@@ -205,7 +178,7 @@ class _Slot:
             self.observation, self.info = self.env.reset(seed=seed)
             self.touched = bool(self.info.get("contact"))
             self.gauge.begin()
-            self.agent.begin(self.index, self.env, seed)
+            self.agent.reset(self.index, self.env, seed)
         except PhysicsError as error:
             self.info, self.ended, self.error = {}, True, str(error)
         self._keep()
@@ -239,7 +212,7 @@ class _Slot:
         gauge = self.gauge
         held = not self.error and gauge.held()
         failure = failure_kind(self.error, self.diverged, self.touched, gauge.wrong_hole, held)
-        row = EpisodeRow(
+        row = EpisodeMetrics(
             task=self.task_config.task,
             policy=self.agent.name,
             seed=self.seed,

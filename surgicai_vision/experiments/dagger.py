@@ -22,7 +22,8 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import job
 from surgicai_vision.demos.record import Learner, record_into
 from surgicai_vision.evaluation.policy_spec import checkpoint_subject
-from surgicai_vision.evaluation.rollout import Agent, env_of
+from surgicai_vision.evaluation.agent import Agent
+from surgicai_vision.evaluation.rollout import env_of
 
 
 @final
@@ -35,7 +36,7 @@ class Wheel:
 
     def begin(self, env: Any, seed: int, rng: np.random.Generator) -> None:
         """Draw the step at which the expert takes over."""
-        self._agent.begin(0, env, seed)
+        self._agent.reset(0, env, seed)
         self._left = int(rng.integers(0, env.config.max_steps, endpoint=True))
 
     def action(self, env: Any, observation: Any) -> np.ndarray | None:

@@ -100,7 +100,7 @@ def test_a_policy_with_a_clock_acts_by_it(tmp_path: Path) -> None:
     train(Stepped(), [], BC, recipe, out=tmp_path / "clocked")
     policy = load_policy(tmp_path / "clocked")
     agent = PolicyAgent("clocked", policy, None, (), 224, policy.inputs.vector)
-    agent.begin(0, Still(), 0)
+    agent.reset(0, Still(), 0)
     early = [agent.act([0], [Still()], [None])[0, 0] for _ in range(40)]
     assert np.mean(early[:18]) < -0.3 and np.mean(early[22:]) > 0.3
     agent.restart(0)

@@ -26,11 +26,11 @@ def test_mean_demonstration_is_over_those_that_still_run() -> None:
 def test_replay_plays_to_its_end_in_every_slot() -> None:
     agent = ReplayAgent(np.array([[0.1] * 7, [0.2] * 7], np.float32))
     for slot in (0, 1):
-        agent.begin(slot, None, 0)
+        agent.reset(slot, None, 0)
     first = [agent.act([0], [None], [None])[0, 0] for _ in range(3)]
     np.testing.assert_allclose(first, [0.1, 0.2, 0.0])
     np.testing.assert_allclose(agent.act([1, 0], [None] * 2, [None] * 2)[:, 0], [0.1, 0.0])
-    agent.begin(0, None, 1)
+    agent.reset(0, None, 1)
     assert agent.act([0], [None], [None])[0, 0] == np.float32(0.1)
 
 

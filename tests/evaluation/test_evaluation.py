@@ -15,8 +15,9 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError
 from surgicai_vision.envs import episode_monitor
 from surgicai_vision.evaluation import policy_spec, storage
+from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent, RandomAgent, ZeroAgent
-from surgicai_vision.evaluation.metrics import KINDS, EpisodeRow, as_table, failure_kind, summary
+from surgicai_vision.evaluation.metrics import KINDS, EpisodeMetrics, as_table, failure_kind, summary
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.evaluation.statistics import clopper_pearson
 
@@ -136,10 +137,10 @@ def test_errors_are_failures_and_counted(fake_envs):
 
 
 def test_an_action_that_is_not_finite_is_an_error(fake_envs):
-    class Broken:
-        name, cameras, image_size = "broken", (), 64
+    class Broken(Agent):
+        name = "broken"
 
-        def begin(self, slot, env, seed):
+        def reset(self, slot, env, seed):
             pass
 
         def act(self, slots, envs, observations):
@@ -237,7 +238,7 @@ def test_survival_counts_each_stage_and_all_before_it():
 
 
 def row_with_stages(seed, stages):
-    return EpisodeRow(
+    return EpisodeMetrics(
         task="suture", policy="x", seed=seed, success=stages == 5, steps=9, trajectory_length_mm=1.0, d_trans_mm=1.0,
         d_angle_deg=1.0, contact=True, error="", grasp="friction", failure="" if stages == 5 else "time",
         stages=stages,

@@ -434,7 +434,7 @@ def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(
         config = TaskConfig(TASK, max_steps=STEPS, reward="dense")
         env = envs.make(config, "pixels_agent_pos", agent.cameras, agent.image_size)
         observation, _ = env.reset(seed=seed)
-        agent.begin(0, env, seed)
+        agent.reset(0, env, seed)
         total = 0.0
         for _ in range(STEPS):
             observation, reward, *_ = env.step(agent.act([0], [env], [observation])[0])

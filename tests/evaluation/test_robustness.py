@@ -15,6 +15,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
 from surgicai_vision.evaluation import policy_spec
+from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.robustness import AXES, CURVES, axes_of, robustness, shifted
 from surgicai_vision.evaluation.robustness.corruption import CORRUPTIONS, CorruptedAgent, Moment
@@ -155,20 +156,48 @@ def test_rows_do_not_depend_on_the_batch(axis):
     assert rows_of(played(chosen, 1)) == rows_of(played(chosen, 2))
 
 
+class Watcher(Agent):
+    """Keeps what it sees and the slots whose subtask began anew."""
+
+    name, cameras, image_size, depth = "watcher", ("front",), 8, True
+
+    def __init__(self):
+        self.seen, self.restarted, self.shared = [], [], None
+
+    def reset(self, slot, env, seed):
+        pass
+
+    def act(self, slots, envs, observations):
+        self.seen.extend(observations)
+
+    def restart(self, slot):
+        self.restarted.append(slot)
+
+    def share(self, features):
+        self.shared = features
+
+
 def test_a_corruption_leaves_the_env_and_everything_but_images_alone():
-    seen = []
-    agent = SimpleNamespace(
-        name="x", cameras=("front",), image_size=8, begin=lambda *_: None,
-        act=lambda slots, envs, observations: seen.extend(observations),
-    )  # fmt: skip
+    agent = Watcher()
     wrapped = CorruptedAgent(agent, CORRUPTIONS["noise"], 1.0)
-    wrapped.begin(3, None, 7)
+    wrapped.reset(3, None, 7)
     given = {"pixels": {"front": np.full((8, 8, 3), 100, np.uint8)}, "agent_pos": np.ones(7)}
     wrapped.act([3], [None], [given])
     wrapped.act([3], [None], [given])
     assert (given["pixels"]["front"] == 100).all()
+    seen = agent.seen
     assert seen[0]["agent_pos"] is given["agent_pos"]
     assert not np.array_equal(seen[0]["pixels"]["front"], seen[1]["pixels"]["front"])
+
+
+def test_a_wrapper_passes_on_every_member_of_the_agent():
+    agent, table = Watcher(), {}
+    wrapped = CorruptedAgent(agent, CORRUPTIONS["noise"], 1.0)
+    wrapped.restart(3)
+    wrapped.share(table)
+    assert agent.restarted == [3] and agent.shared is table
+    kept = ("name", "cameras", "image_size", "depth")
+    assert all(getattr(wrapped, member) == getattr(agent, member) for member in kept)
 
 
 class Pretend:
@@ -180,13 +209,13 @@ class Pretend:
     def __call__(self, out, chosen, seeds, workers, progress):
         shift = chosen.about["shift"]
         self.calls.append((shift["axis"], shift["strength"]))
-        from surgicai_vision.evaluation.metrics import EpisodeRow
+        from surgicai_vision.evaluation.metrics import EpisodeMetrics
         from surgicai_vision.evaluation.rollout import Episode, Film
         from surgicai_vision.evaluation.storage import write_evaluation
 
         film = Film(np.zeros(1, np.int64), np.zeros((1, 2)))
         rows = [
-            EpisodeRow(
+            EpisodeMetrics(
                 "grasp",
                 "seeing",
                 seed,

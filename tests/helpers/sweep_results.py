@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig, to_mapping
-from surgicai_vision.evaluation.rollout import Episode, EpisodeRow, Film
+from surgicai_vision.evaluation.rollout import Episode, EpisodeMetrics, Film
 from surgicai_vision.evaluation.storage import write_evaluation
 
 TASKS = ("grasp", "insert", "handoff")
@@ -27,7 +27,7 @@ def episode(task, policy, seed, success, generator, stages=0):
     kind = "" if success else str(generator.choice(KINDS, p=(0.4, 0.2, 0.1, 0.25, 0.03, 0.02)))
     steps = int(generator.integers(60, 140)) if success else 200
     passed = task in ("insert", "suture") and (success or kind == "time")
-    row = EpisodeRow(
+    row = EpisodeMetrics(
         task=task, policy=policy, seed=seed, success=success, steps=steps, grasp="friction", failure=kind,
         trajectory_length_mm=float(generator.normal(45, 6)), contact=success, stages=stages or int(success),
         d_trans_mm=float(abs(generator.normal(0.7 if success else 6, 1.5))),

@@ -14,7 +14,7 @@ from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, SurgicaiError
 from surgicai_vision.envs import contact_sheet
-from surgicai_vision.evaluation.rollout import Episode, EpisodeRow, Film
+from surgicai_vision.evaluation.rollout import Episode, EpisodeMetrics, Film
 from surgicai_vision.evaluation.storage import (
     find_evaluations,
     read_film,
@@ -35,7 +35,7 @@ MACHINE = {
 def episode(policy, seed, success):
     """An episode of 90 steps, or of 200 without success."""
     steps = 90 if success else 200
-    row = EpisodeRow(
+    row = EpisodeMetrics(
         task="grasp", policy=policy, seed=seed, success=success, steps=steps, trajectory_length_mm=41.5 + seed % 7,
         d_trans_mm=0.8 if success else 6.3, d_angle_deg=4.0, contact=success, error="", grasp="friction",
         failure="" if success else "missed",

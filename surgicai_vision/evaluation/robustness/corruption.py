@@ -9,13 +9,20 @@ looks the same in any batch and process. At strength 0 the image comes back as i
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.evaluation.rollout import Agent
+from surgicai_vision.evaluation.agent import (
+    Actions,
+    Agent,
+    Env,
+    FeatureTable,
+    Observation,
+    images_of,
+)
 
 Image = NDArray[np.uint8]
 
@@ -85,7 +92,7 @@ def _clouds(seed: int, view: int, height: int, width: int) -> NDArray[np.float32
     return upper * (1 - down) + lower * down
 
 
-def _bytes(values: NDArray[Any]) -> Image:
+def _bytes(values: NDArray[np.generic]) -> Image:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
@@ -94,7 +101,7 @@ CORRUPTIONS: Mapping[str, Change] = MappingProxyType({"blur": blur, "noise": noi
 
 
 @final
-class CorruptedAgent:
+class CorruptedAgent(Agent):
     """An agent that sees through a corruption.
 
     Args:
@@ -104,20 +111,33 @@ class CorruptedAgent:
     """
 
     def __init__(self, agent: Agent, change: Change, strength: float):
-        self.name, self.cameras, self.image_size = agent.name, agent.cameras, agent.image_size
-        self.depth = getattr(agent, "depth", False)
-        self._agent, self._change, self._strength = agent, change, strength
+        self.name = agent.name
+        self.cameras = agent.cameras
+        self.image_size = agent.image_size
+        self.depth = agent.depth
+        self._agent = agent
+        self._change = change
+        self._strength = strength
         self._seeds: dict[int, int] = {}
         self._steps: dict[int, int] = {}
 
-    def begin(self, slot: int, env: Any, seed: int) -> None:
+    def reset(self, slot: int, env: Env, seed: int) -> None:
         """Count the slot's steps from 0."""
-        self._seeds[slot], self._steps[slot] = seed, 0
-        self._agent.begin(slot, env, seed)
+        self._seeds[slot] = seed
+        self._steps[slot] = 0
+        self._agent.reset(slot, env, seed)
+
+    def restart(self, slot: int) -> None:
+        """Tell the agent behind; the slot's steps count on."""
+        self._agent.restart(slot)
+
+    def share(self, features: FeatureTable) -> None:
+        """Let the agent behind share features."""
+        self._agent.share(features)
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Any], observations: Sequence[Any]
-    ) -> NDArray[np.float32]:
+        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+    ) -> Actions:
         """Return the agent's actions (n, 7) on what it sees."""
         seen = [
             self._seen(slot, observation)
@@ -127,11 +147,12 @@ class CorruptedAgent:
             self._steps[slot] += 1
         return self._agent.act(slots, envs, seen)
 
-    def _seen(self, slot: int, observation: Any) -> Any:
-        if not isinstance(observation, dict) or "pixels" not in observation:
+    def _seen(self, slot: int, observation: Observation) -> Observation:
+        if not self.cameras:
             return observation
+        assert isinstance(observation, dict), "the env of an agent with cameras shows images"
         changed = {}
-        for view, image in observation["pixels"].items():
+        for view, image in images_of(observation).items():
             moment = Moment(self._seeds[slot], self._steps[slot], names.CAMERAS.index(view))
             changed[view] = self._change(image, self._strength, moment)
         return {**observation, "pixels": changed}

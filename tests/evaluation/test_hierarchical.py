@@ -61,7 +61,7 @@ def agent(classes: list[int], **changes: object) -> ChainAgent:
 
 def roll(actor: ChainAgent, env: Env, steps: int) -> list[int]:
     """Return which low-level policy acted in each step; -1 where the arms hold still."""
-    actor.begin(0, env, 0)
+    actor.reset(0, env, 0)
     acted = []
     for _ in range(steps):
         value = actor.act([0], [env], [None])[0, 0]
@@ -172,7 +172,7 @@ def test_policies_of_a_chain_share_features() -> None:
     for one in agents:
         one.share(shared)
         for slot in range(3):
-            one.begin(slot, None, 0)
+            one.reset(slot, None, 0)
     observations = [
         {"pixels": {"back": np.full((4, 4, 3), value, np.uint8)}} for value in (1, 2, 3)
     ]
