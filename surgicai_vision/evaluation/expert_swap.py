@@ -18,8 +18,8 @@ from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import check_name
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation import hierarchical
-from surgicai_vision.evaluation.policy_spec import Subject
 from surgicai_vision.evaluation.agent import Agent, MakeAgent
+from surgicai_vision.evaluation.policy_spec import Subject
 from surgicai_vision.evaluation.run import evaluate_into
 from surgicai_vision.evaluation.statistics import clopper_pearson, holm, mcnemar
 from surgicai_vision.evaluation.storage import MARKER, parquet_bytes, read_rows

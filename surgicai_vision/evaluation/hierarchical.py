@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import DWELL, TaskConfig, digest, to_mapping

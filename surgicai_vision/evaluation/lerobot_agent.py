@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping

@@ -11,13 +11,13 @@ from typing import Any
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.evaluation.agent import Agent, MakeAgent
 from surgicai_vision.evaluation.agents import (
     BASELINES,
     PolicyAgent,
     ReplayAgent,
     mean_demonstration,
 )
-from surgicai_vision.evaluation.agent import Agent, MakeAgent
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,9 @@ def baseline(name: str) -> Agent:
     return BASELINES[name]()
 
 
-def policy_agent(folder: Path, weights: str | None = None, accept_licence: bool = False) -> PolicyAgent:
+def policy_agent(
+    folder: Path, weights: str | None = None, accept_licence: bool = False
+) -> PolicyAgent:
     """Make the agent of a checkpoint folder (in a worker process).
 
     Raises:

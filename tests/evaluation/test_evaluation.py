@@ -17,7 +17,13 @@ from surgicai_vision.envs import episode_monitor
 from surgicai_vision.evaluation import policy_spec, storage
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent, RandomAgent, ZeroAgent
-from surgicai_vision.evaluation.metrics import KINDS, EpisodeMetrics, as_table, failure_kind, summary
+from surgicai_vision.evaluation.metrics import (
+    KINDS,
+    EpisodeMetrics,
+    as_table,
+    failure_kind,
+    summary,
+)
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.evaluation.statistics import clopper_pearson
 

@@ -13,6 +13,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.evaluation import hierarchical
+from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.hierarchical import PATIENCE, Chain, ChainAgent
 from surgicai_vision.evaluation.metrics import summary
@@ -43,6 +44,22 @@ class Env:
             self.phase, self.steps = self.phase + 1, 0
 
 
+class Constant(Agent):
+    """Says one value; keeps the slots whose subtask began anew."""
+
+    def __init__(self, value: float):
+        self.value, self.restarted = value, []
+
+    def reset(self, slot, env, seed):
+        pass
+
+    def act(self, slots, envs, observations):
+        return np.full((len(slots), 7), self.value)
+
+    def restart(self, slot):
+        self.restarted.append(slot)
+
+
 def agent(classes: list[int], **changes: object) -> ChainAgent:
     """Return a chain whose high-level policy says `classes` one after another, and whose policies
     say their index.
@@ -50,12 +67,7 @@ def agent(classes: list[int], **changes: object) -> ChainAgent:
     made = ChainAgent("chain", Chain("order", **{**EXPERTS, **changes}))
     said = iter(classes)
     made._high = SimpleNamespace(answer=lambda envs, _: np.eye(5)[[next(said) for _ in envs]])
-    made._low = [
-        SimpleNamespace(
-            begin=lambda *_: None, act=lambda slots, *_, value=index: np.full((len(slots), 7), value / 10)
-        )
-        for index in range(5)
-    ]  # fmt: skip
+    made._low = [Constant(index / 10) for index in range(5)]
     return made
 
 
@@ -102,11 +114,9 @@ def test_a_subtask_ends_after_its_steps_and_an_episode_after_its_decisions() -> 
 
 
 def test_a_policy_that_plans_ahead_forgets_its_plan_when_its_subtask_begins() -> None:
-    actor, forgotten = agent([0, 1, 2, 3, 4]), []
-    for index, low in enumerate(actor._low):
-        low.restart = lambda slot, index=index: forgotten.append((slot, index))
+    actor = agent([0, 1, 2, 3, 4])
     roll(actor, Env(3), 8)
-    assert forgotten == [(0, 0), (0, 1), (0, 2)]
+    assert [low.restarted for low in actor._low] == [[0], [0], [0], [], []]
 
 
 def test_learned_termination_waits_for_the_high_level_policy() -> None:
@@ -207,7 +217,7 @@ def test_wrong_chains_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_the_documented_chain_is_one(root: Path) -> None:
     import yaml
 
-    text = (root / "docs" / "chain.md").read_text(encoding="utf-8")
+    text = (root / "docs" / "hierarchical.md").read_text(encoding="utf-8")
     made = from_mapping(Chain, yaml.safe_load(text.split("```yaml\n")[1].split("```")[0]))
     assert made.termination in hierarchical.TERMINATIONS and all(
         f"{s}-of-suture-state" in getattr(made, s) for s in EXPERTS

@@ -16,9 +16,9 @@ from typing import Any
 
 from surgicai_vision.core.config import RANDOMISATION_LIMITS, TaskConfig
 from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.evaluation.agent import Agent, MakeAgent
 from surgicai_vision.evaluation.policy_spec import Subject
 from surgicai_vision.evaluation.robustness.corruption import CORRUPTIONS, CorruptedAgent
-from surgicai_vision.evaluation.agent import Agent, MakeAgent
 
 
 @dataclass(frozen=True)
