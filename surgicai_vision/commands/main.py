@@ -23,6 +23,7 @@ from cyclopts.exceptions import (
     UnknownOptionError,
     UnusedCliTokensError,
 )
+from rich.console import Console
 
 from surgicai_vision.commands import COMMANDS, PROGRAM, register
 from surgicai_vision.commands.options import from_file, split_comma_lists
@@ -44,6 +45,7 @@ app = App(
     version=lambda: f"{PROGRAM} {version(PROGRAM)}",
     default_parameter=Parameter(negative_iterable=(), show_env_var=False),
     help_format="plaintext",
+    console=Console(soft_wrap=True),  # an example is never broken at the edge of the window
     result_action="return_value",
     print_error=False,
     exit_on_error=False,
@@ -129,8 +131,11 @@ def explain(error: CycloptsError) -> InputError:
             return UnknownName("option", given, (*_names(own), *_names(common), "--help"))
         case UnusedCliTokensError(unused_tokens=[given, *_]):
             problem = f"unexpected argument '{given}'"
-        case MissingArgumentError(argument=Argument(index=int(), parameter=parameter)):
-            problem = f"{parameter.metavar} is missing"
+        case MissingArgumentError(keyword=str() as option):
+            problem = f"{option} needs a value"
+        case MissingArgumentError(argument=Argument(index=index, parameter=parameter, name=name)):
+            option = "" if index is not None else f"{name} "
+            problem = f"{option}{parameter.metavar} is missing"
         case _:
             error.verbose = False
             problem = str(error).replace('"', "'").rstrip(".")

@@ -14,13 +14,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeVar, cast
 
-import numpy as np
 import yaml
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnknownName, check_name
 
 if TYPE_CHECKING:
+    import numpy as np
     from _typeshed import DataclassInstance
 
 T = TypeVar("T")
@@ -274,12 +274,14 @@ def check_frame_stride(frame_stride: int) -> None:
         )
 
 
-def clock(steps: np.ndarray) -> np.ndarray:
+def clock(steps: "np.ndarray") -> "np.ndarray":
     """Return what a policy with a clock is told of the control steps (N,) since its subtask began,
     (N, 3) float32.
 
     The share of `SUBTASK_STEPS`, and sine and cosine of a hand that goes round once in
     `CLOCK_PERIOD` steps: the share alone changes too little in a few steps to act by.
     """
+    import numpy as np  # not above: `--help` reads this module and must be quick
+
     turn = 2.0 * np.pi * steps / CLOCK_PERIOD
     return np.stack([steps / SUBTASK_STEPS, np.sin(turn), np.cos(turn)], axis=1).astype(np.float32)

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 from fake_demos import render_with_fake_env, write_demos
 
-from surgicai_vision.commands import render_demos as command
+from surgicai_vision.commands.options import VIDEO
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
@@ -152,7 +152,7 @@ def test_the_same_command_again_does_nothing_and_wrong_ones_are_refused(tmp_path
 def test_the_command_line_knows_the_codecs(tmp_path, demos, capsys):
     from surgicai_vision.commands.main import main
 
-    assert tuple(CODECS) == command.CODECS
+    assert tuple(CODECS) == VIDEO.choices
     render(demos, tmp_path / "set")
     assert main(["dataset", "view", str(tmp_path / "set"), "--view", "back", "--json"]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])

@@ -234,7 +234,7 @@ def test_the_command_reports_a_sweep_whose_grid_it_cannot_read(tmp_path, monkeyp
     told = json.loads(said.out.splitlines()[-1])
     assert (told["evaluations"], told["missing"]) == (5, 1)
     assert "grid cannot be read" in said.err
-    assert Options(str(tmp_path)).strips == filmstrips.MOST_STRIPS
+    assert Options(tmp_path).strips == filmstrips.MOST_STRIPS
 
 
 def test_a_folder_where_every_cell_failed_has_a_report(tmp_path, monkeypatch):
