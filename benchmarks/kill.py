@@ -32,7 +32,8 @@ if __name__ == "__main__":
     engine = open_engine(f"ray,address={address}" if address else "local")
     options = {"size": int(size), "depth": True, "workers": int(workers), "engine": engine}
     summary = render_demos(Path(demos), Path(out), **options)
-    print(json.dumps([summary.digest, open_dataset(Path(out)).fingerprint, summary.frames, summary.episodes]))
+    dataset = open_dataset(Path(out))
+    print(json.dumps([summary.digest, dataset.fingerprint, summary.frames, summary.episodes]))
 """
 
 SIZE = 64

@@ -51,13 +51,16 @@ if __name__ == "__main__":
     env, frames = None, 0
     for path in list_demos(Path(demos)):
         demo = read_demo(path)
-        env = env or envs.make(demo.config, obs_type="pixels_agent_pos", cameras=("front", "back"), image_size=size)
+        env = env or envs.make(
+            demo.config, obs_type="pixels_agent_pos", cameras=("front", "back"), image_size=size
+        )
         for state, action in zip(demo.state, demo.action):
             env.set_state_vector(state)
             seen = env.observe()
             row = {names.image_key(view): seen["pixels"][view] for view in ("front", "back")}
             text = names.TASK_TEXTS[demo.config.task]
-            dataset.add_frame({**row, names.STATE: seen["agent_pos"], names.ACTION: action, "task": text})
+            row |= {names.STATE: seen["agent_pos"], names.ACTION: action, "task": text}
+            dataset.add_frame(row)
             frames += 1
         dataset.save_episode(parallel_encoding=False)
     dataset.finalize()

@@ -10,7 +10,6 @@ states kept of each episode, so results stay small and the page can be rebuilt a
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from surgicai_vision.core import files
 from surgicai_vision.evaluation.storage import GRID_FILE, RUN_FILE
@@ -42,7 +41,7 @@ def write_report(
     out: Path | None = None,
     progress: Progress | None = None,
     *,
-    cells: Sequence[Mapping[str, Any]] = (),
+    cells: Sequence[Mapping[str, object]] = (),
     strips: int = filmstrips.MOST_STRIPS,
 ) -> Path:
     """Write the page and the tables of the results below `folder`; return the page's path.

@@ -6,7 +6,6 @@ Every episode's outcome, the commands, hashes and film strips.
 import hashlib
 import json
 from collections.abc import Sequence
-from typing import Any
 
 from markupsafe import Markup
 
@@ -51,7 +50,7 @@ def film_id(identity: tuple[str, int]) -> str:
 
 def group_details(
     item: Group, reel: Reel, commands: dict[str, list[str]], on_page: set[tuple[str, int]]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return one condition.
 
     Its cells with their episodes, its films, what was measured, what is missing.
@@ -83,7 +82,7 @@ def group_details(
     }
 
 
-def _cell(result: Result, commands: Sequence[str]) -> dict[str, Any]:
+def _cell(result: Result, commands: Sequence[str]) -> dict[str, object]:
     """Return one training seed: counts, episodes in short form, facts."""
     from surgicai_vision.evaluation.statistics import clopper_pearson
 
@@ -139,13 +138,17 @@ def _measures(item: Group) -> list[tuple[str, str]]:
     return spread
 
 
-def _film(strip: Strip, on_page: set[tuple[str, int]]) -> dict[str, Any]:
-    known = {"id": film_id(strip.choice.identity), "view": strip.view, "outcome": strip.outcome}
+def _film(strip: Strip, on_page: set[tuple[str, int]]) -> dict[str, object]:
+    known: dict[str, object] = {
+        "id": film_id(strip.choice.identity),
+        "view": strip.view,
+        "outcome": strip.outcome,
+    }
     if strip.choice.identity in on_page:
         return known
     return {**known, "steps": list(strip.steps), "frames": list(strip.frames)}
 
 
-def _rounded(value: Any) -> float | None:
+def _rounded(value: float | None) -> float | None:
     known = text.finite([value])
     return round(known[0], 1) if known else None

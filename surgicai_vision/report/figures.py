@@ -5,7 +5,6 @@ What each view sees, a success and a failure, rollouts side by side.
 
 import base64
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,7 @@ SIZE = 224
 """Height and width of the large images [px]."""
 
 
-def static_images(groups: Sequence[Group], reel: Reel) -> dict[str, Any]:
+def static_images(groups: Sequence[Group], reel: Reel) -> dict[str, object]:
     """Return views, a success, a failure and rollouts side by side, or why there are none."""
     colours = ["#" + bytes(colour).hex() for colour in contact_sheet.PALETTE]
     parts = [
@@ -31,7 +30,7 @@ def static_images(groups: Sequence[Group], reel: Reel) -> dict[str, Any]:
         task: [_rollout(choice, reel) for choice in choices]
         for task, choices in reel.compared.items()
     }
-    page: dict[str, Any] = {
+    page: dict[str, object] = {
         "image_size": SIZE,
         "parts": parts,
         "no_images": "",
@@ -75,7 +74,7 @@ def choose(groups: Sequence[Group], success: bool) -> Choice | None:
     return None
 
 
-def _strip(choice: Choice | None, kind: str) -> dict[str, Any]:
+def _strip(choice: Choice | None, kind: str) -> dict[str, object]:
     """Render the large film strip of one episode."""
     if choice is None:
         return {
@@ -101,7 +100,7 @@ def _strip(choice: Choice | None, kind: str) -> dict[str, Any]:
     return {"title": f"A {kind} in {condition.task}", "frames": frames, "text": words}
 
 
-def _rollout(choice: Choice, reel: Reel) -> dict[str, Any] | None:
+def _rollout(choice: Choice, reel: Reel) -> dict[str, object] | None:
     """Return one of the rollouts from the same start, with its frames."""
     strip = reel.strips.get(choice.identity)
     if strip is None:
@@ -122,7 +121,7 @@ def _rollout(choice: Choice, reel: Reel) -> dict[str, Any] | None:
     }
 
 
-def _views(groups: Sequence[Group]) -> list[dict[str, Any]]:
+def _views(groups: Sequence[Group]) -> list[dict[str, object]]:
     """Render every modality of the views that were used, at the start of an episode."""
     used = {names.camera_of(view) for item in groups for view in item.condition.views}
     shown = [view for view in names.CAMERAS if view in (used or {"front", "back"})]
@@ -131,7 +130,7 @@ def _views(groups: Sequence[Group]) -> list[dict[str, Any]]:
         return []
     film = read_film(chosen.result.folder, chosen.row["seed"])
     start = chosen.row["seed"]
-    views = []
+    views: list[dict[str, object]] = []
     with contact_sheet.stage(chosen.result.config, SIZE) as image:
         for view in shown:
             frames = {

@@ -3,7 +3,6 @@
 import datetime
 import json
 from collections.abc import Sequence
-from typing import Any
 
 from markupsafe import Markup
 
@@ -20,7 +19,7 @@ FEW = 12
 """Rows up to which a table of every cell is open from the start."""
 
 
-def render(page: dict[str, Any]) -> str:
+def render(page: dict[str, object]) -> str:
     """Fill the template."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -35,7 +34,9 @@ def render(page: dict[str, Any]) -> str:
     return environment.get_template("report.html.j2").render(page)
 
 
-def numbers(collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]) -> dict[str, Any]:
+def numbers(
+    collected: Collected, groups: Sequence[Group], pairs: Sequence[Pair]
+) -> dict[str, object]:
     """Return everything but images and provenance."""
     index = {item.condition: at for at, item in enumerate(groups)}
     best = {task: best_trained(of_task(groups, task)) for task in names.TASKS}

@@ -1,7 +1,6 @@
 """Sections: the rows of the page's tables and maps, as the template prints them."""
 
 from collections.abc import Sequence
-from typing import Any
 
 from markupsafe import Markup
 
@@ -16,9 +15,9 @@ from surgicai_vision.report.paper_comparison import beside_paper, our_text, pape
 PAIRS_SHOWN = 12
 
 
-def paper_rows(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, Any]]:
+def paper_rows(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, object]]:
     """Return the paper's table beside ours, one row a task and encoder."""
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     for task, encoder, sides in beside_paper(groups):
         cells = []
         for rate, item in sides:
@@ -78,7 +77,7 @@ def ceilings(groups: Sequence[Group]) -> str:
     return "; ".join(parts)
 
 
-def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, Any]]:
+def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, object]]:
     """Return one heat map a view set: task × policy.
 
     Of several numbers of demonstrations the largest counts.
@@ -86,7 +85,8 @@ def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict
     plain = [
         item for item in groups if item.condition.plain and item.condition.task != names.SUTURE
     ]
-    maps = []
+    maps: list[dict[str, object]] = []
+    several = False
     for views in dict.fromkeys(item.condition.views for item in plain):
         mine = [item for item in plain if item.condition.views == views]
         columns = list(dict.fromkeys(item.condition.policy for item in mine))
@@ -97,11 +97,12 @@ def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict
             rows.append(
                 {"task": task, "cells": [_heat(known.get(column), index) for column in columns]}
             )
+        several = several or len(rows) > 1
         maps.append({"view": " + ".join(views) or "no images", "columns": columns, "rows": rows})
-    return maps if sum(len(found["rows"]) for found in maps) > len(maps) else []
+    return maps if several else []
 
 
-def _heat(item: Group | None, index: dict[Condition, int]) -> dict[str, Any]:
+def _heat(item: Group | None, index: dict[Condition, int]) -> dict[str, object]:
     if item is None:
         return {
             "text": "",
@@ -133,10 +134,10 @@ def _heat(item: Group | None, index: dict[Condition, int]) -> dict[str, Any]:
     }
 
 
-def success_row(at: int, item: Group, best: Group | None) -> dict[str, Any]:
+def success_row(at: int, item: Group, best: Group | None) -> dict[str, object]:
     """Return one line of the success table; `sort` holds what its columns are sorted by."""
     condition = item.condition
-    row: dict[str, Any] = {
+    row: dict[str, object] = {
         "group": at,
         "task": condition.task,
         "policy": condition.policy if condition.plain else condition.label,
@@ -200,7 +201,7 @@ def _note(item: Group) -> str:
     return ", ".join(parts)
 
 
-def measures(groups: Sequence[Group]) -> dict[str, Any]:
+def measures(groups: Sequence[Group]) -> dict[str, object]:
     """Return the columns that some row measured, and their medians."""
     evaluated = [(at, item) for at, item in enumerate(groups) if item.episodes]
     kept = [
@@ -230,7 +231,7 @@ def measures(groups: Sequence[Group]) -> dict[str, Any]:
     return {"head": [(what, unit) for _, what, unit, _ in kept], "rows": rows, "caption": explained}
 
 
-def pair_row(at: int, pair: Pair) -> dict[str, Any]:
+def pair_row(at: int, pair: Pair) -> dict[str, object]:
     """Return one comparison as text."""
     return {
         "more": at >= PAIRS_SHOWN,
@@ -248,7 +249,7 @@ def pair_row(at: int, pair: Pair) -> dict[str, Any]:
     }
 
 
-def missing_rows(groups: Sequence[Group]) -> list[dict[str, Any]]:
+def missing_rows(groups: Sequence[Group]) -> list[dict[str, object]]:
     """Return what has no result, one row for each condition, state and reason."""
     rows: dict[tuple[str, ...], list[int]] = {}
     for item in groups:
