@@ -4,10 +4,13 @@ import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from surgicai_vision.core import files
 from surgicai_vision.core.errors import BadFile, InputError, check_name
+
+if TYPE_CHECKING:
+    from surgicai_vision.dataset import RenderedDataset
 
 OUTPUTS = Path("outputs")
 CORES = len(os.sched_getaffinity(0))
@@ -58,7 +61,7 @@ def demos_task(folder: Path) -> str:
     return str(read_marker(folder)["task"])
 
 
-def open_dataset(folder: Path | None, task: str, views: Sequence[str]) -> Any:
+def open_dataset(folder: Path | None, task: str, views: Sequence[str]) -> "RenderedDataset":
     """Open a dataset, by default the task's; say which command makes it where there is none.
 
     Raises:

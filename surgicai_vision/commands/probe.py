@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
@@ -22,6 +22,9 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.core.files import check_output, write_json
 from surgicai_vision.features import encoders
+
+if TYPE_CHECKING:
+    from surgicai_vision.dataset import Dataset
 
 app = App(
     name="probe",
@@ -79,7 +82,9 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     return {"rows": rows, "out": str(out)}
 
 
-def _rows(options: Options, name: str, dataset: Any, console: Console) -> list[dict[str, Any]]:
+def _rows(
+    options: Options, name: str, dataset: "Dataset", console: Console
+) -> list[dict[str, Any]]:
     """Encode what is not at hand and probe one encoder's views."""
     from surgicai_vision.features.cache import encode
     from surgicai_vision.features.probe import probe

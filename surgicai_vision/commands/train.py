@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
@@ -26,6 +26,9 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
+
+if TYPE_CHECKING:
+    from surgicai_vision.dataset import Dataset
 
 app = App(
     name="train", help_epilogue="example:\n  surgicai-vision train --encoder random --view back"
@@ -123,11 +126,11 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     label = f"{options.subtask}-of-{task}" if options.subtask else task
     out = options.out or folders.train_folder(label, cell.name, cell.seed)
     folders.check_folder(out, "training.json")
-    dataset = folders.open_dataset(options.dataset, task, cell.view)
+    dataset: "Dataset" = folders.open_dataset(options.dataset, task, cell.view)
     if options.subtask:
-        from surgicai_vision.dataset.subtask_frames import subtask_of
+        from surgicai_vision.dataset.subset import of_subtask
 
-        dataset = subtask_of(dataset, options.subtask)
+        dataset = of_subtask(dataset, options.subtask)
     cell = replace(cell, task=dataset.task)
     with open_log(options.log, out) as log:
         train_cell(

@@ -9,7 +9,8 @@ of videos.
 """
 
 from surgicai_vision.dataset.convert import DatasetSummary, view_dataset
-from surgicai_vision.dataset.reader import Dataset, open_dataset
+from surgicai_vision.dataset.protocol import Dataset
+from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.render import render_demos
 from surgicai_vision.dataset.validate.check import CheckReport, check_dataset
 from surgicai_vision.dataset.validate.repair import Repair, repair_dataset
@@ -18,6 +19,7 @@ __all__ = [
     "CheckReport",
     "Dataset",
     "DatasetSummary",
+    "RenderedDataset",
     "Repair",
     "check_dataset",
     "open_dataset",

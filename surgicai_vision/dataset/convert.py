@@ -30,7 +30,7 @@ from surgicai_vision.dataset.metadata import (
     row_statistics,
     write_metadata,
 )
-from surgicai_vision.dataset.reader import Dataset, open_dataset
+from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.validate.lerobot_files import LeRobotFiles
 from surgicai_vision.dataset.video import CODECS, PIXELS
 from surgicai_vision.dataset.video_jobs import Encoded, Place, encode_views
@@ -131,7 +131,7 @@ def finished(out: Path, request: Mapping[str, Any], started: float) -> DatasetSu
 
 
 def write_view(
-    dataset: Dataset,
+    dataset: RenderedDataset,
     out: Path,
     views: Sequence[str],
     video: str | None,
@@ -184,7 +184,7 @@ def write_view(
 
 
 def _features(
-    files: LeRobotFiles, dataset: Dataset, keys: Sequence[str], video: str | None
+    files: LeRobotFiles, dataset: RenderedDataset, keys: Sequence[str], video: str | None
 ) -> dict[str, Any]:
     """Return the new dataset's features."""
     features = {key: files.features[key] for key in keys}
@@ -245,7 +245,7 @@ def _copy_videos(files: LeRobotFiles, folder: Path, keys: Sequence[str]) -> list
 
 
 def _look(
-    dataset: Dataset,
+    dataset: RenderedDataset,
     keys: Sequence[str],
     rows: Sequence[EpisodeRow],
     encoded: Sequence[Mapping[str, Encoded]],

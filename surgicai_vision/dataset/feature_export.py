@@ -20,13 +20,13 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.files import write_json
 from surgicai_vision.dataset import schema
-from surgicai_vision.dataset.reader import Dataset
+from surgicai_vision.dataset.reader import RenderedDataset
 from surgicai_vision.dataset.stats import column_statistics
 from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, assemble
 
 
 def export_features(
-    dataset: Dataset, rows: Sequence[np.ndarray], about: Mapping[str, Any], out: Path
+    dataset: RenderedDataset, rows: Sequence[np.ndarray], about: Mapping[str, Any], out: Path
 ) -> None:
     """Write `out`: the columns of `dataset` and its features, no images.
 

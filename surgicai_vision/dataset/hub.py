@@ -27,7 +27,7 @@ from surgicai_vision.core.files import check_output
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.metadata import CODEBASE_VERSION
-from surgicai_vision.dataset.reader import Dataset, open_dataset
+from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.validate.check import CheckReport, check_dataset
 
 CARD = "README.md"
@@ -39,7 +39,7 @@ KEPT = ("meta", "data", "videos")
 """Folders of a LeRobot v3 dataset; nothing else of a folder is pushed or pulled."""
 
 
-def dataset_card(dataset: Dataset, repo: str, licence: str = LICENCE) -> str:
+def dataset_card(dataset: RenderedDataset, repo: str, licence: str = LICENCE) -> str:
     """Return the card of a dataset, Markdown with the Hub's header."""
     meta = dataset.meta
     images = [

@@ -11,10 +11,9 @@ row group (one episode) of one column in memory.
 
 import functools
 import hashlib
-import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pyarrow as pa
@@ -26,21 +25,23 @@ from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
 from surgicai_vision.dataset import codecs, schema
+from surgicai_vision.dataset.protocol import episode_bounds
 from surgicai_vision.dataset.video import read_frames
 
 VIDEO_PLACE = ("chunk_index", "file_index", "from_timestamp")
 
 
-def open_dataset(path: Path) -> "Dataset":
+def open_dataset(path: Path) -> "RenderedDataset":
     """Open the dataset in folder `path`.
 
     Raises:
         BadFile: no dataset of ours, or one whose files are damaged or do not fit each other.
     """
-    return Dataset(path)
+    return RenderedDataset(path)
 
 
-class Dataset:
+@final
+class RenderedDataset:
     """A rendered dataset.
 
     Attributes:
@@ -127,8 +128,7 @@ class Dataset:
 
     def bounds(self) -> list[tuple[int, int]]:
         """Return (first frame, frame after the last) of every episode."""
-        starts = [0, *(np.flatnonzero(np.diff(self.episode_index)) + 1).tolist(), self.length]
-        return list(itertools.pairwise(starts)) if self.length else []
+        return episode_bounds(self.episode_index)
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return every column that is no image, (N,) or (N, n): those of `layout.COLUMNS` and

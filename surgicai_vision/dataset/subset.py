@@ -1,61 +1,183 @@
-"""Choosing: some frames of a dataset, as training and encoding read them; what `thinning` and
-`subtask` share.
+"""Subsets of a dataset: its first episodes, every n-th frame, or the frames of one subtask.
+
+    subset = first_episodes(open_dataset(Path("outputs/datasets/grasp")), 10)
+    subset = with_frame_stride(subset, 4)
+    subset = of_subtask(open_dataset(Path("outputs/datasets/suture")), "insert")
+    features = features.part(subset.rows, subset.fingerprint)       # of the whole's features
+
+Of two sets of first episodes the smaller lies within the larger, so a learning curve adds episodes.
+
+A frame stride is worth its name because neighbouring frames of 50 a second say nearly the same,
+while every episode brings a needle that lies elsewhere: for the same time of encoding and training,
+few frames of many episodes teach more than all frames of few (docs/results/best.md).
+
+A low-level policy is better trained on a subtask's frames of whole procedures than on
+demonstrations of the subtask alone, which end at the first success: in a whole procedure the
+subtask goes on until it is finished (`config.DWELL`), and it begins where the one before ended.
 """
 
 import functools
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import final
 
 import numpy as np
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, digest
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.dataset.protocol import Dataset, episode_bounds
 
 
-class ChosenFrames:
-    """Some frames of a dataset.
+def first_episodes(dataset: Dataset, count: int) -> "DatasetSubset":
+    """Return the first `count` episodes of a dataset.
+
+    Raises:
+        InputError: fewer than one, or more than there are.
+    """
+    bounds = dataset.bounds()
+    if not 1 <= count <= len(bounds):
+        raise InputError(f"{count} demonstrations were asked; {dataset.path} holds {len(bounds)}.")
+    return DatasetSubset(dataset, np.arange(bounds[count - 1][1]), {"episodes": count})
+
+
+def with_frame_stride(dataset: Dataset, frame_stride: int) -> Dataset:
+    """Return the frames of the control steps 0, `frame_stride`, 2 · `frame_stride` … of an episode.
+
+    Columns keep their values: `frame_index` still counts the frames of the whole.
+
+    Args:
+        dataset: any dataset; it is returned itself where it holds no other frames.
+        frame_stride: control steps from frame to frame, at least 1.
+
+    Raises:
+        InputError: the dataset was rendered with fewer frames.
+    """
+    if frame_stride < 1:
+        raise InputError(f"frame_stride is {frame_stride}; it must be at least 1.")
+    held = names.FPS // dataset.fps
+    if frame_stride % held:
+        raise InputError(
+            f"The recipe takes a frame every {frame_stride} steps; the dataset holds one every "
+            f"{held} ('render-demos --frame-stride {held}'). Give a recipe with frame_stride: "
+            f"{held}, or render all frames."
+        )
+    stride = frame_stride // held
+    if stride == 1:
+        return dataset
+    index = dataset.episode_index
+    position = np.arange(len(index)) - np.searchsorted(index, index, side="left")
+    rows = np.flatnonzero(position % stride == 0)
+    return DatasetSubset(dataset, rows, {"frame_stride": stride}, fps=dataset.fps // stride)
+
+
+def of_subtask(dataset: Dataset, subtask: str) -> "DatasetSubset":
+    """Return a subtask's frames of a dataset of whole procedures, as a dataset of that subtask.
+
+    The subtask is the task of its configuration, with the subtask's step limit; `frame_index` and
+    `timestamp` count from the subtask's beginning.
+
+    Raises:
+        UnknownName: no subtask of that name.
+        InputError: a dataset of a single subtask, or one in which this one does not occur.
+    """
+    check_name("subtask", subtask, names.SUBTASKS)
+    if dataset.task != names.SUTURE:
+        raise InputError(
+            f"The dataset shows '{dataset.task}'; a subtask's frames are taken from "
+            f"'{names.SUTURE}'."
+        )
+    phase = dataset.columns()[names.PHASE]
+    rows = np.flatnonzero(phase == names.SUBTASKS.index(subtask))
+    if not len(rows):
+        raise InputError(f"The dataset holds no frame of '{subtask}'.")
+    limit = TaskConfig(subtask).max_steps
+    config = replace(dataset.config, task=subtask, max_steps=limit)
+    return DatasetSubset(dataset, rows, {"subtask": subtask}, config=config, restart_time=True)
+
+
+@final
+class DatasetSubset:
+    """Some frames of a dataset; a `Dataset` itself.
 
     Attributes:
-        config, task, views, image_size: as the whole's.
-        fps: frames a second, as the whole's.
         rows: which frames of the whole it holds, (N,) int64, rising.
+        path, views, sights, image_size: those of the whole.
+        config: configuration of the task.
+        task: name of the task.
+        fps: frames per second of simulated time.
         length: N.
     """
 
-    def __init__(self, whole: Any, rows: np.ndarray, chosen: dict[str, Any]):
-        """Choose `rows` of `whole`; `chosen` says in plain data which they are."""
-        self._whole, self._chosen, self.rows = whole, chosen, rows
-        self.config: TaskConfig = whole.config
-        self.task: str = whole.task
-        self.fps: int = getattr(whole, "fps", names.FPS)
-        self.views, self.image_size, self.length = whole.views, whole.image_size, len(rows)
+    def __init__(
+        self,
+        whole: Dataset,
+        rows: np.ndarray,
+        selection: Mapping[str, str | int],
+        *,
+        config: TaskConfig | None = None,
+        fps: int | None = None,
+        restart_time: bool = False,
+    ):
+        """Select `rows` of `whole`.
+
+        Args:
+            whole: the dataset to select from.
+            rows: (N,) int64, rising.
+            selection: says in plain data which frames they are; part of the fingerprint.
+            config: configuration of the task; the whole's by default.
+            fps: frames per second; the whole's by default.
+            restart_time: let `frame_index` and `timestamp` begin anew in every episode.
+        """
+        self._whole = whole
+        self._selection = dict(selection)
+        self._restart_time = restart_time
+        self.rows = rows
+        self.path: Path = whole.path
+        self.config = config or whole.config
+        self.task = self.config.task if config else whole.task
+        self.views = whole.views
+        self.sights = whole.sights
+        self.image_size = whole.image_size
+        self.fps = fps or whole.fps
+        self.length = len(rows)
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """sha256 (hex) over the whole's fingerprint and which frames were chosen."""
-        return digest({"dataset": self._whole.fingerprint, **self._chosen})
+        """Hash (hex) of the whole's fingerprint and the selection."""
+        return digest({"dataset": self._whole.fingerprint, **self._selection})
 
-    @property
+    @functools.cached_property
     def episode_index(self) -> np.ndarray:
         """Episode of every frame, (N,) int64."""
         return np.asarray(self._whole.episode_index)[self.rows]
 
-    def columns(self) -> dict[str, np.ndarray]:
-        """Return every column that is no image, as `Dataset.columns`."""
-        return {key: values[self.rows] for key, values in self._whole.columns().items()}
+    def bounds(self) -> list[tuple[int, int]]:
+        """Return (first frame, frame after the last) of every episode."""
+        return episode_bounds(self.episode_index)
 
-    def frames(self, view: str, start: int = 0, stop: int | None = None) -> Any:
-        """Return the RGB images of a view, (stop - start, H, W, 3) uint8."""
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return every column that is no image, (N,) or (N, n), by its key."""
+        columns = {key: values[self.rows] for key, values in self._whole.columns().items()}
+        if self._restart_time:
+            first = np.searchsorted(self.episode_index, self.episode_index, side="left")
+            for key in ("frame_index", "timestamp"):
+                columns[key] = columns[key] - columns[key][first]
+        return columns
+
+    def frames(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Return the images of one of the `sights`, (stop - start, H, W, 3) uint8 RGB."""
         stop = self.length if stop is None else stop
         if not 0 <= start <= stop <= self.length:
-            said = ", ".join(f"{key} {value}" for key, value in self._chosen.items())
+            selection = ", ".join(f"{key} {value}" for key, value in self._selection.items())
             raise InputError(
-                f"frames {start} to {stop} were asked; this part ({said}) has 0 to {self.length}."
+                f"frames {start} to {stop} were asked; this subset ({selection}) has 0 to "
+                f"{self.length}."
             )
         rows = self.rows[start:stop]
-        runs = np.split(
-            rows, np.flatnonzero(np.diff(rows) != 1) + 1
-        )  # what lies together is read at once, in order
+        # Neighbouring frames are read at once, in order.
+        runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
         parts = [
             self._whole.frames(view, int(run[0]), int(run[-1]) + 1) for run in runs if len(run)
         ]

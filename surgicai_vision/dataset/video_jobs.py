@@ -19,7 +19,7 @@ from surgicai_vision.core.files import read_json, write_json
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.metadata import video_path
-from surgicai_vision.dataset.reader import Dataset, open_dataset
+from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.video import VideoWriter, read_frames
 
 BLOCK_FRAMES = 2000
@@ -46,7 +46,7 @@ class Encoded:
 
 
 def encode_views(
-    dataset: Dataset,
+    dataset: RenderedDataset,
     folder: Path,
     views: Sequence[str],
     video: str,
@@ -111,7 +111,7 @@ def _blocks(bounds: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 @functools.lru_cache(maxsize=1)
-def _dataset(folder: str) -> Dataset:
+def _dataset(folder: str) -> RenderedDataset:
     return open_dataset(Path(folder))
 
 

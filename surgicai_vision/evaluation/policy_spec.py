@@ -6,7 +6,7 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
@@ -18,6 +18,9 @@ from surgicai_vision.evaluation.agents import (
     ReplayAgent,
     mean_demonstration,
 )
+
+if TYPE_CHECKING:
+    from surgicai_vision.dataset.protocol import Dataset
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ def baseline_subject(name: str, config: TaskConfig) -> Subject:
     return Subject(name, config, functools.partial(baseline, name))
 
 
-def replay_subject(dataset: Any) -> Subject:
+def replay_subject(dataset: "Dataset") -> Subject:
     """Return the subject that replays the mean demonstration of an opened dataset, blind.
 
     Raises:

@@ -4,10 +4,11 @@ grid.
 Every step leaves a whole folder and skips the one that is there, so running again continues.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import read_changes
@@ -16,6 +17,9 @@ from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.policy_spec import policy_name
 from surgicai_vision.features.cache import Features, encode
 from surgicai_vision.features.encoders import load_encoder
+
+if TYPE_CHECKING:
+    from surgicai_vision.dataset.protocol import Dataset
 
 OWN = "own"
 """Stands for an encoder: a network of the policy's own, trained with it on the images."""
@@ -101,7 +105,7 @@ class Cell:
 
 def train_cell(
     cell: Cell,
-    dataset: Any,
+    dataset: "Dataset",
     out: Path,
     stage: Stage,
     weights: str | None = None,
@@ -127,24 +131,28 @@ def train_cell(
         save_every: also keep a checkpoint every so many epochs.
         log: called with (epoch, losses by name).
     """
-    from surgicai_vision.dataset.first_episodes import first_episodes
-    from surgicai_vision.dataset.stride import thinned
-    from surgicai_vision.dataset.subtask_frames import subtask_of
+    from surgicai_vision.dataset.subset import (
+        DatasetSubset,
+        first_episodes,
+        of_subtask,
+        with_frame_stride,
+    )
     from surgicai_vision.training import policies
     from surgicai_vision.training.train import train
 
     recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
-    dataset = thinned(dataset, recipe.frame_stride)
+    dataset = with_frame_stride(dataset, recipe.frame_stride)
     begin = policies.load_policy(start) if start else None
     features = _encode(cell, dataset, stage, weights, accept_licence)
-    parts: tuple[tuple[Any, Callable[..., Any]], ...] = (
-        (cell.demonstrations, first_episodes),
-        (subtask, subtask_of),
-    )
-    for which, take in parts:
-        if which is not None:
-            dataset = take(dataset, which)
-            features = [entry.part(dataset.rows, dataset.fingerprint) for entry in features]
+    subsets: list[Callable[[Dataset], DatasetSubset]] = []
+    if cell.demonstrations is not None:
+        subsets.append(functools.partial(first_episodes, count=cell.demonstrations))
+    if subtask is not None:
+        subsets.append(functools.partial(of_subtask, subtask=subtask))
+    for select in subsets:
+        subset = select(dataset)
+        dataset = subset
+        features = [entry.part(subset.rows, subset.fingerprint) for entry in features]
     with stage(f"policy: {cell.name}", "epochs") as progress:
         plugin = policies.policy_plugin(cell.policy)
         train(
@@ -155,22 +163,23 @@ def train_cell(
 
 def encode_cell(
     cell: Cell,
-    dataset: Any,
+    dataset: "Dataset",
     stage: Stage,
     weights: str | None = None,
     *,
     accept_licence: bool = False,
 ) -> list[Features]:
     """Encode the cell's views, all frames that its recipe takes, or find them in the cache."""
-    from surgicai_vision.dataset.stride import thinned
+    from surgicai_vision.dataset.subset import with_frame_stride
     from surgicai_vision.training import policies
 
     recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
-    return _encode(cell, thinned(dataset, recipe.frame_stride), stage, weights, accept_licence)
+    dataset = with_frame_stride(dataset, recipe.frame_stride)
+    return _encode(cell, dataset, stage, weights, accept_licence)
 
 
 def _encode(
-    cell: Cell, dataset: Any, stage: Stage, weights: str | None, accept_licence: bool
+    cell: Cell, dataset: "Dataset", stage: Stage, weights: str | None, accept_licence: bool
 ) -> list[Features]:
     """Encode the cell's views, all frames of `dataset`."""
     if not cell.encoder:

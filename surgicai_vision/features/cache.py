@@ -25,7 +25,7 @@ from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from filelock import Timeout
@@ -35,6 +35,9 @@ from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, UnknownName
 from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, locked, read_json, write_json
 
+if TYPE_CHECKING:
+    from surgicai_vision.dataset.protocol import Dataset
+
 FORMAT = 1
 CHUNK = 256  # frames per progress step: 38 MB of images at 224 × 224
 MANIFEST, PROGRESS, ROWS = "manifest.json", "progress.json", "features.npy"
@@ -42,17 +45,6 @@ LOCK = "lock"
 
 Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
-
-
-class FrameSource(Protocol):
-    """The part of a dataset that encoding reads."""
-
-    views: tuple[str, ...]
-    fingerprint: str
-    length: int
-
-    def frames(self, view: str, start: int, stop: int) -> np.ndarray:
-        """Return frames start..stop of a view, (n, H, W, 3) uint8 RGB."""
 
 
 class FrameEncoder(Protocol):
@@ -100,11 +92,16 @@ class Features:
         """Length of one row."""
         return self.rows.shape[1]
 
-    def part(self, rows: Any, dataset: str) -> "Features":
-        """Return some rows, a slice or (n,) indices, as the features of that part, whose
-        fingerprint is `dataset`.
+    def part(self, rows: np.ndarray, dataset: str) -> "Features":
+        """Return the features of a subset of the dataset.
+
+        Args:
+            rows: (n,) rising indices of the subset's frames in the whole.
+            dataset: fingerprint of the subset.
         """
-        taken = self.rows[rows]
+        contiguous = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
+        # A slice stays on the disk; indices are copied into memory.
+        taken = self.rows[int(rows[0]) : int(rows[-1]) + 1] if contiguous else self.rows[rows]
         return replace(
             self, manifest={**self.manifest, "length": len(taken), "dataset": dataset}, rows=taken
         )
@@ -113,7 +110,7 @@ class Features:
 default_cache_root = cache_root
 
 
-def entry_key(dataset: FrameSource, view: str, encoder: FrameEncoder) -> str:
+def entry_key(dataset: "Dataset", view: str, encoder: FrameEncoder) -> str:
     """Return the address of an entry: a hash of everything its rows depend on."""
     return digest(
         {
@@ -127,7 +124,7 @@ def entry_key(dataset: FrameSource, view: str, encoder: FrameEncoder) -> str:
 
 
 def encode(
-    dataset: FrameSource,
+    dataset: "Dataset",
     view: str,
     encoder: FrameEncoder,
     cache_root: Path | None = None,
@@ -147,9 +144,8 @@ def encode(
         InputError: a cache folder that cannot be written.
         SurgicaiError: a feature that is not finite.
     """
-    sights = getattr(dataset, "sights", dataset.views)
-    if view not in sights:
-        raise UnknownName("view of this dataset", view, sights)
+    if view not in dataset.sights:
+        raise UnknownName("view of this dataset", view, dataset.sights)
     if not dataset.length:
         raise InputError("The dataset holds no frames; record and render some first.")
     folder = (cache_root or default_cache_root()) / "features" / entry_key(dataset, view, encoder)
@@ -187,7 +183,7 @@ def open_entry(folder: Path, length: int | None = None, encoded: int = 0) -> Fea
     return Features(folder, manifest, rows, encoded)
 
 
-def _manifest(dataset: FrameSource, view: str, encoder: FrameEncoder) -> dict[str, Any]:
+def _manifest(dataset: "Dataset", view: str, encoder: FrameEncoder) -> dict[str, Any]:
     """Describe the entry."""
     return {
         "format": FORMAT,
@@ -207,7 +203,7 @@ def _manifest(dataset: FrameSource, view: str, encoder: FrameEncoder) -> dict[st
 
 
 def _fill(
-    folder: Path, dataset: FrameSource, view: str, encoder: FrameEncoder, progress: Progress | None
+    folder: Path, dataset: "Dataset", view: str, encoder: FrameEncoder, progress: Progress | None
 ) -> int:
     """Encode what is missing; return how many frames that was."""
     rows, start = _allocated(folder, (dataset.length, encoder.dim))
@@ -244,7 +240,7 @@ def _allocated(folder: Path, shape: tuple[int, int]) -> tuple[np.memmap, int]:
     return np.lib.format.open_memmap(path, mode="w+", dtype=np.float16, shape=shape), 0
 
 
-def _chunks(dataset: FrameSource, view: str, start: int) -> Iterator[tuple[int, np.ndarray]]:
+def _chunks(dataset: "Dataset", view: str, start: int) -> Iterator[tuple[int, np.ndarray]]:
     """Yield (stop, frames) chunk by chunk; the next chunk is decoded while this one is encoded."""
     starts = range(start, dataset.length, CHUNK)
     if not starts:

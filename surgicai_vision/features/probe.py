@@ -15,13 +15,14 @@ on: what needs no seeing.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
 from surgicai_vision.scene.needle import TIP_ANGLE, point
 from surgicai_vision.scene.rotations import quaternion_to_matrix
@@ -37,17 +38,6 @@ RESAMPLES = 10_000
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 """Called with (folds done, folds in all)."""
-
-
-class ProbedData(Protocol):
-    """The part of a dataset that probing reads."""
-
-    fingerprint: str
-    length: int
-    episode_index: np.ndarray
-
-    def columns(self) -> dict[str, np.ndarray]:
-        """Return the columns by key; (N, 7) `names.NEEDLE_POSE` among them."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +84,7 @@ class Probe:
 
 
 def probe(
-    dataset: ProbedData,
+    dataset: Dataset,
     features: Sequence[Features],
     *,
     seed: int = 0,
@@ -162,7 +152,7 @@ def spread(episode_index: np.ndarray, frames: int) -> NDArray[np.int64]:
     return np.concatenate(chosen)
 
 
-def _pose(dataset: ProbedData) -> Array:
+def _pose(dataset: Dataset) -> Array:
     """Return the needle's pose, (N, 7); refuse a dataset that cannot be probed."""
     columns = dataset.columns()
     if names.NEEDLE_POSE not in columns:

@@ -4,26 +4,13 @@ the inputs.
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig, clock
-
-
-class TrainingData(Protocol):
-    """The part of a dataset that training reads."""
-
-    config: TaskConfig
-    image_size: int
-    length: int
-    fingerprint: str
-    episode_index: np.ndarray
-
-    def columns(self) -> dict[str, np.ndarray]:
-        """Return what policies are fed and learn, by key: (N, 7) state and action, (N,) phase, …"""
+from surgicai_vision.core.config import clock
 
 
 def with_clock(columns: dict[str, np.ndarray], vector: str | None) -> dict[str, np.ndarray]:

@@ -39,6 +39,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, UnknownName
 from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
+from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
 from surgicai_vision.training.checkpoint import (
     CARD,
@@ -47,7 +48,7 @@ from surgicai_vision.training.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
-from surgicai_vision.training.data import TrainingData, cuts, over_places, split, with_clock
+from surgicai_vision.training.data import cuts, over_places, split, with_clock
 
 REQUEST, STATE = "training.json", "training_state.pt"
 STATE_EVERY = 5  # epochs between training states: a broken-off training loses at most these
@@ -62,7 +63,7 @@ Log = Callable[[int, dict[str, float]], None]
 
 
 def train(
-    dataset: TrainingData,
+    dataset: Dataset,
     features: Sequence[Features],
     policy: Any,
     recipe: Any,
@@ -148,7 +149,7 @@ def _one_thread() -> Iterator[None]:
 class _Task:
     """What is to be trained."""
 
-    dataset: TrainingData
+    dataset: Dataset
     features: tuple[Features, ...]
     policy: Any
     recipe: Any

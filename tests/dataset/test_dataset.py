@@ -25,7 +25,7 @@ from surgicai_vision.dataset import (
 )
 from surgicai_vision.dataset import render as render_module
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
-from surgicai_vision.dataset.stride import thinned
+from surgicai_vision.dataset.subset import with_frame_stride
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.store import list_demos, read_demo
 from surgicai_vision.evaluation.policy_spec import replay_subject
@@ -115,12 +115,13 @@ def test_every_fifth_frame_is_one_of_all(tmp_path, fake, demos, monkeypatch):
     assert check_dataset(tmp_path / "set").problems == ()
     lerobot = LeRobotDataset("local/set", root=tmp_path / "set")
     assert lerobot.fps == 10 and len(lerobot) == few.length
-    assert thinned(few, 5) is few
+    assert with_frame_stride(few, 5) is few
     np.testing.assert_array_equal(
-        thinned(few, 10).columns()[names.SEED], thinned(whole, 10).columns()[names.SEED]
+        with_frame_stride(few, 10).columns()[names.SEED],
+        with_frame_stride(whole, 10).columns()[names.SEED],
     )
     with pytest.raises(InputError, match="the dataset holds one every 5"):
-        thinned(few, 1)
+        with_frame_stride(few, 1)
     with pytest.raises(InputError, match=r"frame_stride is 4; .* 1, 2, 5, 10, 25, 50"):
         render(demos, tmp_path / "none", frame_stride=4)
     with pytest.raises(InputError, match="a replay needs each step's"):

@@ -22,8 +22,7 @@ from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.core.executor import JOBS
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.codecs import DEPTH_FAR, DEPTH_NEAR, grey
-from surgicai_vision.dataset.first_episodes import first_episodes
-from surgicai_vision.dataset.stride import thinned
+from surgicai_vision.dataset.subset import first_episodes, with_frame_stride
 from surgicai_vision.experiments.run import Cell
 from surgicai_vision.experiments.sweep import Grid, estimate, plan, read_choice, run_sweep
 from surgicai_vision.experiments.sweep.grid import chain_parts
@@ -160,7 +159,7 @@ def test_smaller_sets_of_demonstrations_lie_within_larger(quiet):
 def test_thinned_frames_are_those_of_the_whole(quiet):
     out, _ = quiet
     dataset = open_dataset(out / "data/grasp/dataset")
-    part = thinned(dataset, 7)
+    part = with_frame_stride(dataset, 7)
     rows = np.concatenate([np.arange(first, stop, 7) for first, stop in dataset.bounds()])
     np.testing.assert_array_equal(part.rows, rows)
     for key, values in dataset.columns().items():
@@ -172,11 +171,11 @@ def test_thinned_frames_are_those_of_the_whole(quiet):
     assert [stop - first for first, stop in part.bounds()] == np.bincount(
         part.episode_index
     ).tolist()
-    assert part.fingerprint not in (dataset.fingerprint, thinned(dataset, 6).fingerprint)
-    assert thinned(dataset, 1) is dataset
+    assert part.fingerprint not in (dataset.fingerprint, with_frame_stride(dataset, 6).fingerprint)
+    assert with_frame_stride(dataset, 1) is dataset
     assert first_episodes(part, 1).length == part.bounds()[0][1]
     with pytest.raises(InputError, match="frame_stride is 0"):
-        thinned(dataset, 0)
+        with_frame_stride(dataset, 0)
 
 
 def test_a_failing_cell_is_recorded_the_rest_goes_on_and_it_is_tried_again(tmp_path):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_dataset import FakeData
 
 from encoders.random_resnet import CARD
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, UnknownName
@@ -13,7 +14,7 @@ from surgicai_vision.features.cache import encode, list_cache, prune_cache
 
 
 @dataclass
-class FakeDataset:
+class FakeDataset(FakeData):
     """Tiny frames whose mean is their index."""
 
     length: int = 23

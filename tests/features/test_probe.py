@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_dataset import FakeData
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.main import main
@@ -31,7 +32,7 @@ def poses(episodes: int, frames: int, seed: int = 0) -> np.ndarray:
 
 
 @dataclass
-class Dataset:
+class Dataset(FakeData):
     """Episodes of a needle's poses, shown in one-pixel images."""
 
     pose: np.ndarray = field(default_factory=lambda: poses(20, 6))

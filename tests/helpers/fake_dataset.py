@@ -7,13 +7,30 @@ import numpy as np
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.dataset.protocol import episode_bounds
 from surgicai_vision.features.cache import Features
 
 DIM = 12
 
 
+class FakeData:
+    """What the stand-ins for a dataset share; each adds what its test reads."""
+
+    fps = names.FPS
+    path = Path("fake")
+    views: tuple[str, ...]
+    episode_index: np.ndarray
+
+    @property
+    def sights(self) -> tuple[str, ...]:
+        return self.views
+
+    def bounds(self) -> list[tuple[int, int]]:
+        return episode_bounds(self.episode_index)
+
+
 @dataclass
-class FakeDataset:
+class FakeDataset(FakeData):
     """A dataset in memory: the action is a smooth function of the state, plus one of the
     features.
     """

@@ -9,6 +9,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from fake_dataset import FakeData
 
 from encoders.base import POOLS
 from policies import hlp
@@ -17,8 +18,7 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, UnknownName, check_name
-from surgicai_vision.dataset.stride import thinned
-from surgicai_vision.dataset.subtask_frames import subtask_of
+from surgicai_vision.dataset.subset import of_subtask, with_frame_stride
 from surgicai_vision.envs import suture
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies, train
@@ -26,7 +26,7 @@ from surgicai_vision.training.checkpoint import read_checkpoint
 
 
 @dataclass
-class Dataset:
+class Dataset(FakeData):
     """Four episodes of noise with every column a policy may be fed."""
 
     task: str = "suture"
@@ -194,7 +194,7 @@ def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     whole = Dataset()
-    part = subtask_of(whole, "insert")  # type: ignore[arg-type]  # the stand-in has what is read
+    part = of_subtask(whole, "insert")
     rows = np.flatnonzero(whole.columns()[names.PHASE] == 2)
     assert part.length == len(rows) == 8 and part.episode_index.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
     assert (
@@ -208,16 +208,16 @@ def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(
         np.testing.assert_array_equal(part.frames("back", start, stop), frames[start:stop])
     with pytest.raises(InputError, match="has 0 to 8"):
         part.frames("back", 0, 9)
-    assert thinned(part, 2).length == 4
+    assert with_frame_stride(part, 2).length == 4
     whole.fps = 25  # rendered with every other frame: a part of it is not thinned once more
-    sparse = subtask_of(whole, "insert")  # type: ignore[arg-type]
+    sparse = of_subtask(whole, "insert")
     assert (
-        thinned(sparse, 2) is sparse
-        and thinned(sparse, 4).length == 4
-        and thinned(sparse, 4).fps == 12
+        with_frame_stride(sparse, 2) is sparse
+        and with_frame_stride(sparse, 4).length == 4
+        and with_frame_stride(sparse, 4).fps == 12
     )
     with pytest.raises(InputError, match="shows 'grasp'"):
-        subtask_of(Dataset(task="grasp"), "insert")  # type: ignore[arg-type]
+        of_subtask(Dataset(task="grasp"), "insert")
     arguments = (
         "train",
         "--subtask",

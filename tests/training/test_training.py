@@ -15,7 +15,7 @@ from policies.bc import BC, BCPolicy
 from policies.layers import MapConvolutions, SpatialSoftmax
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
-from surgicai_vision.dataset.stride import thinned
+from surgicai_vision.dataset.subset import with_frame_stride
 from surgicai_vision.training.checkpoint import (
     CARD,
     WEIGHTS,
@@ -258,7 +258,7 @@ def test_thinned_labels_of_a_policy_that_looks_ahead_stay_at_their_time(tmp_path
     dataset._columns = {names.STATE: number, names.ACTION: number / 100}
     plugin = replace(BC, make=lambda recipe, visual: Watched(recipe, visual), ahead=10)
     recipe = replace(QUICK, frame_stride=2, validation=0.0, epochs=1)
-    train(thinned(dataset, 2), [], plugin, recipe, out=tmp_path / "a")
+    train(with_frame_stride(dataset, 2), [], plugin, recipe, out=tmp_path / "a")
     state, target = torch.cat(seen).T
     torch.testing.assert_close(target * 100, state.round().add(10).clamp(max=38), atol=1e-3, rtol=0)
 

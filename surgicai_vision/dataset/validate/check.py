@@ -28,7 +28,7 @@ from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import read_json, sha256_file
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import schema
-from surgicai_vision.dataset.reader import Dataset, open_dataset
+from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.stats import column_statistics
 from surgicai_vision.dataset.validate.lerobot_files import INFO, LeRobotFiles
 from surgicai_vision.dataset.validate.rules import ImageWatch, episode_problems, number_problems
@@ -139,7 +139,9 @@ def _check_foreign(files: LeRobotFiles, progress: Progress) -> CheckReport:
     )
 
 
-def _check_order(dataset: Dataset, columns: Mapping[str, np.ndarray], problems: list[str]) -> None:
+def _check_order(
+    dataset: RenderedDataset, columns: Mapping[str, np.ndarray], problems: list[str]
+) -> None:
     """Check the index columns and the ends of the episodes."""
     if not np.array_equal(columns["index"], np.arange(dataset.length)):
         problems.append("index: not 0, 1, 2, … over the dataset.")
@@ -159,7 +161,10 @@ def _check_order(dataset: Dataset, columns: Mapping[str, np.ndarray], problems: 
 
 
 def _check_lerobot(
-    dataset: Dataset, columns: Mapping[str, np.ndarray], keys: list[str], problems: list[str]
+    dataset: RenderedDataset,
+    columns: Mapping[str, np.ndarray],
+    keys: list[str],
+    problems: list[str],
 ) -> None:
     """Check LeRobot's own metadata against the data."""
     try:
@@ -207,7 +212,7 @@ def _check_statistics(key: str, recorded: Any, values: np.ndarray, problems: lis
 
 
 def _check_episode(
-    dataset: Dataset,
+    dataset: RenderedDataset,
     keys: list[str],
     start: int,
     stop: int,
@@ -229,7 +234,7 @@ def _check_episode(
 
 
 def _frames(
-    dataset: Dataset, key: str, start: int, stop: int, problems: list[str]
+    dataset: RenderedDataset, key: str, start: int, stop: int, problems: list[str]
 ) -> Iterator[np.ndarray]:
     """Yield an episode's images of one column; those before the first that cannot be decoded."""
     try:

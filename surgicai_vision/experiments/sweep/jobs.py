@@ -17,6 +17,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import Stage, silent_stage, timed
+from surgicai_vision.dataset import RenderedDataset, open_dataset
 from surgicai_vision.evaluation.policy_spec import (
     Subject,
     baseline_subject,
@@ -154,7 +155,7 @@ def run_probe(
 def _subject(
     cell: Cell,
     policies: Mapping[str, str],
-    dataset: Any,
+    dataset: RenderedDataset,
     policy: Path,
     stage: Stage,
     accept_licence: bool,
@@ -199,8 +200,6 @@ def _cell(table: Table) -> Cell:
 
 
 @functools.lru_cache(maxsize=1)
-def _dataset(folder: str) -> Any:
+def _dataset(folder: str) -> RenderedDataset:
     """Open a dataset, or take the one this process read last: its fingerprint is computed once."""
-    from surgicai_vision.dataset import open_dataset
-
     return open_dataset(Path(folder))

@@ -7,13 +7,16 @@ Its checkpoint is evaluated as `surgicai-vision evaluate` does. LeRobot is not i
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.processes import OFFLINE, run_module
 from surgicai_vision.experiments.run import OWN, Cell
 from surgicai_vision.features import encoders
+
+if TYPE_CHECKING:
+    from surgicai_vision.dataset import Dataset, RenderedDataset
 
 LEROBOT_POLICIES = ("act", "diffusion")
 OPTIONS = {
@@ -31,7 +34,13 @@ VARIABLES = {**OFFLINE, "HF_DATASETS_DISABLE_PROGRESS_BARS": "1", "WANDB_MODE": 
 
 
 def train_lerobot(
-    cell: Cell, dataset: Any, out: Path, *, steps: int, batch: int, accept_licence: bool
+    cell: Cell,
+    dataset: "RenderedDataset",
+    out: Path,
+    *,
+    steps: int,
+    batch: int,
+    accept_licence: bool,
 ) -> None:
     """Train a policy of LeRobot into `out`, as `lerobot-train` writes it.
 
@@ -62,7 +71,7 @@ def train_lerobot(
         raise SurgicaiError(f"lerobot-train failed for {cell.name}:\n{done.stderr[-2000:]}")
 
 
-def _export(cell: Cell, dataset: Any, root: Path, accept_licence: bool) -> None:
+def _export(cell: Cell, dataset: "RenderedDataset", root: Path, accept_licence: bool) -> None:
     """Write a dataset with the cell's features in place of images."""
     from surgicai_vision.dataset.feature_export import export_features
     from surgicai_vision.features.cache import encode
@@ -79,7 +88,7 @@ def _export(cell: Cell, dataset: Any, root: Path, accept_licence: bool) -> None:
     export_features(dataset, rows, about, root)
 
 
-def _arguments(cell: Cell, dataset: Any, root: Path, out: Path) -> list[str]:
+def _arguments(cell: Cell, dataset: "Dataset", root: Path, out: Path) -> list[str]:
     """Return the options of `lerobot-train` that say what is trained on what."""
     arguments = [
         f"--dataset.repo_id=local/{cell.task}",

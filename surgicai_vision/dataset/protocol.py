@@ -1,0 +1,73 @@
+"""What every dataset offers to encoding, probing, training and evaluation.
+
+A `reader.RenderedDataset` and a `subset.DatasetSubset` are datasets in this sense; whatever reads
+one names this protocol in its signature.
+"""
+
+import itertools
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from surgicai_vision.core.config import TaskConfig
+
+
+class Dataset(Protocol):
+    """Frames of episodes of one task, numbered 0 … `length` - 1 over all episodes."""
+
+    @property
+    def path(self) -> Path:
+        """Folder of the rendered dataset; a subset has that of its whole."""
+
+    @property
+    def task(self) -> str:
+        """Name of the task, one of `names.TASKS`."""
+
+    @property
+    def config(self) -> TaskConfig:
+        """Configuration of the task."""
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Cameras, in the order of the dataset's columns."""
+
+    @property
+    def sights(self) -> tuple[str, ...]:
+        """What `frames` shows: the views, and their depth views where depth was rendered."""
+
+    @property
+    def image_size(self) -> int:
+        """Side of the square images [px]."""
+
+    @property
+    def fps(self) -> int:
+        """Frames per second of simulated time."""
+
+    @property
+    def length(self) -> int:
+        """Number of frames N."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash (hex) of everything the frames and columns depend on."""
+
+    @property
+    def episode_index(self) -> np.ndarray:
+        """Episode of every frame, (N,) int64, rising."""
+
+    def bounds(self) -> list[tuple[int, int]]:
+        """Return (first frame, frame after the last) of every episode."""
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return every column that is no image, (N,) or (N, n), by its key."""
+
+    def frames(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Return the images of one of the `sights`, (stop - start, H, W, 3) uint8 RGB."""
+
+
+def episode_bounds(episode_index: np.ndarray) -> list[tuple[int, int]]:
+    """Return (first frame, frame after the last) of every episode in `episode_index`, (N,)."""
+    count = len(episode_index)
+    starts = [0, *(np.flatnonzero(np.diff(episode_index)) + 1).tolist(), count]
+    return list(itertools.pairwise(starts)) if count else []
