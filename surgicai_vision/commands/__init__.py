@@ -22,7 +22,7 @@ known. It is imported when it runs or when its `--help` is asked for: what takes
     class Options:
         \"\"\"Options of `count`.
 
-Attributes:
+        Attributes:
             dataset: Folder of the dataset.
             view: Views to count.
         \"\"\"

@@ -1,0 +1,91 @@
+"""Documentation: what it names exists: verbs, options, files, modules."""
+
+import contextlib
+import functools
+import importlib.util
+import io
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from surgicai_vision.commands import COMMANDS
+from surgicai_vision.commands.main import main
+from surgicai_vision.core.plugins import (
+    CAMERAS_GROUP,
+    ENCODERS_GROUP,
+    ENGINES_GROUP,
+    POLICIES_GROUP,
+    TASKS_GROUP,
+)
+
+PROGRAM = "surgicai-vision"
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+COMMAND = re.compile(rf"^(?:\s{{4,}}|\| `|`){PROGRAM} ([a-z][^`|#\n]*)", re.MULTILINE)
+FILE = re.compile(
+    r"`((?:docs|benchmarks|configs|examples|data|encoders|policies|scripts|surgicai_vision|tests)/"
+    r"[\w./-]+)`"
+)
+GROUPS = {ENCODERS_GROUP, POLICIES_GROUP, TASKS_GROUP, CAMERAS_GROUP, ENGINES_GROUP}
+MODULE = re.compile(r"\b(surgicai_vision(?:\.[a-z_]+)+)\b")
+
+
+@functools.cache
+def help_of(verb: str) -> str:
+    """What `VERB --help` prints."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert main([*verb.split(), "--help"]) == 0
+    return printed.getvalue()
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The words of every command line of ours in a page, continued lines joined."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    return [shlex.split(found) for found in COMMAND.findall(text)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_in_docs_have_verbs_and_options_that_exist(page: Path) -> None:
+    for words in commands(page):
+        if words[0].startswith("-") or words[0].isupper():
+            continue
+        assert words[0] in COMMANDS, f"{page.name}: {PROGRAM} {shlex.join(words)}"
+        shown = help_of(words[0])
+        if len(words) > 1 and f"{words[0]} {words[1]}" in _grouped(words[0]):
+            shown = help_of(f"{words[0]} {words[1]}")
+        for word in words[1:]:
+            if word.startswith("--"):
+                name = word.split("=")[0]
+                assert re.search(rf"{re.escape(name)}\b", shown), (
+                    f"{page.name}: {PROGRAM} {shlex.join(words)}: {name}"
+                )
+
+
+def _grouped(verb: str) -> set[str]:
+    """The verbs inside a verb, as "dataset check"."""
+    folder = ROOT / "surgicai_vision" / "commands" / verb.replace("-", "_")
+    names = {path.stem for path in folder.glob("*.py")} - {"__init__"}
+    return {f"{verb} {name.replace('_', '-')}" for name in names}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_named_in_docs_exist(page: Path) -> None:
+    named = [name for name in FILE.findall(page.read_text()) if not name.endswith("-v0")]
+    assert not [name for name in named if not (ROOT / name).exists()]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_modules_named_in_docs_exist(page: Path) -> None:
+    for name in sorted(set(MODULE.findall(page.read_text())) - GROUPS):
+        module, _, attribute = name.rpartition(".")
+        if importlib.util.find_spec(module) is None:
+            pytest.fail(f"{page.name} names {name}")
+        if importlib.util.find_spec(name) is None:
+            assert hasattr(importlib.import_module(module), attribute), f"{page.name}: {name}"
