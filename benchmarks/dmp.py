@@ -1,12 +1,11 @@
-"""Count how often movement primitives learned from demonstrations succeed from new starts.
+"""Count how often movement primitives learned from demonstrations succeed from other starts.
 
-    python benchmarks/dmp.py                                             # taught by our expert,
-    every subtask python benchmarks/dmp.py --task insert --npz surgicai_insert_v2.npz  # taught by
-    SurgicAI's recordings
+    python benchmarks/dmp.py  # learned from our expert, every subtask
+    python benchmarks/dmp.py --task insert --npz surgicai_insert_v2.npz  # from SurgicAI's
 
 Every start counts, none is drawn again. Prints one JSON object: per task the successes, the starts,
 the share with its 95 % Clopper-Pearson interval, the median steps, and what was learned from
-(`bent`: demonstrations that were put onto the path through the holes; see
+(`projected`: demonstrations that were put onto the path through the holes; see
 `surgicai_vision/demos/dmp/fit.py`).
 """
 
@@ -20,14 +19,14 @@ from typing import Any
 from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.demos.dmp.controller import Imitator
+from surgicai_vision.demos.dmp.controller import DmpController
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.imports.surgicai import import_demos
-from surgicai_vision.demos.rollout import roll
+from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import write_demo
 from surgicai_vision.evaluation.statistics import clopper_pearson
 
-LEARNING = 0
+DEMO_SEED = 0
 """Seed of the expert's first demonstration; the starts begin at `--seed`."""
 
 
@@ -35,11 +34,11 @@ def demonstrate(task: str, count: int, folder: Path) -> list[Path]:
     """Record the expert's first `count` successes."""
     env = envs.make(TaskConfig(task))
     paths: list[Path] = []
-    seed = LEARNING
+    seed = DEMO_SEED
     while len(paths) < count:
-        rollout = roll(env, Expert(env), seed)
-        if rollout.success:
-            paths.append(write_demo(folder, len(paths), rollout.demo))
+        result = rollout(env, Expert(env), seed)
+        if result.success:
+            paths.append(write_demo(folder, len(paths), result.demo))
         seed += 1
     return paths
 
@@ -47,20 +46,20 @@ def demonstrate(task: str, count: int, folder: Path) -> list[Path]:
 def measure(task: str, demos: list[Path], episodes: int, seed: int, scaled: bool) -> dict[str, Any]:
     """Execute the primitives learned from `demos` from `episodes` starts."""
     env = envs.make(TaskConfig(task))
-    imitator = Imitator(env, demos, scaled)
+    controller = DmpController(env, demos, scaled)
     successes = 0
     steps = []
     for number in range(seed, seed + episodes):
-        rollout = roll(env, Imitator(env, demos, scaled), number, "dmp")
-        successes += rollout.success
-        steps.append(len(rollout.demo))
+        result = rollout(env, DmpController(env, demos, scaled), number, "dmp")
+        successes += result.success
+        steps.append(len(result.demo))
     return {
         "successes": successes,
         "starts": episodes,
         "share": successes / episodes,
         "interval": clopper_pearson(successes, episodes),
         "median_steps": statistics.median(steps),
-        "bent": imitator.lesson.bent,
+        "projected": controller.fit.projected,
     }
 
 

@@ -28,8 +28,8 @@ from common import emit, median
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.agent import Agent
+from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.rollout import Episode, evaluate
 
 ENCODER = "imagenet-lite"

@@ -16,17 +16,17 @@ from common import chunks, emit, median, spread
 
 from surgicai_vision import envs
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.demos.search_expert import Searcher
+from surgicai_vision.demos.search_expert import SearchExpert
 from surgicai_vision.evaluation.statistics import clopper_pearson
 
 
-class Once(Searcher):
+class Once(SearchExpert):
     """Takes the needle once, in the middle of the range."""
 
     ATTEMPTS = (12.5,)
 
 
-WAYS: dict[str, Callable[[Any], Searcher]] = {"once": Once, "search": Searcher}
+WAYS: dict[str, Callable[[Any], SearchExpert]] = {"once": Once, "search": SearchExpert}
 
 
 def play(seeds: range, way: str) -> list[tuple[bool, int]]:

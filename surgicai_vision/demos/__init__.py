@@ -1,5 +1,5 @@
 """Demonstrations: recorded as states, rendered later.
 
-`store` is the format, `record` rolls an expert, `importing` replays foreign recordings,
-`safe_pickle` opens pickles without trusting them.
+`store` is the format, `demonstrator` says what may demonstrate, `rollout` runs one episode,
+`record` many, `imports` replays recordings of other systems, `dmp` has movement primitives.
 """

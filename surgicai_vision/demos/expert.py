@@ -1,12 +1,12 @@
-"""Expert: a scripted surgeon for every subtask and for the whole, in the env's own actions.
+"""Expert: a scripted policy for every subtask and for the whole, in the env's own actions.
 
-`Expert(env).action()` looks at the env's present state, privileged as it is, and returns the next
-action, (7,) float32. It keeps nothing between calls, so it answers on any state: from its own
-episodes, from a learner's (DAgger), from a restored one. No teleporting, no forces: the same seven
-numbers a policy has.
+`Expert(env).action()` reads the env's present state, privileged as it is, and returns the next
+action, (7,) float32. It keeps nothing between calls, so it labels any state: of its own episodes,
+of a learner's (DAgger), or a restored one. It has the same seven numbers as a policy; it neither
+teleports the tool nor applies forces.
 
-Each subtask's rule says where the commanded tool should be next; `toward` makes that one action,
-scaled as a whole so that translation and rotation stay in step on curved paths.
+Each subtask's rule returns where the commanded tool should be next; `action_towards` makes that one
+action, scaled as a whole so that translation and rotation stay in step on curved paths.
 """
 
 import math
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.demos.demonstrator import Demonstrator
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.control import StepSize
@@ -36,12 +37,12 @@ from surgicai_vision.scene.rotations import matrix_to_rotvec, rotvec_to_matrix
 Matrix = NDArray[np.float64]
 
 HOVER, HANDOFF_BACK = 0.010, 0.009
-"""Where the jaws wait before they go in: above the needle, before the handoff grasp [m]."""
+"""Where the jaws line up before they go in: above the needle, before the handoff grasp [m]."""
 OPEN_ABOVE, OPEN_HANDOFF = 0.35, 0.18
 """Jaw angles [rad] wide enough for the needle and narrow enough for its neighbours."""
 ALIGNED, ALIGNED_ANGLE = 0.0006, math.radians(4.0)
 CLOSING, CLOSING_ANGLE = 0.002, math.radians(20.0)
-"""Off by less than this the jaws, once closing, go on closing [m, rad]."""
+"""Off by less than this, jaws that are closing go on closing [m, rad]."""
 CLEAR = 0.004
 """Height of the needle's lowest point over the tissue at which it may turn and travel [m]."""
 OUTSIDE = 0.006
@@ -51,29 +52,36 @@ DRIVE = math.radians(1.8)
 LEAD = math.radians(9.0)
 """Furthest the command may run ahead of the needle [rad]."""
 BLOCKED = 0.001
-"""A needle this far off its path [m] is held back: in `3dmed_straight` PSM2's wrist meets the
-ridge's steep flank.
-"""
+"""A needle this far off its path [m] is blocked: in `3dmed_straight` PSM2's wrist touches the
+ridge's steep flank."""
 HANDOFF_OFFSET = math.radians(4.0)
-"""The expert takes the needle a little nearer to the tip than the goal, away from the tissue."""
+"""The expert grasps the needle a little nearer to the tip than the goal, away from the tissue."""
 
 
-class Wish(NamedTuple):
-    """Where the active tool should be: T_world_tip (4, 4) and jaw angle [rad]."""
+class ToolTarget(NamedTuple):
+    """Where the active tool should be.
+
+    Attributes:
+        tip: T_world_tip, (4, 4).
+        jaw: jaw angle [rad].
+    """
 
     tip: Matrix
     jaw: float
 
 
-class Expert:
+class Expert(Demonstrator):
     """The scripted expert of an env; see the module's docstring.
 
     Args:
         env: the env.
         noise: standard deviation of Gaussian noise on the six motions of an action, in units of its
-            range. The jaw stays as meant. The expert sees where the noise took it and recovers:
-            recordings with states off the path.
+            range; the jaw has none. The expert recovers from where the noise took it, so a
+            recording has states off the path.
         rng: source of the noise; needed with it.
+
+    Raises:
+        InputError: negative noise, or noise without `rng`.
     """
 
     def __init__(
@@ -81,27 +89,41 @@ class Expert:
     ):
         if noise < 0.0 or (noise and rng is None):
             raise InputError(
-                f"Expert got noise {noise} and rng {rng}; noise is at least 0 and comes from a Generator."
+                f"Expert got noise {noise} and rng {rng}; "
+                "noise is at least 0 and comes from a Generator."
             )
-        self.env, self.noise, self._rng = env, noise, rng
+        self.env = env
+        self.noise = noise
+        self._rng = rng
 
     def action(self) -> NDArray[np.float32]:
-        """Return the next action for the env's present state, (7,) float32 in [-1, 1], noise
-        included.
-        """
-        action = self.meant()
+        """Return the next action for the env's present state, with noise, (7,) in [-1, 1]."""
+        action = self.label()
         if self._rng is not None and self.noise:
             action[:6] = np.clip(action[:6] + self._rng.normal(0.0, self.noise, 6), -1.0, 1.0)
         return action
 
-    def meant(self) -> NDArray[np.float32]:
-        """Return the action without noise: the label of the present state."""
-        scene = Sight(self.env)
-        return toward(scene, _RULES[self.env.subtask.name](scene))
+    def label(self) -> NDArray[np.float32]:
+        """Return the action without noise: the label of the present state, (7,)."""
+        world = WorldState(self.env)
+        return action_towards(world, _RULES[self.env.subtask.name](world))
 
 
-class Sight:
-    """What the expert sees: measured poses in world as (4, 4) matrices."""
+class WorldState:
+    """The present state as the expert needs it: measured poses in world, (4, 4) matrices.
+
+    Attributes:
+        arm: the active arm.
+        stitch: the path through the holes.
+        memory: the task's state beyond MuJoCo's.
+        step: the step sizes of an action.
+        base: T_world_base of the active arm.
+        needle: T_world_needle.
+        tip: T_world_tip of the active arm.
+        command: T_world_tip that the active arm is commanded to.
+        command_jaw: commanded jaw angle [rad].
+        holds: whether the active arm's jaws hold the needle.
+    """
 
     def __init__(self, env: SuturingEnv):
         simulation = env.simulation
@@ -117,7 +139,7 @@ class Sight:
         self.command_jaw = command.jaw
         self.holds = simulation.holds(self.arm)
 
-    def carrying(self, needle_pose: Matrix) -> Matrix:
+    def tip_for_needle(self, needle_pose: Matrix) -> Matrix:
         """Return the tip's pose that brings the held needle to `needle_pose`."""
         return needle_pose @ np.linalg.inv(self.needle) @ self.tip
 
@@ -127,34 +149,32 @@ class Sight:
         return self.command @ np.linalg.inv(self.tip) @ self.needle
 
 
-def toward(scene: Sight, wish: Wish) -> NDArray[np.float32]:
-    """Return the action that moves the command towards `wish`, scaled to at most 1 as a whole.
+def action_towards(world: WorldState, target: ToolTarget) -> NDArray[np.float32]:
+    """Return the action that moves the command towards `target`, scaled to at most 1 as a whole.
 
     Closed jaws are closed with all of the range: the command stays at 0, and a policy that learns
     from it may be off without letting go. (With a label of 0, its small errors add up: 7 of 50
     learned placings dropped the needle.)
     """
-    move = moves(scene, wish.tip)
+    move = command_error(world, target.tip)
     move /= max(1.0, float(np.abs(move).max()))
     jaw = (
         -1.0
-        if wish.jaw <= 0.0
-        else np.clip((wish.jaw - scene.command_jaw) / scene.step.jaw, -1.0, 1.0)
+        if target.jaw <= 0.0
+        else np.clip((target.jaw - world.command_jaw) / world.step.jaw, -1.0, 1.0)
     )
     return np.append(move, jaw).astype(np.float32)
 
 
-def moves(scene: Sight, tip: Matrix) -> Matrix:
-    """Return how many step sizes the command is from T_world_tip (4, 4), along and about the base's
-    axes, (6,).
-    """
-    inverse = scene.base[:3, :3].T
-    shift = inverse @ (tip[:3, 3] - scene.command[:3, 3]) / scene.step.translation
-    turn = matrix_to_rotvec(inverse @ tip[:3, :3] @ scene.command[:3, :3].T @ scene.base[:3, :3])
-    return np.concatenate([shift, turn / scene.step.rotation])
+def command_error(world: WorldState, tip: Matrix) -> Matrix:
+    """Return the way from the command to T_world_tip in step sizes, in the base's axes, (6,)."""
+    inverse = world.base[:3, :3].T
+    shift = inverse @ (tip[:3, 3] - world.command[:3, 3]) / world.step.translation
+    turn = matrix_to_rotvec(inverse @ tip[:3, :3] @ world.command[:3, :3].T @ world.base[:3, :3])
+    return np.concatenate([shift, turn / world.step.rotation])
 
 
-def _angle(a: Matrix, b: Matrix) -> float:
+def _angle_between(a: Matrix, b: Matrix) -> float:
     return float(np.linalg.norm(matrix_to_rotvec(a[:3, :3].T @ b[:3, :3])))
 
 
@@ -164,60 +184,66 @@ def _shifted(pose: Matrix, shift: Matrix) -> Matrix:
     return moved
 
 
-# -- taking the needle -----------------------------------------------------------------------------
+# -- grasping the needle ----------------------------------------------------------------------------
 
 
-def take(scene: Sight, goal: Matrix, back: float, opened: float) -> Wish:
+def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: float) -> ToolTarget:
     """Go before the grasp with open jaws, go in, close.
 
     Args:
-        scene: what is seen.
+        world: the present state.
         goal: T_world_tip of the grasp.
-        back: how far before it the tool gets into line [m].
+        back: how far before it the tool lines up [m].
         opened: jaw angle on the way [rad].
     """
+    # Where the tool is relative to the grasp, along and beside the approach axis.
     axis = goal[:3, 2]
-    offset = scene.tip[:3, 3] - goal[:3, 3]
+    offset = world.tip[:3, 3] - goal[:3, 3]
     depth = float(offset @ axis)
     beside = float(np.linalg.norm(offset - depth * axis))
-    turned = _angle(scene.tip, goal)
+    turned = _angle_between(world.tip, goal)
     lined_up = beside < 2 * ALIGNED and turned < 2 * ALIGNED_ANGLE
-    closing = scene.command_jaw < opened - 2 * scene.step.jaw
+    closing = world.command_jaw < opened - 2 * world.step.jaw
+    # Close, go in, or line up, whichever is due.
     if closing and beside < CLOSING and abs(depth) < CLOSING and turned < CLOSING_ANGLE:
-        return Wish(goal if not scene.holds else scene.command, 0.0)
+        return ToolTarget(goal if not world.holds else world.command, 0.0)
     if beside < ALIGNED and abs(depth) < ALIGNED and turned < ALIGNED_ANGLE:
-        return Wish(goal, 0.0)
+        return ToolTarget(goal, 0.0)
     if lined_up and not closing:
-        return Wish(goal, opened)
+        return ToolTarget(goal, opened)
     retreat = min(depth, -back) if not lined_up and depth > -back else -back
-    return Wish(_shifted(goal, retreat * axis), opened)
+    return ToolTarget(_shifted(goal, retreat * axis), opened)
 
 
-def _grasp(scene: Sight) -> Wish:
-    goal = scene.needle @ grasp_in_needle(
-        scene.arm, scene.memory.grasp_angle, radius=scene.stitch.radius
+def _grasp(world: WorldState) -> ToolTarget:
+    goal = world.needle @ grasp_in_needle(
+        world.arm, world.memory.grasp_angle, radius=world.stitch.radius
     )
-    return take(scene, goal, HOVER, OPEN_ABOVE)
+    return approach_and_grasp(world, goal, HOVER, OPEN_ABOVE)
 
 
-def _handoff(scene: Sight) -> Wish:
-    goal = scene.needle @ grasp_in_needle(
-        scene.arm, HANDOFF_ANGLE + HANDOFF_OFFSET, radius=scene.stitch.radius
+def _handoff(world: WorldState) -> ToolTarget:
+    goal = world.needle @ grasp_in_needle(
+        world.arm, HANDOFF_ANGLE + HANDOFF_OFFSET, radius=world.stitch.radius
     )
-    return take(scene, goal, HANDOFF_BACK, OPEN_HANDOFF)
+    return approach_and_grasp(world, goal, HANDOFF_BACK, OPEN_HANDOFF)
 
 
-# -- carrying the needle ---------------------------------------------------------------------------
+# -- carrying the needle ----------------------------------------------------------------------------------
 
 
 def on_path(stitch: Stitch, turned: float) -> Matrix:
-    """Return the needle's pose after turning by `turned` [rad] about the wound since
-    `Stitch.place`.
+    """Return the needle's pose after a turn about the wound that starts at `Stitch.place`.
 
-    First about the tip, which stays in the entry, until the tangent meets the circle; then along
-    the circle.
+    The needle turns about its tip, which stays in the entry, until the tangent meets the circle,
+    then along the circle.
+
+    Args:
+        stitch: the path through the holes.
+        turned: the turn so far [rad].
     """
-    start, circle = stitch.place(), stitch.on_arc(needle.TIP_ANGLE)
+    start = stitch.place()
+    circle = stitch.on_arc(needle.TIP_ANGLE)
     pivot = turn_about_wound(start, circle)
     if turned >= pivot:
         return stitch.on_arc(needle.TIP_ANGLE - (turned - pivot))
@@ -229,85 +255,94 @@ def on_path(stitch: Stitch, turned: float) -> Matrix:
 
 
 def turn_about_wound(start: Matrix, pose: Matrix) -> float:
-    """Return the turn about the wound from `start` to `pose` in the needle's driving direction
-    [rad], in (-π, π].
+    """Return the turn about the wound from `start` to `pose` [rad], in (-π, π].
+
+    It is positive in the direction in which the needle is driven.
     """
-    x, z = start[:3, 0], np.cross(WOUND, start[:3, 0])
+    x = start[:3, 0]
+    z = np.cross(WOUND, x)
     return -math.atan2(float(pose[:3, 0] @ z), float(pose[:3, 0] @ x))
 
 
-def _place(scene: Sight) -> Wish:
+def _place(world: WorldState) -> ToolTarget:
     """Lift the needle, turn it upright before the entry, bring its tip in."""
-    goal = scene.stitch.place()
-    outward = scene.stitch.pair.entry.rotation[:, 2]
-    line = scene.needle[:3, :3] @ needle.polyline(13, scene.stitch.radius).T + scene.needle[:3, 3:4]
-    if float(line[2].min()) < SURFACE + CLEAR and _angle(scene.needle, goal) > math.radians(20.0):
-        return Wish(_shifted(scene.command, np.array([0.0, 0.0, 0.01])), 0.0)
-    offset = line[:, -1] - np.asarray(scene.stitch.pair.entry.centre)
+    goal = world.stitch.place()
+    outward = world.stitch.pair.entry.rotation[:, 2]
+    line = world.needle[:3, :3] @ needle.polyline(13, world.stitch.radius).T + world.needle[:3, 3:4]
+    if float(line[2].min()) < SURFACE + CLEAR and _angle_between(world.needle, goal) > math.radians(
+        20.0
+    ):
+        return ToolTarget(_shifted(world.command, np.array([0.0, 0.0, 0.01])), 0.0)
+    offset = line[:, -1] - np.asarray(world.stitch.pair.entry.centre)
     beside = float(np.linalg.norm(offset - (offset @ outward) * outward))
-    away = 0.0 if beside < 0.0015 and _angle(scene.needle, goal) < math.radians(7.0) else OUTSIDE
-    return Wish(scene.carrying(_shifted(goal, away * outward)), 0.0)
+    away = (
+        0.0
+        if beside < 0.0015 and _angle_between(world.needle, goal) < math.radians(7.0)
+        else OUTSIDE
+    )
+    return ToolTarget(world.tip_for_needle(_shifted(goal, away * outward)), 0.0)
 
 
-def _insert(scene: Sight) -> Wish:
+def _insert(world: WorldState) -> ToolTarget:
     """Bring the tip in, then drive the needle along its path."""
-    start = scene.stitch.place()
+    start = world.stitch.place()
     tip = (
-        scene.needle[:3, :3] @ needle.point(needle.TIP_ANGLE, scene.stitch.radius)
-        + scene.needle[:3, 3]
+        world.needle[:3, :3] @ needle.point(needle.TIP_ANGLE, world.stitch.radius)
+        + world.needle[:3, 3]
     )
-    local = scene.stitch.pair.entry.rotation.T @ (tip - np.asarray(scene.stitch.pair.entry.centre))
-    turned = turn_about_wound(start, scene.needle)
-    if scene.memory.passed == 0.0:
+    local = world.stitch.pair.entry.rotation.T @ (tip - np.asarray(world.stitch.pair.entry.centre))
+    turned = turn_about_wound(start, world.needle)
+    if world.memory.passed == 0.0:
         near = float(np.linalg.norm(local)) < 0.0009
-        tilt = _angle(scene.needle, on_path(scene.stitch, max(turned, 0.0)))
+        tilt = _angle_between(world.needle, on_path(world.stitch, max(turned, 0.0)))
         if not (near and tilt < math.radians(4.0)):
-            return _place(scene)
-    pivot = turn_about_wound(start, scene.stitch.on_arc(needle.TIP_ANGLE))
+            return _place(world)
+    pivot = turn_about_wound(start, world.stitch.on_arc(needle.TIP_ANGLE))
     last = (
-        pivot + needle.TIP_ANGLE - scene.stitch.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA)
+        pivot + needle.TIP_ANGLE - world.stitch.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA)
     )
-    return _drive(scene, turned, last)
+    return _drive(world, turned, last)
 
 
-def _drive(scene: Sight, turned: float, last: float) -> Wish:
-    """Move the needle on along its path, up to `last` [rad]; once it is through and off the path,
-    press no further.
+def _drive(world: WorldState, turned: float, last: float) -> ToolTarget:
+    """Move the needle along its path, up to the turn `last` [rad].
+
+    Once it is through and off the path it is pressed no further.
     """
-    start = scene.stitch.place()
-    commanded = turn_about_wound(start, scene.commanded_needle)
+    start = world.stitch.place()
+    commanded = turn_about_wound(start, world.commanded_needle)
     ahead = max(min(commanded, turned + LEAD), turned - LEAD) + DRIVE
-    off = scene.needle[:3, 3] - on_path(scene.stitch, min(max(turned, 0.0), last))[:3, 3]
-    if scene.memory.passed >= 2.0 and float(np.linalg.norm(off)) > BLOCKED:
+    off = world.needle[:3, 3] - on_path(world.stitch, min(max(turned, 0.0), last))[:3, 3]
+    if world.memory.passed >= 2.0 and float(np.linalg.norm(off)) > BLOCKED:
         ahead = min(ahead - DRIVE, turned)
-    return Wish(scene.carrying(on_path(scene.stitch, min(max(ahead, 0.0), last))), 0.0)
+    return ToolTarget(world.tip_for_needle(on_path(world.stitch, min(max(ahead, 0.0), last))), 0.0)
 
 
-def _pullout(scene: Sight) -> Wish:
-    """Turn the needle on along the circle until its base is out, then carry it to the end point."""
-    stitch = scene.stitch
-    if scene.memory.release > 30:
-        return Wish(scene.command, 0.0)
+def _pullout(world: WorldState) -> ToolTarget:
+    """Turn the needle along the circle until its base is out, then carry it to the end point."""
+    stitch = world.stitch
+    if world.memory.release > 30:
+        return ToolTarget(world.command, 0.0)
     line = (
-        scene.needle[:3, :3] @ needle.polyline(13, scene.stitch.radius).T + scene.needle[:3, 3:4]
+        world.needle[:3, :3] @ needle.polyline(13, world.stitch.radius).T + world.needle[:3, 3:4]
     ).T
     outside = ((line - np.asarray(stitch.pair.exit.centre)) @ stitch.pair.exit.rotation)[:, 2]
     if float(outside.min()) > 0.0005:
-        return Wish(scene.carrying(stitch.pulled()), 0.0)
+        return ToolTarget(world.tip_for_needle(stitch.pulled()), 0.0)
     start = stitch.place()
-    turned = turn_about_wound(start, scene.needle) % (2 * math.pi)
-    commanded = turned + _wrap(turn_about_wound(start, scene.commanded_needle) - turned)
+    turned = turn_about_wound(start, world.needle) % (2 * math.pi)
+    commanded = turned + _wrap(turn_about_wound(start, world.commanded_needle) - turned)
     ahead = max(min(commanded, turned + LEAD), turned - LEAD)
     pivot = turn_about_wound(start, stitch.on_arc(needle.TIP_ANGLE))
     last = pivot + needle.TIP_ANGLE + 2 * stitch.half + math.radians(12.0)
-    return Wish(scene.carrying(on_path(stitch, min(ahead + DRIVE, last))), 0.0)
+    return ToolTarget(world.tip_for_needle(on_path(stitch, min(ahead + DRIVE, last))), 0.0)
 
 
 def _wrap(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-_RULES: dict[str, Callable[[Sight], Wish]] = {
+_RULES: dict[str, Callable[[WorldState], ToolTarget]] = {
     "grasp": _grasp,
     "place": _place,
     "insert": _insert,

@@ -1,27 +1,25 @@
-"""Record demonstrations: roll an expert from seeded starts and keep the episodes that succeed.
+"""Record demonstrations: run a demonstrator from seeded starts and keep what succeeds.
 
     record(TaskConfig("grasp"), episodes=50, seed=0, out=Path("demos"), workers=2)
 
-Seeds are taken in order from the first one; a seed at which the expert fails is written down as
+Seeds are taken in order from the first one; a seed at which the demonstrator fails is noted as
 skipped in `demos.json` and the next one is taken, so what is kept depends on the seeds alone. The
-same command continues a run that was killed (the finished episodes lie in `<out>.work` until the
-folder is complete) and does nothing when it is complete. How an episode goes is in
-`surgicai_vision.demos.rollout`.
+same command continues a run that was killed (the finished episodes are in `<out>.work` until the
+folder is complete) and does nothing when it is complete. `surgicai_vision.demos.rollout` runs one
+episode.
 """
 
 import dataclasses
 import functools
-import importlib
 import itertools
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, check_name
 from surgicai_vision.core.executor import (
     LOCAL,
@@ -42,7 +40,13 @@ from surgicai_vision.core.files import (
     write_json,
 )
 from surgicai_vision.core.progress import Progress, silent
-from surgicai_vision.demos.rollout import CALM, Disturbance, Driver, roll
+from surgicai_vision.demos.demonstrator import (
+    DEMONSTRATORS,
+    LEARNING_DEMONSTRATORS,
+    BehaviourPolicy,
+    make_demonstrator,
+)
+from surgicai_vision.demos.rollout import UNDISTURBED, Disturbance, rollout
 from surgicai_vision.demos.store import (
     MARKER,
     list_demos,
@@ -52,52 +56,45 @@ from surgicai_vision.demos.store import (
     write_marker,
 )
 
-DEMONSTRATORS: Mapping[str, str] = MappingProxyType(
-    {
-        "expert": "surgicai_vision.demos.expert:Expert",
-        "dmp": "surgicai_vision.demos.dmp.controller:Imitator",
-        "search": "surgicai_vision.demos.search_expert:Searcher",
-    }
-)
-"""Source → "module:class" of what acts; built as `class(env)`, or as `class(env, demos)` where it
-is `LEARNING`.
-"""
-LEARNING = frozenset({"dmp"})
-"""Sources that learn from demonstrations."""
+if TYPE_CHECKING:
+    from surgicai_vision.envs.base import SuturingEnv
 
 MAX_FAILURES = 3
-"""Seeds tried per episode wanted, at most; below one success in three the expert is not fit to
-teach.
-"""
+"""Seeds tried per episode wanted, at most: one success in three is the least to learn from."""
 LABELS = ("demos", "learner")
-"""Arguments of a job that say where a file lies, and not what it holds."""
+"""Arguments of a job that say where a file is, not what it holds; its key leaves them out."""
 
 
 @dataclass(frozen=True)
 class Learner:
-    """The checkpoint folder of a driver, and the hash of the policy in it."""
+    """A policy that acts in the demonstrator's place at first.
+
+    Attributes:
+        folder: its checkpoint folder.
+        digest: hash of the policy in it.
+    """
 
     folder: Path
     digest: str
 
 
 @functools.lru_cache(maxsize=1)
-def _env(config: TaskConfig) -> Any:
+def _env(config: TaskConfig) -> "SuturingEnv":
     """Return this process's environment for `config`."""
-    import surgicai_vision.envs as envs
+    from surgicai_vision import envs  # mujoco, which listing the demonstrators does not need
 
     return envs.make(config)
 
 
 @job("record-episode", stages=("scene", "envs", "demos"))
-def record_episode(folder: Path, task: Mapping[str, Any], **how: Any) -> None:
-    """Job "record-episode": roll one seed; `how` is the rest of `record_into`'s arguments."""
-    record_into(folder, _env(from_mapping(TaskConfig, task)), **how)
+def record_episode(folder: Path, task: Mapping[str, JSON], **arguments: Any) -> None:
+    """Run one seed; the arguments are the rest of those of `record_into`."""
+    record_into(folder, _env(from_mapping(TaskConfig, task)), **arguments)
 
 
 def record_into(
     folder: Path,
-    env: Any,
+    env: "SuturingEnv",
     demonstrator: str,
     seed: int,
     noise: float = 0.0,
@@ -105,24 +102,22 @@ def record_into(
     noise_from: float | None = None,
     post_success_steps: int = 0,
     demos: Sequence[str] = (),
-    driver: Driver | None = None,
+    behaviour: BehaviourPolicy | None = None,
 ) -> None:
-    """Roll `seed` in `env` and write the episode, or why it failed, into `folder`."""
-    module, _, name = DEMONSTRATORS[demonstrator].partition(":")
-    actor = getattr(importlib.import_module(module), name)(env, *([demos] if demos else []))
-    rollout = roll(
+    """Run `seed` in `env` and write the episode, or why it failed, into `folder`."""
+    result = rollout(
         env,
-        actor,
+        make_demonstrator(demonstrator, env, demos),
         seed,
         demonstrator,
         Disturbance(noise, perturb_start_fraction, noise_from),
         post_success_steps,
-        driver,
+        behaviour,
     )
-    if rollout.success:
-        write_demo(folder, 0, rollout.demo)
+    if result.success:
+        write_demo(folder, 0, result.demo)
     write_json(
-        folder / "result.json", {"seed": seed, "success": rollout.success, "reason": rollout.reason}
+        folder / "result.json", {"seed": seed, "success": result.success, "reason": result.reason}
     )
 
 
@@ -133,7 +128,7 @@ def record(
     out: Path,
     demonstrator: str = "expert",
     seed: int = names.TRAIN_SEED,
-    disturbance: Disturbance = CALM,
+    disturbance: Disturbance = UNDISTURBED,
     post_success_steps: int = 0,
     workers: int = 1,
     engine: Engine = LOCAL,
@@ -149,13 +144,13 @@ def record(
         out: folder to make; the same request continues it or finds it finished.
         demonstrator: a key of `DEMONSTRATORS`.
         seed: first seed; the following ones are taken in order.
-        disturbance: noise and pushes.
-        post_success_steps: control steps that an episode goes on after its success.
+        disturbance: noise and perturbed starts.
+        post_success_steps: control steps recorded after an episode's success.
         workers: number of processes.
         engine: what runs them.
-        demos: files of the demonstrations that a demonstrator in `LEARNING` learns from; their
-            seeds are left out.
-        learner: what drives until a step drawn by chance, while the labels stay the expert's.
+        demos: files of the demonstrations that a demonstrator in `LEARNING_DEMONSTRATORS` learns
+            from; their seeds are left out.
+        learner: acts until a step drawn by chance, while the labels stay the demonstrator's.
         progress: called with (episodes kept, episodes wanted, "episodes").
 
     Raises:
@@ -163,20 +158,21 @@ def record(
             demonstrator, demonstrations for a demonstrator that learns from none, or none for one
             that does.
         OutputExists: `out` holds something else.
-        SurgicaiError: the expert failed at too many seeds.
+        SurgicaiError: the demonstrator failed at too many seeds.
     """
     check_name("demonstrator", demonstrator, DEMONSTRATORS)
     if episodes < 1 or min(seed, post_success_steps) < 0:
         raise InputError(
-            f"episodes is {episodes}, seed {seed}, post_success_steps {post_success_steps}; they must be at least 1, 0 and 0."
+            f"episodes is {episodes}, seed {seed}, post_success_steps {post_success_steps}; "
+            "they must be at least 1, 0 and 0."
         )
-    _check_taught(demonstrator, demos)
+    _check_demos(demonstrator, demos)
     request = {
         "task": to_mapping(config),
         "demonstrator": demonstrator,
         "seed": seed,
         "episodes": episodes,
-        **_of(disturbance),
+        **_disturbance_fields(disturbance),
     }
     if post_success_steps:
         request["post_success_steps"] = post_success_steps
@@ -188,8 +184,8 @@ def record(
     if finished(out, request):
         return list_demos(out)
     with building(out) as (store, result):
-        rolling = functools.partial(run, store=store, context=RunContext(workers, engine))
-        kept, skipped = _take(request, demos, learner, rolling, progress or silent)
+        run_jobs = functools.partial(run, store=store, context=RunContext(workers, engine))
+        kept, skipped = _run_seeds(request, demos, learner, run_jobs, progress or silent)
         with whole_folder(result) as folder:
             for index, path in enumerate(kept):
                 shutil.copyfile(path, folder / f"episode_{index:06d}.safetensors")
@@ -198,82 +194,89 @@ def record(
     return list_demos(out)
 
 
-def _check_taught(demonstrator: str, demos: Sequence[Path]) -> None:
-    """Refuse a demonstrator without the demonstrations it learns from, or with some that it does
-    not.
-    """
-    if demonstrator in LEARNING and not demos:
+def _check_demos(demonstrator: str, demos: Sequence[Path]) -> None:
+    """Refuse a learning demonstrator without demonstrations, and another one with some."""
+    if demonstrator in LEARNING_DEMONSTRATORS and not demos:
         raise InputError(
-            f"Source '{demonstrator}' learns from demonstrations; give at least one (--from DEMOS)."
+            f"Demonstrator '{demonstrator}' learns from demonstrations; "
+            "give at least one (--from DEMOS)."
         )
-    if demos and demonstrator not in LEARNING:
-        taught = ", ".join(sorted(LEARNING))
+    if demos and demonstrator not in LEARNING_DEMONSTRATORS:
+        learning = ", ".join(sorted(LEARNING_DEMONSTRATORS))
         raise InputError(
-            f"Source '{demonstrator}' learns from no demonstrations; leave them (--from) out or take demonstrator {taught}."
+            f"Demonstrator '{demonstrator}' learns from no demonstrations; "
+            f"leave them (--from) out or take demonstrator {learning}."
         )
 
 
-def _of(disturbance: Disturbance) -> dict[str, float]:
-    """Return what a request says of a disturbance: nothing of what is off."""
-    said = dataclasses.asdict(disturbance)
-    return {name: value for name, value in said.items() if value != getattr(CALM, name)}
+def _disturbance_fields(disturbance: Disturbance) -> dict[str, float]:
+    """Return the fields of a disturbance that differ from none at all, for a request."""
+    undisturbed = dataclasses.asdict(UNDISTURBED)
+    fields = dataclasses.asdict(disturbance)
+    return {name: value for name, value in fields.items() if value != undisturbed[name]}
 
 
 def finished(out: Path, request: Mapping[str, Any]) -> bool:
-    """Say whether `out` is the finished result of `request`; `OutputExists` if it is that of
-    another one.
+    """Return True if `out` is the finished result of `request`.
+
+    Raises:
+        OutputExists: it is the result of another request.
     """
     if not (out / MARKER).exists():
         return False
     if read_marker(out).get("request") != request:
         raise OutputExists(
-            f"--out {out} holds demonstrations of another command (see {out / MARKER}); give another folder."
+            f"--out {out} holds demonstrations of another command (see {out / MARKER}); "
+            "give another folder."
         )
     # Left by a run that was killed after its last step.
     shutil.rmtree(work_folder(out), ignore_errors=True)
     return True
 
 
-def _take(
+def _run_seeds(
     request: Mapping[str, Any],
     demos: Sequence[Path],
     learner: Learner | None,
-    rolling: Callable[..., list[Path]],
+    run_jobs: Callable[..., list[Path]],
     progress: Progress,
 ) -> tuple[list[Path], list[dict[str, Any]]]:
     """Try seeds in order until enough succeeded; return the kept files and the skipped seeds."""
     kept: list[Path] = []
     skipped: list[dict[str, Any]] = []
-    wanted, inputs = request["episodes"], tuple(request.get("demos", ()))
-    same = {
+    wanted = request["episodes"]
+    inputs = tuple(request.get("demos", ()))
+    shared = {
         key: value
         for key, value in request.items()
         if key not in ("seed", "episodes", "demos", "learner")
     }
     if demos:
-        same["demos"] = [str(path.resolve()) for path in demos]
+        shared["demos"] = [str(path.resolve()) for path in demos]
     if learner:
-        same["learner"], inputs = str(learner.folder.resolve()), (*inputs, learner.digest)
+        shared["learner"] = str(learner.folder.resolve())
+        inputs = (*inputs, learner.digest)
     known = {read_demo(path).seed for path in demos}
     seeds = (seed for seed in itertools.count(request["seed"]) if seed not in known)
     while len(kept) < wanted:
         if len(kept) + len(skipped) >= MAX_FAILURES * wanted + 5:
             reasons = "; ".join(f"seed {row['seed']}: {row['reason']}" for row in skipped[:3])
             raise SurgicaiError(
-                f"The {request['demonstrator']} succeeded at {len(kept)} of {len(kept) + len(skipped)} starts of "
-                f"{request['task']['task']}; {wanted} were wanted ({reasons}; …)."
+                f"The {request['demonstrator']} succeeded at {len(kept)} of "
+                f"{len(kept) + len(skipped)} starts of {request['task']['task']}; "
+                f"{wanted} were wanted ({reasons}; …)."
             )
         jobs = [
             Job(
                 "drive-episode" if learner else "record-episode",
-                {**same, "seed": seed},
+                {**shared, "seed": seed},
                 inputs,
                 label=LABELS,
             )
             for seed in itertools.islice(seeds, wanted - len(kept))
         ]
-        report = functools.partial(_report, progress, len(kept), wanted)
-        for folder in rolling(jobs, progress=report):
+        report = functools.partial(_report_all, progress, len(kept), wanted)
+        for folder in run_jobs(jobs, progress=report):
             result = read_json(folder / "result.json")
             if result["success"]:
                 kept.append(folder / "episode_000000.safetensors")
@@ -283,15 +286,19 @@ def _take(
     return kept, skipped
 
 
-def _report(
+def _report_all(
     progress: Progress, before: int, wanted: int, done: int, total: int, unit: str = ""
 ) -> None:
-    """Pass on the progress of one wave of seeds as that of the whole."""
+    """Report the progress of one batch of seeds as that of the whole."""
     progress(before + done, wanted, "episodes")
 
 
 def check_folder(folder: Path) -> int:
-    """Read every episode of `folder`; return their number, `BadFile` at the first damaged one."""
+    """Read every episode of `folder` and return their number.
+
+    Raises:
+        BadFile: a damaged episode.
+    """
     paths = list_demos(folder)
     for path in paths:
         read_demo(path)

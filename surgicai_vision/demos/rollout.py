@@ -1,26 +1,31 @@
-"""Rolling: one episode by an actor, with every state on the way.
+"""Rollout: one episode by a demonstrator, with every state on the way.
 
-    rollout = roll(env, expert, seed)      # one episode, kept or not
+    result = rollout(env, expert, seed)      # one episode, kept or not
 
-With a `Disturbance` the expert is shown states off its own path: noise on what is executed, while
-the label stays the expert's own answer (DART, Laskey et al. 2017), and starts that were pushed away
-before the recording begins. With a `Driver` these are states that a learner itself comes to
-(DAgger, Ross et al. 2011; `surgicai_vision.experiments.dagger`).
+With a `Disturbance` the demonstrator meets states off its own path: noise on what is executed,
+while the label stays its own answer (DART, Laskey et al. 2017), and starts that were perturbed
+before the recording begins. With a `BehaviourPolicy` these are states that a learner itself comes
+to (DAgger, Ross et al. 2011; `surgicai_vision.experiments.dagger`).
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import code_version
+from surgicai_vision.demos.demonstrator import BehaviourPolicy, Demonstrator
 from surgicai_vision.demos.store import Demo
+
+if TYPE_CHECKING:
+    from surgicai_vision.envs.base import SuturingEnv
 
 DISTURBANCE_STREAM = 0xDA27
 """Sets the disturbance's random numbers apart from the start's, which are of the same seed."""
-PUSH = (8, 25)
-"""Fewest and most control steps of a push: 4 to 12 mm at the paper's step size."""
+PERTURBATION_STEPS = (8, 25)
+"""Fewest and most control steps of a perturbation: 4 to 12 mm at the paper's step size."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +34,11 @@ class Disturbance:
 
     Attributes:
         noise: standard deviation of the Gaussian noise on the six motions of an executed action, in
-            units of its range; the jaw is done as meant, since a random walk of it would drop the
-            needle.
-        noise_from: lowest such deviation; each episode draws its own between the two. None takes
-            `noise` throughout.
-        perturb_start_fraction: share of episodes that start with a push in a random direction,
+            units of its range; the jaw has none, since a random walk of it would drop the needle.
+        perturb_start_fraction: share of episodes that start with a motion in a random direction,
             which is not recorded.
+        noise_from: lowest deviation; each episode draws its own between this and `noise`. None
+            takes `noise` throughout.
     """
 
     noise: float = 0.0
@@ -48,124 +52,117 @@ class Disturbance:
             )
         if not 0.0 <= self.noise <= 1.0 or not 0.0 <= self.perturb_start_fraction <= 1.0:
             raise InputError(
-                f"noise is {self.noise:g} and perturb_start_fraction {self.perturb_start_fraction:g}; each must be within 0 and 1."
+                f"noise is {self.noise:g} and perturb_start_fraction "
+                f"{self.perturb_start_fraction:g}; each must be within 0 and 1."
             )
 
-    def push(self, env: Any, rng: np.random.Generator) -> bool:
-        """Push the tool away, or not, as chance has it; say whether the episode is still on."""
+    def perturb_start(self, env: "SuturingEnv", rng: np.random.Generator) -> bool:
+        """Move the tool away with the given probability; return False if that ended the episode."""
         if rng.random() >= self.perturb_start_fraction:
             return True
         direction = np.append(rng.uniform(-1.0, 1.0, 6), 0.0).astype(np.float32)
-        for _ in range(rng.integers(*PUSH, endpoint=True)):
+        for _ in range(rng.integers(*PERTURBATION_STEPS, endpoint=True)):
             _, _, terminated, truncated, _ = env.step(direction)
             if terminated or truncated:
                 return False
         return True
 
-    def deviation(self, rng: np.random.Generator) -> float:
+    def draw_deviation(self, rng: np.random.Generator) -> float:
         """Return the standard deviation of an episode's noise."""
-        return (
-            self.noise
-            if self.noise_from is None
-            else float(rng.uniform(self.noise_from, self.noise))
-        )
+        if self.noise_from is None:
+            return self.noise
+        return float(rng.uniform(self.noise_from, self.noise))
 
     @staticmethod
-    def executed(action: np.ndarray, deviation: float, rng: np.random.Generator) -> np.ndarray:
-        """Return what is done in the place of `action`, (7,) float32."""
+    def disturb(
+        action: NDArray[np.float32], deviation: float, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """Return what is executed in the place of `action`, (7,)."""
         noisy = action + np.append(rng.normal(0.0, deviation, 6), 0.0)
         return np.clip(noisy, -1.0, 1.0).astype(np.float32)
 
 
-CALM = Disturbance()
-
-
-class Actor(Protocol):
-    """What records: an expert that sees the environment itself; made anew for every episode.
-
-    One with a true attribute `persists` goes on after its success until the episode's limit.
-    """
-
-    def action(self) -> np.ndarray:
-        """Return the action (7,) float32 for the environment's present state."""
-
-
-class Driver(Protocol):
-    """What acts in the expert's place at first, while the labels stay the expert's."""
-
-    def begin(self, env: Any, seed: int, rng: np.random.Generator) -> None:
-        """Begin an episode: `env` has been reset."""
-
-    def action(self, env: Any, observation: Any) -> np.ndarray | None:
-        """Return the action (7,) that is executed; None once the expert acts itself."""
+UNDISTURBED = Disturbance()
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """One rolled episode, whether it succeeded, and why it is not kept if it did not."""
+    """One episode.
+
+    Attributes:
+        demo: what happened.
+        success: whether it met the task.
+        reason: why it is not kept; "" after a success.
+    """
 
     demo: Demo
     success: bool
     reason: str
 
 
-def roll(
-    env: Any,
-    actor: Actor,
+def rollout(
+    env: "SuturingEnv",
+    demonstrator: Demonstrator,
     seed: int,
-    demonstrator: str = "expert",
-    disturbance: Disturbance = CALM,
+    name: str = "expert",
+    disturbance: Disturbance = UNDISTURBED,
     post_success_steps: int = 0,
-    driver: Driver | None = None,
+    behaviour: BehaviourPolicy | None = None,
 ) -> Rollout:
-    """Roll one episode of `env` from `seed` and return it with every state on the way.
+    """Run one episode of `env` from `seed` and return it with every state on the way.
 
-    It ends `post_success_steps` control steps after its success: what is shown there is that, and
-    how, one stops.
+    Args:
+        env: the env; it is reset.
+        demonstrator: labels every state, and acts where `behaviour` does not.
+        seed: of the start, and of all chance in the episode.
+        name: the demonstrator's name, as it is stored.
+        disturbance: noise and perturbed starts.
+        post_success_steps: control steps recorded after the success, which show how one stops.
+        behaviour: acts in the demonstrator's place at first.
     """
     rng = np.random.default_rng([seed, DISTURBANCE_STREAM])
     env.reset(seed=seed)
-    if not disturbance.push(env, rng):
-        env.reset(seed=seed)  # the push ended it; this start stays as it was
-    deviation = disturbance.deviation(rng)
-    observation = env.observe() if driver else None
-    if driver:
-        driver.begin(env, seed, rng)
-    states, rows = [env.get_state()], []
+    if not disturbance.perturb_start(env, rng):
+        env.reset(seed=seed)  # the perturbation ended it; this start stays as it was
+    deviation = disturbance.draw_deviation(rng)
+    observation = env.observe() if behaviour else None
+    if behaviour:
+        behaviour.reset(env, seed, rng)
+
+    states = [env.get_state()]
+    rows: list[tuple[Any, ...]] = []
     info: dict[str, Any] = {}
-    left = env.config.max_steps if getattr(actor, "persists", False) else post_success_steps
-    ended = reached = False
+    steps_left = env.config.max_steps if demonstrator.persists else post_success_steps
+    ended = False
+    succeeded = False
     while not ended:
         phase = env.phase
-        action = np.asarray(actor.action(), dtype=np.float32)
-        driven = driver.action(env, observation) if driver else None
-        executed = (
-            disturbance.executed(action, deviation, rng) if deviation and driven is None else action
-        )
-        executed = executed if driven is None else driven
+        label = np.asarray(demonstrator.action(), dtype=np.float32)
+        executed = behaviour.action(env, observation) if behaviour else None
+        if executed is None:
+            executed = disturbance.disturb(label, deviation, rng) if deviation else label
         observation, reward, _, truncated, info = env.step(executed)
         states.append(env.get_state())
-        rows.append((action, executed, phase, reward, info["is_success"], info["contact"]))
-        left -= reached
-        reached = reached or bool(info["is_success"])
-        ended = (reached and left <= 0) or truncated or info["physics_error"]
-    actions, sent, phase, reward, success, contact = (
-        list(column) for column in zip(*rows, strict=True)
-    )
+        rows.append((label, executed, phase, reward, info["is_success"], info["contact"]))
+        steps_left -= succeeded
+        succeeded = succeeded or bool(info["is_success"])
+        ended = (succeeded and steps_left <= 0) or truncated or info["physics_error"]
+
+    labels, actions, phases, rewards, successes, contacts = zip(*rows, strict=True)
     demo = Demo(
         config=env.config,
         seed=seed,
-        demonstrator=demonstrator,
+        demonstrator=name,
         scene_hash=env.scene.hash,
         code_version=code_version(),
         state=np.stack(states).astype(np.float64),
-        action=np.stack(actions),
-        phase=np.asarray(phase, dtype=np.int8),
-        reward=np.asarray(reward, dtype=np.float32),
-        success=np.asarray(success, dtype=bool),
-        contact=np.asarray(contact, dtype=bool),
-        executed=np.stack(sent) if disturbance.noise or driver else None,
+        action=np.stack(labels),
+        phase=np.asarray(phases, dtype=np.int8),
+        reward=np.asarray(rewards, dtype=np.float32),
+        success=np.asarray(successes, dtype=bool),
+        contact=np.asarray(contacts, dtype=bool),
+        executed=np.stack(actions) if disturbance.noise or behaviour else None,
     )
     if info["physics_error"]:
         return Rollout(demo, False, "physics error")
-    return Rollout(demo, reached, "" if reached else f"no success in {len(actions)} steps")
+    return Rollout(demo, succeeded, "" if succeeded else f"no success in {len(labels)} steps")

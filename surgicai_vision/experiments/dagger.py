@@ -20,21 +20,22 @@ import numpy as np
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import job
+from surgicai_vision.demos.demonstrator import BehaviourPolicy
 from surgicai_vision.demos.record import Learner, record_into
-from surgicai_vision.evaluation.policy_spec import checkpoint_subject
 from surgicai_vision.evaluation.agent import Agent
+from surgicai_vision.evaluation.policy_spec import checkpoint_subject
 from surgicai_vision.evaluation.rollout import env_of
 
 
 @final
-class Wheel:
-    """A driver: an agent until a step of each episode that is drawn by chance."""
+class MixturePolicy(BehaviourPolicy):
+    """An agent until a step of each episode that is drawn by chance, then the expert."""
 
     def __init__(self, agent: Agent):
         self._agent = agent
         self._left = 0
 
-    def begin(self, env: Any, seed: int, rng: np.random.Generator) -> None:
+    def reset(self, env: Any, seed: int, rng: np.random.Generator) -> None:
         """Draw the step at which the expert takes over."""
         self._agent.reset(0, env, seed)
         self._left = int(rng.integers(0, env.config.max_steps, endpoint=True))
@@ -74,13 +75,13 @@ def learner_of(folder: Path, config: TaskConfig) -> Learner:
 )  # fmt: skip
 def record_driven(folder: Path, task: Mapping[str, Any], learner: str, **how: Any) -> None:
     """Job "drive-episode": as "record-episode", with a learner that drives."""
-    env, wheel = _driven(from_mapping(TaskConfig, task), learner)
-    record_into(folder, env, driver=wheel, **how)
+    env, mixture = _driven(from_mapping(TaskConfig, task), learner)
+    record_into(folder, env, behaviour=mixture, **how)
 
 
 @functools.lru_cache(maxsize=1)
-def _driven(config: TaskConfig, learner: str) -> tuple[Any, Wheel]:
+def _driven(config: TaskConfig, learner: str) -> tuple[Any, MixturePolicy]:
     """Return this process's environment with what the learner sees, and the learner."""
     atexit.register(_driven.cache_clear)  # the GL context must go before the interpreter does
     agent = checkpoint_subject(Path(learner)).make_agent()
-    return env_of(agent, config), Wheel(agent)
+    return env_of(agent, config), MixturePolicy(agent)

@@ -8,7 +8,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.executor import LOCAL, Engine
 from surgicai_vision.dataset.render import render_demos
 from surgicai_vision.demos.record import record
-from surgicai_vision.demos.rollout import CALM, Disturbance
+from surgicai_vision.demos.rollout import UNDISTURBED, Disturbance
 
 
 def prepare_dataset(
@@ -24,7 +24,7 @@ def prepare_dataset(
     frame_stride: int = 1,
     engine: Engine = LOCAL,
     demonstrator: str = "expert",
-    disturbance: Disturbance = CALM,
+    disturbance: Disturbance = UNDISTURBED,
     post_success_steps: int = 0,
 ) -> Path:
     """Record demonstrations into `folder`/demos and render them into `folder`/dataset; return the

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import surgicai_vision.envs as envs
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, OutputExists
-from surgicai_vision.demos.dmp.fit import learn_lesson
+from surgicai_vision.demos.dmp.fit import fit_subtask
 from surgicai_vision.demos.imports.rosbag import reader, segments
 from surgicai_vision.demos.imports.rosbag.config import BagConfig, Frames, Topics
 from surgicai_vision.demos.imports.rosbag.importer import import_bags
@@ -96,8 +96,8 @@ def test_actions_carry_the_arm_along_the_recorded_path(tmp_path):
 def test_an_imported_bag_teaches_a_movement_primitive(tmp_path):
     bag = write_bag(tmp_path / "trial", "bag", streams(shown("place")))
     (made,) = import_bags([bag], task="place", out=tmp_path / "demos")
-    lesson = learn_lesson("place", [read_demo(path) for path in made.paths])
-    assert len(lesson.parts) == 1
+    fit = fit_subtask("place", [read_demo(path) for path in made.paths])
+    assert len(fit.phases) == 1
 
 
 def test_the_same_import_again_does_nothing_and_another_is_refused(tmp_path):

@@ -11,7 +11,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
 from surgicai_vision.demos import record as recording
 from surgicai_vision.demos.record import record
-from surgicai_vision.demos.rollout import Disturbance, roll
+from surgicai_vision.demos.rollout import Disturbance, rollout
 from surgicai_vision.demos.store import (
     Demo,
     list_demos,
@@ -28,13 +28,13 @@ CONFIG = TaskConfig(max_steps=12)
 def fake(monkeypatch):
     """Record from the stand-in environment, in this process."""
     monkeypatch.setattr(recording, "_env", lambda config: FakeEnv(config))
-    monkeypatch.setattr(recording, "DEMONSTRATORS", {"expert": "fake_env:FakeExpert"})
+    monkeypatch.setattr(recording, "make_demonstrator", lambda name, env, demos: FakeExpert(env))
 
 
 @pytest.fixture
 def demo():
     env = FakeEnv(CONFIG)
-    return roll(env, FakeExpert(env), 3).demo
+    return rollout(env, FakeExpert(env), 3).demo
 
 
 def test_write_read_returns_the_same_demo(tmp_path, demo):
@@ -51,7 +51,7 @@ def test_write_read_returns_the_same_demo(tmp_path, demo):
 
 def test_noise_is_executed_and_the_label_is_the_experts(tmp_path):
     env = FakeEnv(CONFIG)
-    noisy = roll(env, FakeExpert(env), 3, disturbance=Disturbance(noise=0.2)).demo
+    noisy = rollout(env, FakeExpert(env), 3, disturbance=Disturbance(noise=0.2)).demo
     again = read_demo(write_demo(tmp_path, 0, noisy))
     np.testing.assert_array_equal(again.executed, noisy.executed)
     difference = noisy.executed - noisy.action
@@ -64,18 +64,18 @@ def test_noise_is_executed_and_the_label_is_the_experts(tmp_path):
         np.testing.assert_array_equal(FakeExpert(env).action(), label)
         env.step(executed)
     np.testing.assert_array_equal(
-        roll(env, FakeExpert(env), 3, disturbance=Disturbance(0.2)).demo.state, noisy.state
+        rollout(env, FakeExpert(env), 3, disturbance=Disturbance(0.2)).demo.state, noisy.state
     )
 
 
 def test_each_episode_draws_its_own_noise_within_the_range():
     env = FakeEnv(CONFIG)
     spread = Disturbance(0.6, noise_from=0.1)
-    demos = [roll(env, FakeExpert(env), seed, disturbance=spread).demo for seed in range(12)]
+    demos = [rollout(env, FakeExpert(env), seed, disturbance=spread).demo for seed in range(12)]
     off = [np.abs(demo.executed - demo.action)[:, 1:6].mean() for demo in demos]
     assert max(off) > 1.5 * min(off) > 0, "episodes differ in their noise"
     even = [
-        roll(env, FakeExpert(env), seed, disturbance=Disturbance(0.6)).demo for seed in range(12)
+        rollout(env, FakeExpert(env), seed, disturbance=Disturbance(0.6)).demo for seed in range(12)
     ]
     assert np.mean(off) < np.mean(
         [np.abs(demo.executed - demo.action)[:, 1:6].mean() for demo in even]
@@ -96,8 +96,8 @@ def test_the_range_of_noise_reaches_the_recording(tmp_path):
 
 def test_an_episode_lingers_after_its_success():
     env = FakeEnv(CONFIG)
-    plain = roll(env, FakeExpert(env), 3).demo
-    longer = roll(env, FakeExpert(env), 3, post_success_steps=4).demo
+    plain = rollout(env, FakeExpert(env), 3).demo
+    longer = rollout(env, FakeExpert(env), 3, post_success_steps=4).demo
     assert len(longer.action) == len(plain.action) + 4
     np.testing.assert_array_equal(longer.state[: len(plain.state)], plain.state)
     assert (
@@ -105,7 +105,7 @@ def test_an_episode_lingers_after_its_success():
     )
     short = FakeEnv(dataclasses.replace(CONFIG, max_steps=len(plain.action) + 1))
     assert (
-        len(roll(short, FakeExpert(short), 3, post_success_steps=4).demo.action)
+        len(rollout(short, FakeExpert(short), 3, post_success_steps=4).demo.action)
         == len(plain.action) + 1
     ), "up to the limit"
 
@@ -122,7 +122,9 @@ class Patient(FakeEnv):
 def test_a_recovery_starts_elsewhere_and_its_push_is_not_recorded():
     env = Patient(dataclasses.replace(CONFIG, max_steps=60))
     pushed = [
-        roll(env, FakeExpert(env), seed, disturbance=Disturbance(perturb_start_fraction=0.5)).demo
+        rollout(
+            env, FakeExpert(env), seed, disturbance=Disturbance(perturb_start_fraction=0.5)
+        ).demo
         for seed in range(20)
     ]
     starts = [int(demo.state[0, 2]) for demo in pushed]
@@ -131,7 +133,7 @@ def test_a_recovery_starts_elsewhere_and_its_push_is_not_recorded():
     # A push that ends the episode is undone: the start stays as it was.
     short = FakeEnv(CONFIG)
     for seed in range(20):
-        start = roll(
+        start = rollout(
             short, FakeExpert(short), seed, disturbance=Disturbance(perturb_start_fraction=1.0)
         ).demo.state[0, 2]
         assert start < CONFIG.max_steps

@@ -40,7 +40,7 @@ from surgicai_vision.demos.imports.rosbag import reader
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
 from surgicai_vision.demos.imports.rosbag.resample import recording_of
 from surgicai_vision.demos.imports.rosbag.segments import segments
-from surgicai_vision.demos.rollout import roll
+from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import demo_bytes, list_demos, read_demo
 from surgicai_vision.scene.holes import PAIRS
 
@@ -277,7 +277,7 @@ def tensors(table, body, size=None):
 
 def demonstrations():
     env = FakeEnv(CONFIG)
-    whole = demo_bytes(roll(env, FakeExpert(env), 1).demo)
+    whole = demo_bytes(rollout(env, FakeExpert(env), 1).demo)
     table, body = header_of(whole)
 
     def tensor(**changes):

@@ -16,9 +16,9 @@ from surgicai_vision.core.errors import BadFile, InputError, OutputExists
 from surgicai_vision.dataset import open_dataset, render_demos
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.record import record
-from surgicai_vision.demos.rollout import roll
+from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import read_demo, read_marker
-from surgicai_vision.experiments.dagger import Wheel, learner_of
+from surgicai_vision.experiments.dagger import MixturePolicy, learner_of
 
 CONFIG = TaskConfig("place", max_steps=120)
 
@@ -51,15 +51,15 @@ def driven(learner, tmp_path_factory):
 
 def test_the_learner_drives_until_the_expert_takes_over():
     config = TaskConfig(max_steps=40)
-    env, wheel = FakeEnv(config), Wheel(Backwards())
-    plain = roll(env, FakeExpert(env), 3).demo
-    driven = roll(env, FakeExpert(env), 3, driver=wheel).demo
+    env, mixture = FakeEnv(config), MixturePolicy(Backwards())
+    plain = rollout(env, FakeExpert(env), 3).demo
+    driven = rollout(env, FakeExpert(env), 3, behaviour=mixture).demo
     wrong = (driven.executed == -1.0).all(axis=1)
     handed = int(wrong.sum())
     assert 0 < handed < 40 and wrong[:handed].all(), "first the learner, then the expert to the end"
     np.testing.assert_array_equal(driven.executed[handed:], driven.action[handed:])
     assert driven.success[-1] and len(driven.action) > len(plain.action)
-    lengths = {int((roll(env, FakeExpert(env), seed, driver=wheel).demo.executed == -1.0).all(axis=1).sum())
+    lengths = {int((rollout(env, FakeExpert(env), seed, behaviour=mixture).demo.executed == -1.0).all(axis=1).sum())
                for seed in range(8)}  # fmt: skip
     assert len(lengths) > 4, "each episode draws its own step"
 

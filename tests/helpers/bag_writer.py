@@ -14,7 +14,7 @@ import surgicai_vision.envs as envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.demos.rollout import roll
+from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.envs import poses
 
 FORMATS = ("bag", "db3", "mcap")
@@ -63,9 +63,9 @@ class Motion:
 def shown(task, seed=0):
     """Return the motion of our expert's episode; made once."""
     env = envs.make(TaskConfig(task))
-    rollout = roll(env, Expert(env), seed)
-    assert rollout.success
-    return watched(env, rollout.demo)
+    result = rollout(env, Expert(env), seed)
+    assert result.success
+    return watched(env, result.demo)
 
 
 def watched(env, demo):

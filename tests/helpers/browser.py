@@ -1,6 +1,5 @@
-"""A headless Chromium that tests steer through its debugging pipe.
-
-Nothing but the standard library.
+"""A headless Chromium that tests steer through its debugging pipe; nothing but the standard
+library.
 """
 
 import json

@@ -4,7 +4,7 @@ import numpy as np
 from fake_env import FakeEnv, FakeExpert
 
 from surgicai_vision.dataset import render
-from surgicai_vision.demos.rollout import roll
+from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import write_demo, write_marker
 
 
@@ -22,6 +22,6 @@ def write_demos(folder, config, seeds):
     env = FakeEnv(config)
     folder.mkdir()
     for index, seed in enumerate(seeds):
-        write_demo(folder, index, roll(env, FakeExpert(env), seed).demo)
+        write_demo(folder, index, rollout(env, FakeExpert(env), seed).demo)
     write_marker(folder, "grasp", "expert")
     return folder

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.demos.demonstrator import Demonstrator
 
 
 class FakeEnv:
@@ -85,7 +86,7 @@ class FakeEnv:
         return observation
 
 
-class FakeExpert:
+class FakeExpert(Demonstrator):
     def __init__(self, env):
         self.env = env
 

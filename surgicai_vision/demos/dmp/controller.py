@@ -1,19 +1,19 @@
-"""Imitator: does a subtask as its demonstrations did, from a new start, in the env's own actions.
+"""Controller: executes fitted movement primitives of a subtask in the env's own actions.
 
-    imitator = Imitator(env, ["demos/episode_000000.safetensors"])
+    controller = DmpController(env, ["demos/episode_000000.safetensors"])
     env.reset(seed=7)
-    imitator.reset()
-    env.step(imitator.action())
+    controller.reset()
+    env.step(controller.action())
 
-A lesson's primitives (`lesson`) run from the needle's measured start to the goal. Each step the
-needle's next pose becomes the tool's through the rigid grasp, measured anew each time, and the
-tool's becomes an action like the expert's. The primitive's clock waits while the command is more
-than one action behind it (phase stopping of Ijspeert et al., all or nothing), so the path is kept
-whatever the step size. Demonstrations end as soon as they are within the tolerance; when the last
-primitive has run out, its goal moves on to the subtask's own.
+The primitives (`fit`) run from the needle's measured start to the goal. Each step the needle's next
+pose becomes the tool's through the rigid grasp, measured anew each time, and the tool's becomes an
+action like the expert's. The primitive's clock stops while the command is more than one action
+behind it (phase stopping of Ijspeert et al., all or nothing), so the path is kept whatever the step
+size. Demonstrations end as soon as they are within the tolerance; when the last primitive has run
+out, its goal becomes the subtask's own.
 
-Where the needle is taken the tool runs relative to the grasp goal on the needle where it lies, jaws
-as open as the demonstration's before it closed, and closes when it is there.
+Where the needle is grasped the tool runs relative to the grasp goal on the resting needle, jaws as
+open as the demonstration's before it closed, and closes when it has arrived.
 """
 
 import functools
@@ -25,9 +25,23 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.names import SUTURE
-from surgicai_vision.demos.dmp.fit import CARRIED, Lesson, Piece, as_pose, learn_lesson
-from surgicai_vision.demos.dmp.primitive import Course
-from surgicai_vision.demos.expert import ALIGNED, ALIGNED_ANGLE, Sight, Wish, moves, toward
+from surgicai_vision.demos.demonstrator import Demonstrator
+from surgicai_vision.demos.dmp.fit import (
+    CARRY_PHASES,
+    CarryPhase,
+    SubtaskFit,
+    as_pose,
+    fit_subtask,
+)
+from surgicai_vision.demos.dmp.primitive import Execution
+from surgicai_vision.demos.expert import (
+    ALIGNED,
+    ALIGNED_ANGLE,
+    ToolTarget,
+    WorldState,
+    action_towards,
+    command_error,
+)
 from surgicai_vision.demos.store import read_demo
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.geometry import grasp_in_needle
@@ -36,14 +50,17 @@ from surgicai_vision.scene.rotations import geodesic_angle, matrix_to_quaternion
 Matrix = NDArray[np.float64]
 
 
-class Imitator:
-    """The imitator of an env; see the module's docstring. It begins an episode at its first action.
+class DmpController(Demonstrator):
+    """Executes movement primitives in an env; an episode starts at its first action.
 
     Args:
         env: the env.
         demos: files of demonstrations of its subtask; they may come from another scene or step
             size.
-        scaled: see `movement`.
+        scaled: see `primitive`.
+
+    Attributes:
+        fit: what was learned from the demonstrations.
 
     Raises:
         BadFile: a file that is no demonstration.
@@ -56,90 +73,91 @@ class Imitator:
                 "Movement primitives are learned for a subtask; the whole procedure has none."
             )
         self.env = env
-        self.lesson = _lesson(env.task, tuple(map(str, demos)), scaled)
-        self._course: Course | None = None
-        self._piece = 0
-        self._closing = self._waits = False
-        self._told = np.eye(4)
+        self.fit = _fit_files(env.task, tuple(map(str, demos)), scaled)
+        self._execution: Execution | None = None
+        self._index = 0
+        self._closing = False
+        self._behind = False
+        self._last_command = np.eye(4)
 
     def reset(self) -> None:
-        """Begin a new episode at the env's present state."""
-        self._begin(0, self._start(Sight(self.env)))
-        self._closing = self._waits = False
+        """Start a new episode at the env's present state."""
+        self._start_phase(0, self._start_pose(WorldState(self.env)))
+        self._closing = False
+        self._behind = False
 
     def action(self) -> NDArray[np.float32]:
-        """Return the next action, (7,) float32 in [-1, 1]."""
-        if self._course is None:
+        """Return the next action, (7,) in [-1, 1]."""
+        if self._execution is None:
             self.reset()
-        sight = Sight(self.env)
-        refused = self._waits and np.array_equal(sight.command, self._told)
-        self._waits = self._waits and not refused
-        wish = self._carry(sight) if self.env.task in CARRIED else self._take(sight)
-        self._waits, self._told = bool(np.abs(moves(sight, wish.tip)).max() > 1.0), sight.command
-        return toward(sight, wish)
+        world = WorldState(self.env)
+        if np.array_equal(world.command, self._last_command):
+            self._behind = False  # the env refused the last action: waiting would not help
+        target = self._carry(world) if self._phases else self._grasp(world)
+        self._behind = bool(np.abs(command_error(world, target.tip)).max() > 1.0)
+        self._last_command = world.command
+        return action_towards(world, target)
 
-    # -- the course --------------------------------------------------------------------------------
+    # -- the execution -----------------------------------------------------------------------------
 
-    def _begin(self, index: int, pose: Matrix) -> None:
-        """Start a part of the lesson at a pose in its coordinates."""
-        part = self.lesson.parts[index]
-        self._piece = index
-        self._course = part.primitive.start(*_split(pose), *_split(part.goal))
+    def _start_phase(self, index: int, pose: Matrix) -> None:
+        """Start a phase of the fit at a pose in its coordinates."""
+        phase = self.fit.phases[index]
+        self._index = index
+        self._execution = phase.primitive.start(*_split(pose), *_split(phase.goal))
 
-    def _next(self) -> Matrix:
-        """Move the course on by a control step, unless the tool is behind; return its pose in its
-        coordinates.
-        """
-        course = self._course
-        assert course is not None
-        if not self._waits:
-            course.advance(self.env.dt)
-        pose = as_pose(course.position, course.rotation)
-        if course.done and self._piece + 1 < len(self.lesson.parts):
-            before, after = self._pieces[self._piece], self._pieces[self._piece + 1]
+    def _next_pose(self) -> Matrix:
+        """Advance by a control step, unless the tool is behind, and return the phase's pose."""
+        execution = self._execution
+        assert execution is not None
+        if not self._behind:
+            execution.advance(self.env.dt)
+        pose = as_pose(execution.position, execution.rotation)
+        if execution.done and self._index + 1 < len(self.fit.phases):
+            before = self._phases[self._index]
+            after = self._phases[self._index + 1]
             stitch = self.env.stitch
             needle_pose = before.goal(stitch) @ pose @ np.linalg.inv(before.frame())
-            self._begin(
-                self._piece + 1, np.linalg.inv(after.goal(stitch)) @ needle_pose @ after.frame()
-            )
-        elif course.done:
-            course.aim(*_split(np.eye(4)))
+            start = np.linalg.inv(after.goal(stitch)) @ needle_pose @ after.frame()
+            self._start_phase(self._index + 1, start)
+        elif execution.done:
+            execution.set_goal(*_split(np.eye(4)))
         return pose
 
     @property
-    def _pieces(self) -> tuple[Piece, ...]:
-        return CARRIED[self.env.task]
+    def _phases(self) -> tuple[CarryPhase, ...]:
+        """Return the phases in which the needle is carried; none where it is grasped."""
+        return CARRY_PHASES.get(self.env.task, ())
 
-    def _start(self, sight: Sight) -> Matrix:
-        """Return where the episode starts, in the first part's coordinates."""
-        if self.env.task not in CARRIED:
-            return np.linalg.inv(self._grasp(sight)) @ sight.tip
-        piece = self._pieces[0]
-        return np.linalg.inv(piece.goal(sight.stitch)) @ sight.needle @ piece.frame()
+    def _start_pose(self, world: WorldState) -> Matrix:
+        """Return where the episode starts, in the first phase's coordinates."""
+        if not self._phases:
+            return np.linalg.inv(self._grasp_pose(world)) @ world.tip
+        phase = self._phases[0]
+        return np.linalg.inv(phase.goal(world.stitch)) @ world.needle @ phase.frame()
 
-    # -- wishes ------------------------------------------------------------------------------------
+    # -- tool targets ------------------------------------------------------------------------------
 
-    def _carry(self, sight: Sight) -> Wish:
-        piece = self._pieces[self._piece]
-        wanted = piece.goal(sight.stitch) @ self._next() @ np.linalg.inv(piece.frame())
-        return Wish(sight.carrying(wanted), 0.0)
+    def _carry(self, world: WorldState) -> ToolTarget:
+        phase = self._phases[self._index]
+        needle_pose = phase.goal(world.stitch) @ self._next_pose() @ np.linalg.inv(phase.frame())
+        return ToolTarget(world.tip_for_needle(needle_pose), 0.0)
 
-    def _take(self, sight: Sight) -> Wish:
-        goal = self._grasp(sight)
+    def _grasp(self, world: WorldState) -> ToolTarget:
+        goal = self._grasp_pose(world)
         if self._closing:
-            return Wish(sight.command if sight.holds else goal, 0.0)
-        wanted = goal @ self._next()
-        off = float(np.linalg.norm(sight.tip[:3, 3] - goal[:3, 3]))
-        there = off < ALIGNED and geodesic_angle(sight.tip[:3, :3], goal[:3, :3]) < ALIGNED_ANGLE
-        self._closing = self._course is not None and self._course.done and there
-        return Wish(wanted, self.lesson.opening)
+            return ToolTarget(world.command if world.holds else goal, 0.0)
+        tip = goal @ self._next_pose()
+        distance = float(np.linalg.norm(world.tip[:3, 3] - goal[:3, 3]))
+        angle = geodesic_angle(world.tip[:3, :3], goal[:3, :3])
+        arrived = distance < ALIGNED and angle < ALIGNED_ANGLE
+        self._closing = self._execution is not None and self._execution.done and arrived
+        return ToolTarget(tip, self.fit.jaw_opening)
 
-    def _grasp(self, sight: Sight) -> Matrix:
-        """Return T_world_tip of the grasp: at the angle the episode drew, or else at the
-        demonstrated one.
-        """
-        angle = sight.memory.grasp_angle or self.lesson.angle
-        return sight.needle @ grasp_in_needle(sight.arm, angle)
+    def _grasp_pose(self, world: WorldState) -> Matrix:
+        """Return T_world_tip of the grasp, at the episode's angle or else the demonstrated one."""
+        angle = world.memory.grasp_angle or self.fit.grasp_angle
+        return world.needle @ grasp_in_needle(world.arm, angle)
 
 
 def _split(pose: Matrix) -> tuple[Matrix, Matrix]:
@@ -148,6 +166,6 @@ def _split(pose: Matrix) -> tuple[Matrix, Matrix]:
 
 
 @functools.lru_cache(maxsize=8)
-def _lesson(task: str, demos: tuple[str, ...], scaled: bool) -> Lesson:
-    """Learn once per process."""
-    return learn_lesson(task, [read_demo(Path(path)) for path in demos], scaled)
+def _fit_files(task: str, demos: tuple[str, ...], scaled: bool) -> SubtaskFit:
+    """Fit once per process."""
+    return fit_subtask(task, [read_demo(Path(path)) for path in demos], scaled)

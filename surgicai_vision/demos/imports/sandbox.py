@@ -1,7 +1,7 @@
 """Read foreign recordings at arm's length: in a process of its own, with limits, without a network.
 
-    arrays = read_foreign(Path("regrasp_all_episodes_merged.pkl"))
-    arrays = read_foreign(Path("trial.bag"), "bag", topics={"psm2_pose": "/PSM2/measured_cp"})
+    arrays = read_sandboxed(Path("regrasp_all_episodes_merged.pkl"))
+    arrays = read_sandboxed(Path("trial.bag"), "bag", topics={"psm2_pose": "/PSM2/measured_cp"})
 
 The child sets its limits before it opens the file: memory, processor time, size of what it writes,
 and, where the kernel lets it, a network namespace of its own with nothing in it; an audit hook that
@@ -64,7 +64,7 @@ REFUSED = (
 """Audit events (by their beginning) that end the child."""
 
 
-def read_foreign(path: Path, kind: str = "surgicai", **options: Any) -> dict[str, np.ndarray]:
+def read_sandboxed(path: Path, kind: str = "surgicai", **options: Any) -> dict[str, np.ndarray]:
     """Read a recording in a limited child process.
 
     Args:

@@ -34,7 +34,7 @@ from surgicai_vision.demos.imports.replay import (
     grip_error,
     trimmed,
 )
-from surgicai_vision.demos.imports.sandbox import read_foreign
+from surgicai_vision.demos.imports.sandbox import read_sandboxed
 from surgicai_vision.demos.record import finished
 from surgicai_vision.demos.store import MARKER, list_demos, read_marker, write_demo, write_marker
 
@@ -92,7 +92,7 @@ def import_demos(
     """
     check_name("subtask", task, names.SUBTASKS)
     check_output(out, may_resume=MARKER)
-    arrays = read_foreign(file)
+    arrays = read_sandboxed(file)
     request = {"file": sha256_file(file), "task": task}
     if not finished(out, request):
         episodes = split(arrays)

@@ -15,7 +15,7 @@ from surgicai_vision.core.config import (
     to_mapping,
 )
 from surgicai_vision.core.errors import InputError, check_name
-from surgicai_vision.demos.record import DEMONSTRATORS, LEARNING
+from surgicai_vision.demos.demonstrator import SCRIPTED_DEMONSTRATORS
 from surgicai_vision.demos.rollout import Disturbance
 from surgicai_vision.evaluation.hierarchical import TERMINATIONS
 from surgicai_vision.experiments.run import OWN, Cell
@@ -34,9 +34,6 @@ AXES = (
     "chain",
 )
 """Keys of a grid that hold lists; one value alone may be written without brackets."""
-
-TEACHERS = tuple(name for name in DEMONSTRATORS if name not in LEARNING)
-"""Sources of demonstrations that need none themselves."""
 
 
 BANKS: Mapping[str, int] = MappingProxyType(
@@ -155,7 +152,7 @@ class Grid:
                 encoders.check_encoder_name(name)
         for name in self.policy:
             check_name("policy", name, (*policies.policy_names(), *LEROBOT_POLICIES))
-        check_name("demonstrator", self.demonstrator, TEACHERS)
+        check_name("demonstrator", self.demonstrator, SCRIPTED_DEMONSTRATORS)
         check_name("bank of starts", self.starts, BANKS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
         check_frame_stride(self.frame_stride)

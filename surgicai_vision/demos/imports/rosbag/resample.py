@@ -1,6 +1,6 @@
 """Recording: what a bag says of both arms and the needle, at the control rate and in our frames.
 
-    recording = recording_of(read_foreign(path, "bag", topics=config.all_topics), config)
+    recording = recording_of(read_sandboxed(path, "bag", topics=config.all_topics), config)
 
 Each topic has its own times, with jitter and messages lost. Times are those of the headers where
 there are headers (shifted by the median delay, so that they agree with topics that have none), or

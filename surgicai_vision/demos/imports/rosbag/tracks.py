@@ -18,7 +18,7 @@ from surgicai_vision.demos.imports.replay import Episode, Track, grip_error, nee
 from surgicai_vision.demos.imports.rosbag.config import BagConfig, listed
 from surgicai_vision.demos.imports.rosbag.resample import Arm, Recording, recording_of
 from surgicai_vision.demos.imports.rosbag.segments import Segment, holes_passed, moving, segments
-from surgicai_vision.demos.imports.sandbox import read_foreign
+from surgicai_vision.demos.imports.sandbox import read_sandboxed
 from surgicai_vision.scene import kinematics, needle
 from surgicai_vision.scene.holes import PAIRS
 from surgicai_vision.scene.rotations import matrix_to_rpy
@@ -78,7 +78,9 @@ def take_apart(
         BadFile: an unreadable bag.
         InputError: topics that are not there, nothing to segment by, nothing found.
     """
-    arrays = read_foreign(bag, "bag", topics=config.all_topics, needed=list(config.topics.given()))
+    arrays = read_sandboxed(
+        bag, "bag", topics=config.all_topics, needed=list(config.topics.given())
+    )
     try:
         recording = recording_of(arrays, config, base.scene.instrument)
         pair = PAIRS[base.scene.layout][base.scene.hole_pair - 1]

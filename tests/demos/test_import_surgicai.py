@@ -15,7 +15,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import STEPS
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
 from surgicai_vision.demos.imports import replay, sandbox, surgicai_pickle
-from surgicai_vision.demos.imports.sandbox import read_foreign
+from surgicai_vision.demos.imports.sandbox import read_sandboxed
 from surgicai_vision.demos.imports.surgicai import (
     check_task,
     import_demos,
@@ -265,7 +265,7 @@ def test_what_is_no_recording_is_one_line(tmp_path, content):
     path = tmp_path / "bad.pkl"
     path.write_bytes(content)
     with pytest.raises(BadFile) as caught:
-        read_foreign(path)
+        read_sandboxed(path)
     assert "\n" not in str(caught.value)
 
 
@@ -276,7 +276,7 @@ def test_npz_with_objects_or_bombs_is_refused(tmp_path):
         tmp_path / f"{name}.npz" for name in ("good", "objects", "bomb", "short")
     )
     np.savez(good, **arrays)
-    assert read_foreign(good)["action"].shape == arrays["action"].shape
+    assert read_sandboxed(good)["action"].shape == arrays["action"].shape
     np.savez(objects, **{**arrays, "action": np.array([os.system, None], dtype=object)})
     np.savez_compressed(bomb, **{**arrays, "action": np.zeros((2_000_000, 7))})
     np.savez(short, action=arrays["action"])
@@ -286,7 +286,7 @@ def test_npz_with_objects_or_bombs_is_refused(tmp_path):
         (short, "has no array done"),
     ):
         with pytest.raises(BadFile, match=message):
-            read_foreign(path)
+            read_sandboxed(path)
 
 
 class Call:
@@ -336,7 +336,7 @@ def test_the_reading_process_cannot_leave_its_limits(tmp_path, name):
 def test_what_the_child_cannot_finish_is_a_bad_file(tmp_path, recording, monkeypatch):
     monkeypatch.setattr(sandbox, "WALL_SECONDS", 0.01)
     with pytest.raises(BadFile, match="was not read within"):
-        read_foreign(recording)
+        read_sandboxed(recording)
 
 
 # -- SurgicAI's own recordings ---------------------------------------------------------------------

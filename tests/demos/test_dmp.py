@@ -11,24 +11,24 @@ from hypothesis import strategies as st
 from surgicai_vision import envs
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.demos.dmp import fit as lessons
-from surgicai_vision.demos.dmp.controller import Imitator
+from surgicai_vision.demos.dmp import fit
+from surgicai_vision.demos.dmp.controller import DmpController
 from surgicai_vision.demos.dmp.primitive import (
-    SLOW,
-    SLOW_TURN,
-    Course,
+    PAUSE_SPEED,
+    PAUSE_TURN_RATE,
+    Execution,
     Motion,
     conjugate,
-    filtered,
-    learn,
+    exp_quaternion,
+    fit_primitive,
+    log_quaternion,
     multiply,
-    quaternion_of,
-    turn_of,
+    without_pauses,
 )
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.imports.surgicai import import_demos
 from surgicai_vision.demos.record import record
-from surgicai_vision.demos.rollout import roll
+from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_demo
 from surgicai_vision.envs import poses
 
@@ -42,15 +42,15 @@ def motion(samples=60, dt=0.02, turn=2.5):
     bow = np.sin(np.pi * m)
     position = np.stack([0.05 * m, 0.01 * np.sin(2 * np.pi * m), 0.01 * bow - 0.02 * m], axis=1)
     turns = turn * m[:, None] * AXIS + np.stack([0.3 * bow, 0 * m, 0 * m], axis=1)
-    return Motion(position, quaternion_of(turns), dt)
+    return Motion(position, exp_quaternion(turns), dt)
 
 
-def play(course: Course, dt: float, steps: int) -> Motion:
-    positions, rotations = [course.position.copy()], [course.rotation.copy()]
+def play(execution: Execution, dt: float, steps: int) -> Motion:
+    positions, rotations = [execution.position.copy()], [execution.rotation.copy()]
     for _ in range(steps):
-        course.advance(dt)
-        positions.append(course.position.copy())
-        rotations.append(course.rotation.copy())
+        execution.advance(dt)
+        positions.append(execution.position.copy())
+        rotations.append(execution.rotation.copy())
     return Motion(np.array(positions), np.array(rotations), dt)
 
 
@@ -60,7 +60,7 @@ def ends(demo):
 
 def apart(a, b):
     """Largest distance [m] and angle [rad] between two motions, sample by sample."""
-    turns = turn_of(multiply(a.rotation, conjugate(b.rotation)))
+    turns = log_quaternion(multiply(a.rotation, conjugate(b.rotation)))
     return np.linalg.norm(a.position - b.position, axis=1).max(), np.linalg.norm(
         turns, axis=1
     ).max()
@@ -74,7 +74,9 @@ def test_reproduces_its_own_demonstration(samples, cut):
     whole = motion(samples)
     kept = slice(samples // 4, 3 * samples // 4) if cut else slice(None)
     demo = Motion(whole.position[kept], whole.rotation[kept], whole.dt)
-    distance, angle = apart(play(learn([demo]).start(*ends(demo)), demo.dt, len(demo) - 1), demo)
+    distance, angle = apart(
+        play(fit_primitive([demo]).start(*ends(demo)), demo.dt, len(demo) - 1), demo
+    )
     assert distance < 0.0003
     assert angle < math.radians(0.5)
 
@@ -82,10 +84,10 @@ def test_reproduces_its_own_demonstration(samples, cut):
 def test_standard_scaling_loses_an_axis_without_amplitude():
     demo = motion()
     assert demo.position[0, 1] == pytest.approx(demo.position[-1, 1], abs=1e-12)
-    played = play(learn([demo], scaled=True).start(*ends(demo)), demo.dt, len(demo) - 1)
+    played = play(fit_primitive([demo], scaled=True).start(*ends(demo)), demo.dt, len(demo) - 1)
     assert np.abs(played.position[:, 1]).max() < 1e-5 < 0.009 < np.abs(demo.position[:, 1]).max()
     assert np.abs(played.position[:, [0, 2]] - demo.position[:, [0, 2]]).max() < 0.0003
-    double = learn([demo], scaled=True).start(
+    double = fit_primitive([demo], scaled=True).start(
         demo.position[0], demo.rotation[0], 2 * demo.position[-1], demo.rotation[-1]
     )
     wide = play(double, demo.dt, len(demo) - 1)
@@ -95,39 +97,45 @@ def test_standard_scaling_loses_an_axis_without_amplitude():
 def test_another_start_and_goal_are_met_and_the_quaternion_stays_one():
     demo = motion()
     start, goal = np.array([0.01, -0.02, 0.005]), np.array([-0.03, 0.04, 0.02])
-    turned = quaternion_of(np.array([0.4, -0.9, 0.2]))
-    course = learn([demo]).start(start, quaternion_of(np.array([0.2, 0.0, -0.3])), goal, turned)
-    played = play(course, demo.dt, len(demo) + 20)
-    assert course.done
+    turned = exp_quaternion(np.array([0.4, -0.9, 0.2]))
+    execution = fit_primitive([demo]).start(
+        start, exp_quaternion(np.array([0.2, 0.0, -0.3])), goal, turned
+    )
+    played = play(execution, demo.dt, len(demo) + 20)
+    assert execution.done
     np.testing.assert_allclose(np.linalg.norm(played.rotation, axis=1), 1.0, atol=1e-12)
-    assert np.linalg.norm(course.position - goal) < 1e-4
-    assert np.linalg.norm(turn_of(multiply(course.rotation, conjugate(turned)))) < math.radians(0.2)
+    assert np.linalg.norm(execution.position - goal) < 1e-4
+    assert np.linalg.norm(
+        log_quaternion(multiply(execution.rotation, conjugate(turned)))
+    ) < math.radians(0.2)
 
 
 def test_goal_may_move_on_the_way():
     demo = motion()
-    course = learn([demo]).start(*ends(demo))
-    play(course, demo.dt, 30)
-    course.aim(np.array([0.1, 0.0, 0.0]), demo.rotation[0])
-    play(course, demo.dt, 90)
-    np.testing.assert_allclose(course.position, [0.1, 0.0, 0.0], atol=1e-5)
+    execution = fit_primitive([demo]).start(*ends(demo))
+    play(execution, demo.dt, 30)
+    execution.set_goal(np.array([0.1, 0.0, 0.0]), demo.rotation[0])
+    play(execution, demo.dt, 90)
+    np.testing.assert_allclose(execution.position, [0.1, 0.0, 0.0], atol=1e-5)
 
 
 def test_orientation_takes_the_short_way():
     demo = motion(turn=0.5)
-    straight = dataclasses.replace(learn([demo]), weights=np.zeros((80, 6)), drift=np.zeros(6))
-    near = quaternion_of(np.array([0.0, 0.0, 1.0]))
+    straight = dataclasses.replace(
+        fit_primitive([demo]), weights=np.zeros((80, 6)), drift=np.zeros(6)
+    )
+    near = exp_quaternion(np.array([0.0, 0.0, 1.0]))
     for goal in (near, -near):  # the same rotation, its quaternion from either half
         played = play(
             straight.start(np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), goal), demo.dt, 80
         )
-        steps = turn_of(multiply(played.rotation[1:], conjugate(played.rotation[:-1])))
+        steps = log_quaternion(multiply(played.rotation[1:], conjugate(played.rotation[:-1])))
         assert np.linalg.norm(steps, axis=1).sum() == pytest.approx(1.0, abs=0.01)
 
 
 def test_time_scales_and_the_path_stays():
     demo = motion()
-    primitive = learn([demo])
+    primitive = fit_primitive([demo])
     once = play(primitive.start(*ends(demo)), demo.dt, len(demo) - 1)
     slow = primitive.start(*ends(demo), duration=3 * primitive.duration)
     thrice = play(slow, 3 * demo.dt, len(demo) - 1)
@@ -144,18 +152,18 @@ def test_filter_drops_slow_samples_only():
     stopped = Motion(
         np.repeat(demo.position, 3, axis=0), np.repeat(demo.rotation, 3, axis=0), demo.dt
     )
-    np.testing.assert_array_equal(filtered(stopped).position, filtered(demo).position)
+    np.testing.assert_array_equal(without_pauses(stopped).position, without_pauses(demo).position)
     for speed, turn, kept in ((0.9, 0.9, 1), (1.1, 0.9, 10), (0.9, 1.1, 10)):
         time = 0.02 * np.arange(10)[:, None]
-        position = time * speed * SLOW * np.array([[0.6, 0.8, 0.0]])
-        rotation = quaternion_of(time * turn * SLOW_TURN * AXIS)
-        assert len(filtered(Motion(position, rotation, 0.02))) == kept
+        position = time * speed * PAUSE_SPEED * np.array([[0.6, 0.8, 0.0]])
+        rotation = exp_quaternion(time * turn * PAUSE_TURN_RATE * AXIS)
+        assert len(without_pauses(Motion(position, rotation, 0.02))) == kept
 
 
 def test_several_demonstrations_teach_their_mean():
     demo = motion()
     wide = Motion(demo.position * [1.0, 3.0, 1.0], demo.rotation, demo.dt)
-    played = play(learn([demo, wide]).start(*ends(demo)), demo.dt, len(demo) - 1)
+    played = play(fit_primitive([demo, wide]).start(*ends(demo)), demo.dt, len(demo) - 1)
     assert np.abs(played.position - demo.position * [1.0, 2.0, 1.0]).max() < 0.0005
 
 
@@ -166,7 +174,7 @@ def test_refuses_what_is_no_motion():
     with pytest.raises(InputError, match="unit quaternions"):
         Motion(demo.position, 2 * demo.rotation, demo.dt)
     with pytest.raises(InputError, match="got 0 and 80"):
-        learn([])
+        fit_primitive([])
 
 
 vectors = st.tuples(*[st.floats(-0.05, 0.05)] * 3).map(np.array)
@@ -179,11 +187,11 @@ def test_a_moved_demonstration_gives_the_moved_path(shift, turn, vector):
     """Round trip: learning in another frame and going back is learning here; and log is the inverse
     of exp.
     """
-    np.testing.assert_allclose(turn_of(quaternion_of(vector)), vector, atol=1e-12)
-    demo, frame = motion(20), quaternion_of(turn)
+    np.testing.assert_allclose(log_quaternion(exp_quaternion(vector)), vector, atol=1e-12)
+    demo, frame = motion(20), exp_quaternion(turn)
     matrix = np.stack(
         [
-            turn_of(multiply(multiply(frame, quaternion_of(axis)), conjugate(frame)))
+            log_quaternion(multiply(multiply(frame, exp_quaternion(axis)), conjugate(frame)))
             for axis in np.eye(3)
         ]
     )
@@ -192,10 +200,10 @@ def test_a_moved_demonstration_gives_the_moved_path(shift, turn, vector):
         multiply(np.broadcast_to(frame, (20, 4)), demo.rotation),
         demo.dt,
     )
-    here = play(learn([demo]).start(*ends(demo)), demo.dt, 19)
-    there = play(learn([moved]).start(*ends(moved)), demo.dt, 19)
+    here = play(fit_primitive([demo]).start(*ends(demo)), demo.dt, 19)
+    there = play(fit_primitive([moved]).start(*ends(moved)), demo.dt, 19)
     np.testing.assert_allclose(there.position, here.position @ matrix + shift, atol=1e-9)
-    back = turn_of(
+    back = log_quaternion(
         multiply(
             there.rotation, conjugate(multiply(np.broadcast_to(frame, (20, 4)), here.rotation))
         )
@@ -207,13 +215,13 @@ def test_a_moved_demonstration_gives_the_moved_path(shift, turn, vector):
 
 
 @pytest.fixture(scope="module")
-def taught(tmp_path_factory):
+def demonstrated(tmp_path_factory):
     """One of the expert's demonstrations per subtask: {task: path}."""
-    folder = tmp_path_factory.mktemp("taught")
+    folder = tmp_path_factory.mktemp("demonstrated")
     paths = {}
     for task in envs.SUBTASKS:
         env = envs.make(TaskConfig(task))
-        rollouts = (roll(env, Expert(env), seed) for seed in range(10))
+        rollouts = (rollout(env, Expert(env), seed) for seed in range(10))
         (folder / task).mkdir()
         paths[task] = write_demo(
             folder / task, 0, next(one.demo for one in rollouts if one.success)
@@ -222,33 +230,36 @@ def taught(tmp_path_factory):
 
 
 @pytest.mark.parametrize("task", list(envs.SUBTASKS))
-def test_one_demonstration_teaches_other_starts(taught, task):
+def test_one_demonstration_teaches_other_starts(demonstrated, task):
     env = envs.make(TaskConfig(task))
-    successes = [roll(env, Imitator(env, [taught[task]]), seed).success for seed in range(500, 505)]
+    successes = [
+        rollout(env, DmpController(env, [demonstrated[task]]), seed).success
+        for seed in range(500, 505)
+    ]
     assert sum(successes) >= 4, successes
 
 
-def test_an_insertion_is_cut_at_the_entry_and_a_pull_out_at_the_exit(taught):
-    for task, measured in (("insert", 1.0), ("pullout", 3.0)):
-        demo = read_demo(taught[task])
-        seen, env = lessons.watch(demo), envs.make(demo.config)
-        cut = lessons.CARRIED[task][0].end(seen)
+def test_an_insertion_is_cut_at_the_entry_and_a_pull_out_at_the_exit(demonstrated):
+    for task, holes in (("insert", 1.0), ("pullout", 3.0)):
+        demo = read_demo(demonstrated[task])
+        measured, env = fit.demo_poses(demo), envs.make(demo.config)
+        cut = fit.CARRY_PHASES[task][0].end(measured)
         env.set_state_vector(demo.state[min(cut + 6, len(demo))])
-        assert env.simulation.memory.passed == measured
+        assert env.simulation.memory.passed == holes
         env.set_state_vector(demo.state[max(cut - 4, 0)])
-        assert env.simulation.memory.passed < measured
+        assert env.simulation.memory.passed < holes
 
 
-def test_reset_begins_anew_and_the_same_start_gives_the_same_actions(taught):
+def test_reset_begins_anew_and_the_same_start_gives_the_same_actions(demonstrated):
     env = envs.make(TaskConfig("insert"))
-    imitator = Imitator(env, [taught["insert"]])
+    controller = DmpController(env, [demonstrated["insert"]])
     runs = []
     for _ in range(2):
         env.reset(seed=77)
-        imitator.reset()
+        controller.reset()
         actions = []
         for _ in range(15):
-            actions.append(imitator.action())
+            actions.append(controller.action())
             env.step(actions[-1])
         runs.append(np.array(actions))
     np.testing.assert_array_equal(*runs)
@@ -256,24 +267,24 @@ def test_reset_begins_anew_and_the_same_start_gives_the_same_actions(taught):
     assert np.abs(runs[0]).max() <= 1.0
 
 
-def test_refuses_lessons_that_do_not_fit(taught, tmp_path):
+def test_refuses_demonstrations_that_do_not_fit(demonstrated, tmp_path):
     insert, whole = envs.make(TaskConfig("insert")), envs.make(TaskConfig("suture"))
     with pytest.raises(InputError, match="A demonstration of place cannot teach insert"):
-        Imitator(insert, [taught["place"]])
+        DmpController(insert, [demonstrated["place"]])
     with pytest.raises(InputError, match="at least one"):
-        Imitator(insert, [])
+        DmpController(insert, [])
     with pytest.raises(InputError, match="whole procedure has none"):
-        Imitator(whole, [taught["insert"]])
-    demo = dataclasses.replace(read_demo(taught["insert"]), scene_hash="0" * 64)
+        DmpController(whole, [demonstrated["insert"]])
+    demo = dataclasses.replace(read_demo(demonstrated["insert"]), scene_hash="0" * 64)
     with pytest.raises(InputError, match="recorded in another scene"):
-        Imitator(insert, [write_demo(tmp_path, 0, demo)])
+        DmpController(insert, [write_demo(tmp_path, 0, demo)])
 
 
-def test_records_what_it_generates(taught, tmp_path):
-    seed = read_demo(taught["insert"]).seed
+def test_records_what_it_generates(demonstrated, tmp_path):
+    seed = read_demo(demonstrated["insert"]).seed
     out, given = (
         tmp_path / "demos",
-        {"demonstrator": "dmp", "demos": [taught["insert"]], "workers": 0},
+        {"demonstrator": "dmp", "demos": [demonstrated["insert"]], "workers": 0},
     )
     paths = record(TaskConfig("insert"), episodes=3, seed=seed, out=out, **given)
     demos = [read_demo(path) for path in paths]
@@ -285,27 +296,31 @@ def test_records_what_it_generates(taught, tmp_path):
     with pytest.raises(InputError, match="learns from demonstrations"):
         record(TaskConfig("insert"), episodes=1, out=tmp_path / "none", demonstrator="dmp")
     with pytest.raises(InputError, match="learns from no demonstrations"):
-        record(TaskConfig("insert"), episodes=1, out=tmp_path / "none", demos=[taught["insert"]])
+        record(
+            TaskConfig("insert"), episodes=1, out=tmp_path / "none", demos=[demonstrated["insert"]]
+        )
 
 
 @pytest.mark.parametrize(("task", "name"), [("insert", "insert_v2"), ("pullout", "pullout_v2")])
 def test_recordings_of_surgicai_teach_in_tissue(shared, tmp_path, task, name):
     import_demos(shared / "surgicai" / f"surgicai_{name}.npz", task=task, out=tmp_path / "demos")
     env, first = envs.make(TaskConfig(task)), list_demos(tmp_path / "demos")[0]
-    imitator = Imitator(env, [first])
-    assert imitator.lesson.bent == 1, "its needle moves beside the holes"
-    successes = [roll(env, Imitator(env, [first]), seed).success for seed in range(500, 504)]
+    controller = DmpController(env, [first])
+    assert controller.fit.projected == 1, "its needle moves beside the holes"
+    successes = [
+        rollout(env, DmpController(env, [first]), seed).success for seed in range(500, 504)
+    ]
     assert sum(successes) >= 3, successes
 
 
-def test_a_bent_path_keeps_its_turns_and_lies_in_the_holes(taught):
-    seen = lessons.watch(read_demo(taught["insert"]))
-    cut = lessons.CARRIED["insert"][0].end(seen)
-    path = seen.needle[cut:]
-    assert lessons._stray(seen.stitch, path) < lessons.ROOM
+def test_a_projected_path_keeps_its_turns_and_lies_in_the_holes(demonstrated):
+    measured = fit.demo_poses(read_demo(demonstrated["insert"]))
+    cut = fit.CARRY_PHASES["insert"][0].end(measured)
+    path = measured.needle[cut:]
+    assert fit._deviation_from_path(measured.stitch, path) < fit.CLEARANCE
     away = path.copy()
     away[:, :3, 3] += [0.003, 0.002, -0.004]
-    assert lessons._stray(seen.stitch, away) > lessons.ROOM
-    for bent, pose in zip(lessons._on_path(seen.stitch, away), path, strict=True):
-        assert poses.angle(poses.flat(bent), poses.flat(pose)) < math.radians(0.5)
-        assert poses.distance(poses.flat(bent), poses.flat(pose)) < 0.0003
+    assert fit._deviation_from_path(measured.stitch, away) > fit.CLEARANCE
+    for projected, pose in zip(fit._project(measured.stitch, away), path, strict=True):
+        assert poses.angle(poses.flat(projected), poses.flat(pose)) < math.radians(0.5)
+        assert poses.distance(poses.flat(projected), poses.flat(pose)) < 0.0003

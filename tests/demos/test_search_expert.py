@@ -15,8 +15,8 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import CLOCK_PERIOD, CLOCK_SIZE, SUBTASK_STEPS, TaskConfig, clock
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.demos.rollout import roll
-from surgicai_vision.demos.search_expert import Searcher
+from surgicai_vision.demos.rollout import rollout
+from surgicai_vision.demos.search_expert import SearchExpert
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.training.policies import load_policy
 from surgicai_vision.training.train import train
@@ -26,7 +26,7 @@ def grasp(env: envs.SuturingEnv, seed: int, goal: float | None = None) -> tuple[
     env.reset(seed=seed)
     if goal is not None:
         env.simulation.memory.grasp_angle = math.radians(goal)
-    actor, actions, ended, info = Searcher(env), [], False, {}
+    actor, actions, ended, info = SearchExpert(env), [], False, {}
     while not ended:
         actions.append(actor.action())
         _, _, terminated, truncated, info = env.step(actions[-1])
@@ -42,7 +42,10 @@ def test_it_meets_every_goal_and_reads_none() -> None:
         shortest = min(len(actions) for _, actions in tried)
         for _, actions in tried[1:]:
             np.testing.assert_array_equal(actions[:shortest], tried[0][1][:shortest])
-    second, third = Searcher.AGAIN, Searcher.AGAIN + CLOCK_PERIOD
+    second, third = (
+        SearchExpert.SECOND_ATTEMPT_STEP,
+        SearchExpert.SECOND_ATTEMPT_STEP + CLOCK_PERIOD,
+    )
     steps = [len(grasp(env, 500_000, goal)[1]) for goal in (12.5, 5.0, 20.0)]
     assert steps[0] < second < steps[1] < third < steps[2] < SUBTASK_STEPS
 
@@ -52,19 +55,17 @@ def test_its_demonstrations_show_every_attempt() -> None:
     shown.
     """
     env = envs.make(TaskConfig("grasp"))
-    rollout = roll(env, Searcher(env), 500_000, "search")
-    assert (
-        rollout.success and len(rollout.demo) == env.config.max_steps and rollout.demo.success.any()
-    )
-    closing = rollout.demo.action[:, 6] < -0.5
-    opening = rollout.demo.action[:, 6] > 0.5
-    edges = range(Searcher.AGAIN, env.config.max_steps + 1, CLOCK_PERIOD)
-    assert len(edges) == len(Searcher.ATTEMPTS)
+    result = rollout(env, SearchExpert(env), 500_000, "search")
+    assert result.success and len(result.demo) == env.config.max_steps and result.demo.success.any()
+    closing = result.demo.action[:, 6] < -0.5
+    opening = result.demo.action[:, 6] > 0.5
+    edges = range(SearchExpert.SECOND_ATTEMPT_STEP, env.config.max_steps + 1, CLOCK_PERIOD)
+    assert len(edges) == len(SearchExpert.ATTEMPTS)
     for start, stop in pairwise(edges):
         assert opening[start:stop].any() and closing[start:stop].any()
         assert opening[start:stop].argmax() < closing[start:stop].argmax()
     other = envs.make(TaskConfig("pullout"))
-    assert len(roll(other, Searcher(other), 500_000, "search").demo) < other.config.max_steps
+    assert len(rollout(other, SearchExpert(other), 500_000, "search").demo) < other.config.max_steps
 
 
 def test_the_clock_tells_steps_apart_and_comes_round() -> None:

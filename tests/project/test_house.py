@@ -1,4 +1,6 @@
-"""The distribution: what it owns, what its lock promises, what no file may name, doctor."""
+"""The house: what the distribution owns, what its lock promises, what no file may name, and
+doctor.
+"""
 
 import importlib.metadata
 import os

@@ -1,0 +1,78 @@
+"""Demonstrators: what labels the states of a rollout, and acts there unless something else does.
+
+    demonstrator = make_demonstrator("expert", env)
+    env.step(demonstrator.action())
+
+A `Demonstrator` looks at the env's whole state, privileged as it is. In DAgger a `BehaviourPolicy`
+acts in its place for a while; the labels stay the demonstrator's.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core.errors import check_name
+from surgicai_vision.core.plugins import resolve
+
+if TYPE_CHECKING:
+    from surgicai_vision.envs.base import SuturingEnv
+
+
+class Demonstrator(ABC):
+    """Labels the states of one episode; made anew for every episode."""
+
+    @property
+    def persists(self) -> bool:
+        """Return True if an episode goes on after its success, until its limit."""
+        return False
+
+    @abstractmethod
+    def action(self) -> NDArray[np.float32]:
+        """Return the action for the env's present state, (7,) in [-1, 1]."""
+
+
+class BehaviourPolicy(ABC):
+    """Acts in the demonstrator's place at first, while the labels stay the demonstrator's."""
+
+    @abstractmethod
+    def reset(self, env: "SuturingEnv", seed: int, rng: np.random.Generator) -> None:
+        """Start an episode: `env` has been reset."""
+
+    @abstractmethod
+    def action(self, env: "SuturingEnv", observation: Any) -> NDArray[np.float32] | None:
+        """Return the action that is executed, (7,), or None once the demonstrator acts itself."""
+
+
+DEMONSTRATORS: Mapping[str, str] = MappingProxyType(
+    {
+        "expert": "surgicai_vision.demos.expert:Expert",
+        "dmp": "surgicai_vision.demos.dmp.controller:DmpController",
+        "search": "surgicai_vision.demos.search_expert:SearchExpert",
+    }
+)
+"""Name → "module:class", imported on first use."""
+
+LEARNING_DEMONSTRATORS = frozenset({"dmp"})
+"""Those that learn from demonstrations, which their class takes as a second argument."""
+
+SCRIPTED_DEMONSTRATORS = tuple(name for name in DEMONSTRATORS if name not in LEARNING_DEMONSTRATORS)
+
+
+def make_demonstrator(name: str, env: "SuturingEnv", demos: Sequence[str] = ()) -> Demonstrator:
+    """Return a demonstrator for an episode of `env`.
+
+    Args:
+        name: a key of `DEMONSTRATORS`.
+        env: the env.
+        demos: files of the demonstrations that a learning demonstrator learns from.
+
+    Raises:
+        UnknownName: no demonstrator is called so.
+    """
+    kind = resolve(DEMONSTRATORS[check_name("demonstrator", name, DEMONSTRATORS)])
+    demonstrator: Demonstrator = kind(env, demos) if demos else kind(env)
+    return demonstrator
