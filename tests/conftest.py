@@ -1,5 +1,6 @@
-"""What every test stands on: a headless GL, no network, few threads, and the recordings where
-present.
+"""What every test stands on.
+
+A headless GL, no network, few threads, and the recordings where present.
 """
 
 import os

@@ -26,7 +26,7 @@ CONFIG = TaskConfig("place", max_steps=120)
 class Backwards:
     """A learner that goes the wrong way, more wildly than it may."""
 
-    def begin(self, slot, env, seed):
+    def reset(self, slot, env, seed):
         self.begun = seed
 
     def act(self, slots, envs, observations):

@@ -1,5 +1,6 @@
-"""A headless Chromium that tests steer through its debugging pipe; nothing but the standard
-library.
+"""A headless Chromium that tests steer through its debugging pipe.
+
+Nothing but the standard library.
 """
 
 import json

@@ -13,9 +13,24 @@ def checkpoint(folder: Path, task: str, policy: str = "bc") -> str:
     """Write an untrained policy that sees no image."""
     plugin = {"bc": BC, "hlp": HLP}[policy]
     written = Checkpoint(
-        task=TaskConfig(task), policy=policy, recipe=to_mapping(Recipe()), recipe_name="paper", views=(),
-        image_size=32, encoder=None, proprioception=True, seed=0, epoch=1, dataset="", demonstrations=1, frames=1,
-        validation_episodes=(), train_losses=(), validation_losses=(), device="cpu", code_version="",
-    )  # fmt: skip
+        task=TaskConfig(task),
+        policy=policy,
+        recipe=to_mapping(Recipe()),
+        recipe_name="paper",
+        views=(),
+        image_size=32,
+        encoder=None,
+        proprioception=True,
+        seed=0,
+        epoch=1,
+        dataset="",
+        demonstrations=1,
+        frames=1,
+        validation_episodes=(),
+        train_losses=(),
+        validation_losses=(),
+        device="cpu",
+        code_version="",
+    )
     write_checkpoint(folder, written, plugin.make(Recipe(), ()).state_dict())
     return str(folder)

@@ -31,8 +31,9 @@ class FakeData:
 
 @dataclass
 class FakeDataset(FakeData):
-    """A dataset in memory: the action is a smooth function of the state, plus one of the
-    features.
+    """A dataset in memory.
+
+    The action is a smooth function of the state, plus one of the features.
     """
 
     episodes: int = 5

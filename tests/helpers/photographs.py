@@ -6,9 +6,7 @@ import numpy as np
 
 
 def hopper() -> np.ndarray:
-    """The photograph of Grace Hopper that matplotlib ships, its upper square, (1, 224, 224, 3)
-    uint8 RGB.
-    """
+    """The photograph of Grace Hopper that matplotlib ships, (1, 224, 224, 3) uint8 RGB."""
     import cv2
     import matplotlib.cbook
 

@@ -1,5 +1,6 @@
-"""A sweep's folder as sweeps leave it, with generated episodes: every kind of thing a report has to
-show.
+"""A sweep's folder as sweeps leave it, with generated episodes.
+
+Every kind of thing a report has to show.
 """
 
 import itertools
@@ -17,8 +18,14 @@ TASKS = ("grasp", "insert", "handoff")
 ENCODERS = {"imagenet": 0.45, "imagenet-lite": 0.3, "random": 0.05}
 VIEWS = (("front",), ("back",), ("front", "back"))
 KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
-MACHINE = {"packages": {"mujoco": "4.0.0", "torch": "2.9"}, "python": "3.12.1", "system": "Linux 6 x86_64",
-           "processor": "a test's processor", "cores": 2, "renderer": "llvmpipe"}  # fmt: skip
+MACHINE = {
+    "packages": {"mujoco": "4.0.0", "torch": "2.9"},
+    "python": "3.12.1",
+    "system": "Linux 6 x86_64",
+    "processor": "a test's processor",
+    "cores": 2,
+    "renderer": "llvmpipe",
+}
 COMMAND = "surgicai-vision sweep table.yaml --out outputs/sweeps/table"
 
 
@@ -28,16 +35,25 @@ def episode(task, policy, seed, success, generator, stages=0):
     steps = int(generator.integers(60, 140)) if success else 200
     passed = task in ("insert", "suture") and (success or kind == "time")
     row = EpisodeMetrics(
-        task=task, policy=policy, seed=seed, success=success, steps=steps, grasp="friction", failure=kind,
-        trajectory_length_mm=float(generator.normal(45, 6)), contact=success, stages=stages or int(success),
+        task=task,
+        policy=policy,
+        seed=seed,
+        success=success,
+        steps=steps,
+        grasp="friction",
+        failure=kind,
+        trajectory_length_mm=float(generator.normal(45, 6)),
+        contact=success,
+        stages=stages or int(success),
         d_trans_mm=float(abs(generator.normal(0.7 if success else 6, 1.5))),
         d_angle_deg=float(abs(generator.normal(4 if success else 14, 3))),
         error="the start cannot be made" if kind == "error" else "",
         entry_mm=float(abs(generator.normal(0.6, 0.3))) if passed else float("nan"),
         exit_mm=float(abs(generator.normal(1.1, 0.5))) if passed else float("nan"),
-        slip_mm=float(abs(generator.normal(0.2, 0.1))), slip_deg=float(abs(generator.normal(3, 1))),
+        slip_mm=float(abs(generator.normal(0.2, 0.1))),
+        slip_deg=float(abs(generator.normal(3, 1))),
         tissue_force_n=float(abs(generator.normal(0.4, 0.2))),
-    )  # fmt: skip
+    )
     kept = np.linspace(0, steps, 10).astype(np.int64)
     return Episode(row, Film(kept, np.stack([kept, np.full(10, seed)], axis=1).astype(np.float64)))
 
@@ -58,13 +74,30 @@ def evaluation(folder, task, policy, rate, generator, about, episodes=20):
 
 
 def checkpoint(seed, recipe="paper", demonstrations=45):
-    return {"weights_sha256": "0123456789abcdef" * 4, "policy_sha256": "aa" * 32, "dataset": "fedcba9876543210" * 4,
-            "seed": seed, "policy": "bc", "recipe": recipe, "demonstrations": demonstrations}  # fmt: skip
+    return {
+        "weights_sha256": "0123456789abcdef" * 4,
+        "policy_sha256": "aa" * 32,
+        "dataset": "fedcba9876543210" * 4,
+        "seed": seed,
+        "policy": "bc",
+        "recipe": recipe,
+        "demonstrations": demonstrations,
+    }
 
 
 def cell(task, encoder, view, seed, **more):
-    return {"task": task, "encoder": encoder, "view": list(view), "seed": seed, "policy": "bc", "recipe": "paper",
-            "pool": "global", "privileged": False, "epochs": None, **more}  # fmt: skip
+    return {
+        "task": task,
+        "encoder": encoder,
+        "view": list(view),
+        "seed": seed,
+        "policy": "bc",
+        "recipe": "paper",
+        "pool": "global",
+        "privileged": False,
+        "epochs": None,
+        **more,
+    }
 
 
 def store_cell(out, key, described, rate, generator, **about):
@@ -72,8 +105,12 @@ def store_cell(out, key, described, rate, generator, **about):
     encoder, view = described["encoder"], described["view"]
     name = f"{encoder}-{'+'.join(view)}" if encoder else "proprioception"
     folder = out / "cells" / key
-    more = {"views": view, "encoder": encoder or name, "checkpoint": checkpoint(described["seed"]),
-            "folder": f"outputs/sweeps/table/cells/{key}/policy"}  # fmt: skip
+    more = {
+        "views": view,
+        "encoder": encoder or name,
+        "checkpoint": checkpoint(described["seed"]),
+        "folder": f"outputs/sweeps/table/cells/{key}/policy",
+    }
     summary = evaluation(
         folder / "evaluation", described["task"], name, rate, generator, {**more, **about}
     )
@@ -81,8 +118,9 @@ def store_cell(out, key, described, rate, generator, **about):
 
 
 def write_sweep(out, tasks=TASKS, seeds=(0, 1), encoders=ENCODERS, views=VIEWS):
-    """Write a sweep's folder: done cells, failed ones, ones not run, references, probes; return
-    `out`.
+    """Write a sweep's folder: done cells, failed ones, ones not run, references, probes.
+
+    Return `out`.
     """
     generator = np.random.default_rng(7)
     out.mkdir(parents=True, exist_ok=True)
@@ -101,7 +139,8 @@ def write_sweep(out, tasks=TASKS, seeds=(0, 1), encoders=ENCODERS, views=VIEWS):
             better = 0.25 if task == "handoff" else 0.0
             store_cell(out, key, described, rate + better + 0.1 * (view == ("back",)), generator)
         not_run.append(
-            f"not run: {task}, r3m-{'+'.join(view)}, seed {seed}: R3M's weights are not here; see its card."
+            f"not run: {task}, r3m-{'+'.join(view)}, seed {seed}: R3M's weights are not here; see"
+            " its card."
         )
     for task in tasks:
         store_cell(out, f"blind{task}", cell(task, None, (), 0), 0.05, generator)
@@ -118,11 +157,20 @@ def write_sweep(out, tasks=TASKS, seeds=(0, 1), encoders=ENCODERS, views=VIEWS):
     }
     files.write_json(out / "run.json", run)
     probes = [
-        {"encoder": encoder, "view": "+".join(view), "pool": "global", "angle_deg": 12.0, "n": 50,
-         "task": "handoff", "tip_mm_low": 2.0, "tip_mm_high": 7.0, "tip_mm_chance": 9.5,
-         "tip_mm": 6 - 4 * rate + generator.normal(0, 0.2)}
+        {
+            "encoder": encoder,
+            "view": "+".join(view),
+            "pool": "global",
+            "angle_deg": 12.0,
+            "n": 50,
+            "task": "handoff",
+            "tip_mm_low": 2.0,
+            "tip_mm_high": 7.0,
+            "tip_mm_chance": 9.5,
+            "tip_mm": 6 - 4 * rate + generator.normal(0, 0.2),
+        }
         for (encoder, rate), view in itertools.product(encoders.items(), views)
-    ]  # fmt: skip
+    ]
     pq.write_table(pa.Table.from_pylist(probes), out / "probes.parquet")
     return out
 
@@ -135,8 +183,12 @@ def add_curves(out):
         store_cell(out, f"data{encoder}{count}", described, 0.1 + count / 200, generator)
     for axis, strength in itertools.product(("light", "blur"), (0.25, 0.5, 1.0)):
         for encoder in ("imagenet", "imagenet-lite"):
-            about = {"views": ["back"], "encoder": encoder, "checkpoint": checkpoint(0, demonstrations=50),
-                     "shift": {"axis": axis, "strength": strength}}  # fmt: skip
+            about = {
+                "views": ["back"],
+                "encoder": encoder,
+                "checkpoint": checkpoint(0, demonstrations=50),
+                "shift": {"axis": axis, "strength": strength},
+            }
             place = out / "robustness" / f"{encoder}-{axis}-{strength}"
             evaluation(place, "place", f"{encoder}-back", 0.6 - 0.5 * strength, generator, about)
     for swap in (None, "grasp", "insert"):
@@ -147,7 +199,14 @@ def add_curves(out):
             )
             for at, stage in enumerate(stages)
         ]
-        about = {"task_config": to_mapping(TaskConfig("suture")), "chain": {"hlp": "order"}, "encoder": "imagenet",
-                 "views": ["front", "back"], "swap": swap, "command": COMMAND, "provenance": MACHINE}  # fmt: skip
+        about = {
+            "task_config": to_mapping(TaskConfig("suture")),
+            "chain": {"hlp": "order"},
+            "encoder": "imagenet",
+            "views": ["front", "back"],
+            "swap": swap,
+            "command": COMMAND,
+            "provenance": MACHINE,
+        }
         write_evaluation(out / "chains" / str(swap), made, about)
     return out

@@ -1,5 +1,6 @@
-"""Wheel and sdist: built, the wheel installed where nothing else of ours is, and used from another
-folder.
+"""Wheel and sdist.
+
+Built, the wheel installed where nothing else of ours is, and used from another folder.
 """
 
 import os
@@ -19,11 +20,13 @@ from surgicai_vision.core.files import configs_folder
 from surgicai_vision.features.encoders import encoder_card
 for module in (surgicai_vision, encoders, policies):
     assert pathlib.Path(module.__file__).is_relative_to(sys.argv[1]), module.__file__
-assert configs_folder() == pathlib.Path(sys.argv[1]) / "surgicai_vision" / "configs", configs_folder()
+site = pathlib.Path(sys.argv[1])
+assert configs_folder() == site / "surgicai_vision" / "configs", configs_folder()
 assert (configs_folder() / "README.md").is_file()
 assert encoder_card("imagenet-lite").offline
 owners = importlib.metadata.packages_distributions()
-assert all(set(owners[name]) == {"surgicai-vision"} for name in ("surgicai_vision", "encoders", "policies"))
+for name in ("surgicai_vision", "encoders", "policies"):
+    assert set(owners[name]) == {"surgicai-vision"}, owners[name]
 assert importlib.metadata.version("surgicai-vision") == surgicai_vision.__version__
 """
 

@@ -1,6 +1,4 @@
-"""The report: every number and image is there, the page stands alone, and what it says of a
-quickstart.
-"""
+"""The report: every number and image is there, and the page stands alone."""
 
 import contextlib
 import re
@@ -36,10 +34,19 @@ def episode(policy, seed, success):
     """An episode of 90 steps, or of 200 without success."""
     steps = 90 if success else 200
     row = EpisodeMetrics(
-        task="grasp", policy=policy, seed=seed, success=success, steps=steps, trajectory_length_mm=41.5 + seed % 7,
-        d_trans_mm=0.8 if success else 6.3, d_angle_deg=4.0, contact=success, error="", grasp="friction",
+        task="grasp",
+        policy=policy,
+        seed=seed,
+        success=success,
+        steps=steps,
+        trajectory_length_mm=41.5 + seed % 7,
+        d_trans_mm=0.8 if success else 6.3,
+        d_angle_deg=4.0,
+        contact=success,
+        error="",
+        grasp="friction",
         failure="" if success else "missed",
-    )  # fmt: skip
+    )
     kept = np.linspace(0, steps, 9).astype(np.int64)
     return Episode(row, Film(kept, np.stack([kept, np.full(9, seed)], axis=1).astype(np.float64)))
 
@@ -133,9 +140,7 @@ class Page(HTMLParser):
 
 
 def assert_stands_alone(text):
-    """Nothing is loaded from anywhere, every tag is closed, every link of the page has its
-    target.
-    """
+    """Nothing is loaded from elsewhere, tags are closed, links have their targets."""
     page = Page(text)
     assert page.open == []
     inside = {address[1:] for address in page.addresses if address.startswith("#")}

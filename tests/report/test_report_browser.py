@@ -1,5 +1,6 @@
-"""The report in headless Chromium: filtering, sorting, a cell's episodes, a phone's width,
-print.
+"""The report in headless Chromium.
+
+Filtering, sorting, a cell's episodes, a phone's width, print.
 """
 
 import html
@@ -60,18 +61,22 @@ def browse(folder, page, *options):
 SCRIPT = """
 <script>
 (async () => {
-  const say = {}, find = s => document.querySelector(s), all = s => [...document.querySelectorAll(s)];
-  const column = n => all("#success tbody tr:not([hidden])").map(row => row.cells[n].textContent.trim());
+  const say = {}, find = s => document.querySelector(s),
+    all = s => [...document.querySelectorAll(s)];
+  const column = n => all("#success tbody tr:not([hidden])").map(row =>
+    row.cells[n].textContent.trim());
   say.all = column(0).length;
   const task = find("select[data-filter=task]");
   task.value = "insert"; task.dispatchEvent(new Event("input"));
-  say.filtered = [...new Set(column(0))]; say.count = column(0).length; say.line = find("#shown").textContent;
+  say.filtered = [...new Set(column(0))]; say.count = column(0).length;
+  say.line = find("#shown").textContent;
   say.measures = [...new Set(all("#measures tbody tr:not([hidden])").map(row => row.dataset.task))];
   const words = find("#search"); words.value = "lite back"; words.dispatchEvent(new Event("input"));
   say.searched = column(1).length;
   task.value = ""; words.value = "";
   task.dispatchEvent(new Event("input")); words.dispatchEvent(new Event("input"));
-  const heads = all("#success th button"), click = name => heads.find(b => b.textContent.startsWith(name)).click();
+  const heads = all("#success th button"),
+    click = name => heads.find(b => b.textContent.startsWith(name)).click();
   const values = n => all("#success tbody tr").map(row => row.cells[n].dataset.v);
   click("success"); say.down = values(3); click("success"); say.up = values(3);
   click("task"); say.tasks = column(0);
@@ -80,13 +85,16 @@ SCRIPT = """
   say.open = find("#episodes").open; say.title = find("#episodes-title").textContent;
   say.squares = all("#episodes .squares button").length;
   say.won = all("#episodes .squares button").filter(b => b.textContent === "✓").length;
-  say.films = all("#episodes figure.rollout").length; say.frames = all("#episodes figure.rollout img").length;
+  say.films = all("#episodes figure.rollout").length;
+  say.frames = all("#episodes figure.rollout img").length;
   say.dialog = find("#episodes-body").textContent; say.hash = location.hash;
   find("#episodes .pin").click(); say.pinned = all("#pinned figure img").length;
   find("#close").click(); say.closed = !find("#episodes").open;
-  find(".heat td[data-group]").dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", bubbles: true }));
+  find(".heat td[data-group]").dispatchEvent(new KeyboardEvent("keydown", { key: "Enter",
+    bubbles: true }));
   say.keyboard = find("#episodes").open; find("#close").click();
-  find("td.absent[data-group]").click(); say.absent = find("#episodes-body").textContent; find("#close").click();
+  find("td.absent[data-group]").click(); say.absent = find("#episodes-body").textContent;
+  find("#close").click();
   const more = find("[data-all]"); more.click();
   say.pairs = all("#pair-table tbody tr").filter(r => r.offsetHeight > 0).length;
   say.images = all("img").filter(i => !(i.complete && i.naturalWidth > 0)).length;
@@ -147,11 +155,13 @@ def test_at_a_phones_width_nothing_but_marked_tables_is_wider(written, tmp_path)
     frame = tmp_path / "phone.html"
     source = (written / "report.html").as_uri()
     frame.write_text(
-        f'<iframe id="f" src="{source}" style="width:375px;height:800px;border:0"></iframe>'
-        '<script>addEventListener("load", () => { const d = document.getElementById("f").contentDocument;'
-        'const wide = [...d.querySelectorAll("main *")].filter(n => n.getBoundingClientRect().right > 376 &&'
-        ' !n.closest(".scroll, dialog")).map(n => n.tagName + "." + n.className);'
-        'document.body.dataset.said = d.documentElement.scrollWidth + ":" + wide.join(","); });</script>'
+        f'<iframe id="f" src="{source}"'
+        ' style="width:375px;height:800px;border:0"></iframe><script>addEventListener("load", ()'
+        ' => { const d = document.getElementById("f").contentDocument;const wide ='
+        ' [...d.querySelectorAll("main *")].filter(n => n.getBoundingClientRect().right > 376 &&'
+        ' !n.closest(".scroll, dialog")).map(n => n.tagName + "." +'
+        ' n.className);document.body.dataset.said = d.documentElement.scrollWidth + ":" +'
+        ' wide.join(","); });</script>'
     )
     done = browse(
         tmp_path,

@@ -1,5 +1,6 @@
-"""The report of a sweep: nothing is silently absent, numbers agree with the rows, and the page
-works in a browser.
+"""The report of a sweep.
+
+Nothing is silently absent, numbers agree with the rows, and the page works in a browser.
 """
 
 import csv
@@ -184,8 +185,9 @@ def test_a_plans_cells_that_nobody_came_to_are_pending(tmp_path):
     ]
     missing = collect(tmp_path / "s", plan).missing
     assert [(item.condition.encoder, item.seed, item.state) for item in missing] == [
-        ("clip", 3, "not run"), ("imagenet", 0, "pending"),
-    ]  # fmt: skip
+        ("clip", 3, "not run"),
+        ("imagenet", 0, "pending"),
+    ]
     assert missing[0].reason == "no weights"
 
 
@@ -273,9 +275,10 @@ def test_a_reference_that_several_sweeps_evaluated_stands_once(tmp_path):
             tmp_path / name, "grasp", "expert", rate, np.random.default_rng(seed), {}, episodes
         )
     told = {(r.folder.name, r.condition.place) for r in collect(tmp_path).results}
-    assert told == {("right", "right"), ("other", "other")}, (
-        "what another saw goes in, what differs is told apart"
-    )
+    assert told == {
+        ("right", "right"),
+        ("other", "other"),
+    }, "what another saw goes in, what differs is told apart"
     shutil.rmtree(tmp_path / "other")
     assert [(r.folder.name, r.condition.place) for r in collect(tmp_path).results] == [
         ("right", "")
@@ -377,8 +380,9 @@ def test_two_evaluations_of_the_same_thing_are_not_counted_as_one(tmp_path):
     for name in ("friction", "attach"):
         evaluation(tmp_path / name, "grasp", "expert", 1.5, generator, {})
     assert [(item.label, item.episodes) for item in group(collect(tmp_path))] == [
-        ("expert · attach", 20), ("expert · friction", 20),
-    ]  # fmt: skip
+        ("expert · attach", 20),
+        ("expert · friction", 20),
+    ]
 
 
 def test_what_a_running_sweep_has_not_filed_is_no_result_yet(tmp_path):
@@ -505,8 +509,9 @@ def test_latex_compiles(written, tmp_path):
 
 
 def test_latex_escapes_what_it_would_read_as_a_command():
-    assert formats.escape_latex("50 % of a_b & {c} ~ \\x") == (
-        r"50 \% of a\_b \& \{c\} \textasciitilde{} \textbackslash{}x"
+    assert (
+        formats.escape_latex("50 % of a_b & {c} ~ \\x")
+        == r"50 \% of a\_b \& \{c\} \textasciitilde{} \textbackslash{}x"
     )
 
 

@@ -1,6 +1,4 @@
-"""The house: what the distribution owns, what its lock promises, what no file may name, and
-doctor.
-"""
+"""The distribution: what it owns, what its lock promises, what no file may name, doctor."""
 
 import importlib.metadata
 import os
