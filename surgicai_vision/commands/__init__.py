@@ -2,16 +2,22 @@
 
 A command's module holds
 
-* `Options`, a frozen dataclass: the command's options, and the schema of its `--config` file. A
-  field's annotation is `Annotated[type, TRAIT, ...]` with traits of `options.py` or a
-  `cyclopts.Parameter` of its own; its line under `Attributes:` in the docstring is its help. Fields
-  with `dataclasses.field(kw_only=False)` are positional, all others are options. `type | None` is an
-  option that may be left out (say by `default_text(...)` what happens then), a `tuple` is a comma
-  list that may also be repeated, a `bool` has `--no-NAME`, a `FILE_ONLY` field stands in a
-  `--config` file alone.
-* `run(options, *, console)`, registered by `@app.default`; it returns the result that `--json`
-  prints, with `exit_code` 1 where the command ran and found something wrong.
 * `app = App(name=..., help_epilogue=...)`; the epilogue is the example below `--help`.
+* `Options`, a frozen dataclass: the command's options, and the schema of its `--config` file.
+* `run(options, *, console)`, registered by `@app.default`. It returns the result that `--json`
+  prints, with `exit_code` 1 where the command ran and found something wrong.
+
+An option is a field `name: Annotated[type, TRAIT, ...] = default`, with traits of `options.py` or a
+`cyclopts.Parameter` of its own. Its line under `Attributes:` in the docstring is its help, unless
+its trait has one. What cyclopts makes of the type:
+
+* `bool`: `--name` and `--no-name` (`Parameter(negative=())` leaves the second out).
+* `tuple[type, ...]`: a comma list, which may also be given piece by piece.
+* `type | None`: may be left out; `default_text("...")` says in `--help` what happens then.
+* a field with `dataclasses.field(kw_only=False)`: a positional argument.
+* `FILE_ONLY`: a table that only the `--config` file can give.
+
+Where every option has a default, cyclopts asks for `def run(options: Options = Options(), ...)`.
 
 Its line in `COMMANDS` (or in `COMMANDS` of the package that groups several, as `dataset`) makes it
 known. It is imported when it runs or when its `--help` is asked for: what takes long to import
@@ -22,7 +28,7 @@ known. It is imported when it runs or when its `--help` is asked for: what takes
     class Options:
         \"\"\"Options of `count`.
 
-        Attributes:
+Attributes:
             dataset: Folder of the dataset.
             view: Views to count.
         \"\"\"

@@ -34,7 +34,7 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Show the entries, or delete those of no dataset that is kept."""
+    """Print the entries, or delete those of every dataset but the kept ones."""
     from surgicai_vision.features.cache import default_cache_root, list_cache, prune_cache
 
     prune = options.action == "prune"
@@ -74,7 +74,8 @@ def _text(manifest: Mapping[str, Any] | None) -> str:
     if manifest is None:
         return "unfinished"
     shape = " × ".join(map(str, (manifest["length"], *manifest["shape"])))
-    return f"{manifest['encoder']}, {manifest['view']}, {manifest['pool']}, {shape}, dataset {manifest['dataset'][:12]}"
+    dataset = f"dataset {manifest['dataset'][:12]}"
+    return ", ".join((manifest["encoder"], manifest["view"], manifest["pool"], shape, dataset))
 
 
 def _row(folder: Path, size: int, manifest: Mapping[str, Any] | None) -> dict[str, object]:

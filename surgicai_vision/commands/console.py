@@ -1,19 +1,18 @@
 """The console: results on stdout, progress on stderr."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import final
 
 from cyclopts import Parameter
 
-Progress = Callable[..., None]
-"""Called as progress(done, total) or progress(done, total, unit), both counted from the start."""
+from surgicai_vision.core.progress import Progress, silent
 
 
 @final
 @Parameter(parse=False)
 class Console:
-    """Where a command prints. `rich` is imported with the first bar: short commands stay quick."""
+    """Where a command prints; cyclopts gives it to every command that asks for one."""
 
     def say(self, text: str = "") -> None:
         """Print a line of the result."""
@@ -26,28 +25,22 @@ class Console:
         Rich(stderr=True, highlight=False).print(text, markup=False, soft_wrap=True)
 
     @contextmanager
-    def stage(self, title: str, unit: str = "") -> Iterator[Progress]:
+    def stage(self, title: str, unit: str = "", /) -> Iterator[Progress]:
         """Show a progress bar for one stage; yields the function that moves it."""
+        from rich import progress as rich_progress
         from rich.console import Console as Rich
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
 
         columns = (
-            TextColumn("{task.description:<38}"),
-            BarColumn(bar_width=20),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[unit]}"),
-            TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+            rich_progress.TextColumn("{task.description:<38}"),
+            rich_progress.BarColumn(bar_width=20),
+            rich_progress.MofNCompleteColumn(),
+            rich_progress.TextColumn("{task.fields[unit]}"),
+            rich_progress.TimeRemainingColumn(compact=True, elapsed_when_finished=True),
         )
-        bars = Progress(*columns, console=Rich(stderr=True), refresh_per_second=4)
+        bars = rich_progress.Progress(*columns, console=Rich(stderr=True), refresh_per_second=4)
         bar = bars.add_task(title, total=None, unit=unit)
 
-        def move(done: int, total: int, unit: str = unit) -> None:
+        def move(done: int, total: int, unit: str = unit, /) -> None:
             bars.start()  # on the first call only: wrong input found before any work shows no bar
             bars.update(bar, completed=done, total=total, unit=unit)
 
@@ -69,6 +62,6 @@ class QuietConsole:
         """Drop the line."""
 
     @contextmanager
-    def stage(self, title: str, unit: str = "") -> Iterator[Progress]:
-        """Yield a function that does nothing."""
-        yield lambda done, total, unit="": None
+    def stage(self, title: str, unit: str = "", /) -> Iterator[Progress]:
+        """Yield a progress that shows nothing."""
+        yield silent

@@ -1,4 +1,4 @@
-"""Doctor: look at this machine and say, line by line, what is well, what is not, and what to do.
+"""The checks of `doctor`: Python, packages, import names, GL, GPU, encoders and disk.
 
 Whatever can crash a process or take long to import (GL, torch, the encoders) is looked at in a
 process of its own, `python -m surgicai_vision.commands.doctor_checks PROBE`, so that a broken
@@ -17,17 +17,21 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import unquote, urlparse
 
 from surgicai_vision.core.processes import OFFLINE, start_module
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
 
 DISTRIBUTION = "surgicai-vision"
 PACKAGES = ("surgicai_vision", "encoders", "policies")
 GL_LINE = "sudo apt-get install --yes --no-install-recommends libegl1 libgl1"
 PROBE_SECONDS = 120
 DISK_GB = 5.0  # a quickstart writes well under 1 GB; 1,000 demonstrations in five views about 20
-FRAMES, FRAME_SIZE = 30, 224
+FRAMES = 30
+FRAME_SIZE = 224
 
 Status = Literal["ok", "warning", "fail"]
 Finding = dict[str, Any]
@@ -51,7 +55,7 @@ class Check:
 
 
 def check() -> list[Check]:
-    """Look at Python, packages, import names, GL, GPU, encoders and disk, in this order."""
+    """Run every check, in the order of the report."""
     probes = {name: start_probe(name) for name in PROBES}
     return [
         check_python(),
@@ -74,8 +78,9 @@ def check_python(version: tuple[int, int] | None = None) -> Check:
 
 
 def check_packages(lock: Path | None = None) -> Check:
-    """Compare installed packages with requirements.lock, or outside a checkout with what the wheel
-    requires.
+    """Compare installed packages with requirements.lock.
+
+    Outside a checkout they are compared with what the wheel requires.
     """
     lock = lock or Path(__file__).resolve().parents[2] / "requirements.lock"
     locked = lock.is_file()
@@ -92,7 +97,7 @@ def check_packages(lock: Path | None = None) -> Check:
     )
 
 
-def locked_requirements(lock: Path) -> list[Any]:
+def locked_requirements(lock: Path) -> list["Requirement"]:
     """Return the requirements of a lock file that hold on this machine."""
     from packaging.requirements import Requirement
 
@@ -101,7 +106,7 @@ def locked_requirements(lock: Path) -> list[Any]:
     return [pin for pin in pins if pin.marker is None or pin.marker.evaluate()]
 
 
-def own_requirements() -> list[Any]:
+def own_requirements() -> list["Requirement"]:
     """Return the requirements the installed distribution declares, without its extras."""
     from packaging.requirements import Requirement
 
@@ -109,8 +114,8 @@ def own_requirements() -> list[Any]:
     return [each for each in declared if each.marker is None or each.marker.evaluate({"extra": ""})]
 
 
-def mismatch(requirement: Any) -> str:
-    """Say how the installed package differs from `requirement`; empty where it agrees."""
+def mismatch(requirement: "Requirement") -> str:
+    """Return how the installed package differs from `requirement`, "" where it agrees."""
     try:
         installed = importlib.metadata.version(requirement.name)
     except importlib.metadata.PackageNotFoundError:
@@ -161,7 +166,8 @@ def check_gl(finding: Finding) -> Check:
     if "error" in finding:
         advice = "GL works and our scene does not: report it" if "renderer" in finding else GL_LINE
         return Check("GL", "fail", f"{backend}: nothing renders ({finding['error']})", advice)
-    speed = f"{finding['frames_per_second']:.0f} frames/s of the grasp scene at {FRAME_SIZE} × {FRAME_SIZE}"
+    size = f"{FRAME_SIZE} × {FRAME_SIZE}"
+    speed = f"{finding['frames_per_second']:.0f} frames/s of the grasp scene at {size}"
     return Check("GL", "ok", f"{backend}, {finding['renderer']}: {speed}")
 
 

@@ -57,7 +57,7 @@ class Options:
 
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
-    """Encode every view and say where the features are."""
+    """Encode every view and print where the features are."""
     weights = join_weights(options.weights)
     encoders.find_weights(options.encoder, weights, options.accept_licence)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
@@ -73,9 +73,10 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     for view in options.view:
         with console.stage(f"encoding {view} by {options.encoder}", "frames") as progress:
             features = encode(dataset, view, encoder, progress=progress)
-        state = f"{features.encoded} frames encoded" if features.encoded else "at hand"
+        state = f"{features.encoded} frames encoded" if features.encoded else "in the cache"
         console.say(
-            f"{options.encoder} {view}: {len(features.rows)} × {features.dim}, {state}: {features.folder}"
+            f"{options.encoder} {view}: {len(features.rows)} × {features.dim}, {state}: "
+            f"{features.folder}"
         )
         rows.append(features.rows)
         entries.append(

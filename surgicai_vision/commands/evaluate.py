@@ -135,7 +135,8 @@ def subject_of(options: Any) -> Any:
     trained_for = subject.config.task
     if options.task not in (None, trained_for):
         raise InputError(
-            f"{folder} was trained for '{trained_for}', not for --task {options.task}; leave --task out."
+            f"{folder} was trained for '{trained_for}', not for --task {options.task}; "
+            "leave --task out."
         )
     return _in_env(subject, options.env)
 
@@ -190,7 +191,7 @@ def _run_swaps(options: Options, console: Console) -> dict[str, object]:
 
 
 def summary_line(result: dict[str, Any]) -> str:
-    """Return a result in one line for people."""
+    """Return one line about an evaluation."""
     low, high = result["ci95"]
     line = (
         f"{result['policy']} on {result['task']}: {result['successes']}/{result['episodes']} "

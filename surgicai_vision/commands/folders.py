@@ -1,4 +1,4 @@
-"""Where commands read and write when nothing else is said: below `outputs/` in the current folder."""
+"""Where commands read and write by default: below `outputs/` in the current folder."""
 
 import os
 import tempfile
@@ -17,22 +17,22 @@ CORES = len(os.sched_getaffinity(0))
 
 
 def demos_folder(task: str) -> Path:
-    """Demonstrations of a task."""
+    """Return the folder of a task's demonstrations."""
     return OUTPUTS / "demos" / task
 
 
 def dataset_folder(task: str) -> Path:
-    """The dataset of a task."""
+    """Return the folder of a task's dataset."""
     return OUTPUTS / "datasets" / task
 
 
 def train_folder(task: str, name: str, seed: int) -> Path:
-    """The checkpoint of one training, by the policy's name."""
+    """Return the checkpoint folder of one training, by the policy's name."""
     return OUTPUTS / "train" / f"{task}-{name}-seed{seed}"
 
 
 def evaluation_folder(task: str, policy: str, seed: int, episodes: int) -> Path:
-    """One evaluation."""
+    """Return the folder of one evaluation."""
     return OUTPUTS / "evaluations" / f"{task}-{policy}-starts{seed}+{episodes}"
 
 
@@ -62,10 +62,10 @@ def demos_task(folder: Path) -> str:
 
 
 def open_dataset(folder: Path | None, task: str, views: Sequence[str]) -> "RenderedDataset":
-    """Open a dataset, by default the task's; say which command makes it where there is none.
+    """Open a dataset, by default the task's.
 
     Raises:
-        BadFile: no dataset there.
+        BadFile: no dataset there; the message says which command makes it.
         UnknownName: a view the dataset does not have.
     """
     path = folder or dataset_folder(task)
@@ -83,8 +83,10 @@ def open_dataset(folder: Path | None, task: str, views: Sequence[str]) -> "Rende
 
 
 def check_file(path: Path, name: str, suffixes: Sequence[str]) -> None:
-    """Make the folder of an output file, before any work; refuse an ending that cannot be
-    written.
+    """Make the folder of an output file, before any work.
+
+    Raises:
+        InputError: the file cannot be written, or not in the format that its suffix names.
     """
     if path.suffix not in suffixes:
         raise InputError(f"{name} {path} ends in '{path.suffix}'; allowed: {', '.join(suffixes)}.")

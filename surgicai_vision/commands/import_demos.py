@@ -33,8 +33,9 @@ example:
 A bag is a .bag, .db3 or .mcap file, or a folder of ROS 2; a folder of bags is read whole:
   surgicai-vision import-demos trial.bag --topic needle=/needle/pose --out outputs/demos/trial
 Roles of --topic: {", ".join(ROLES)}.
-Without --task every subtask that is found gets a folder below --out. Frames, units, labels and
-more stand in the table `bag` of a --config file, the scene in the table `env`; see docs/demos.md.""",
+Without --task every subtask that is found gets a folder below --out. Frames, units, labels and more
+stand in the table `bag` of a --config file, the scene in the table `env`; see docs/demos.md.\
+""",
 )
 
 
@@ -72,7 +73,7 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Import and say where the demonstrations are."""
+    """Import demonstrations and print where they are."""
     path = options.file
     if is_bag(path) or path.is_dir():
         return _import_bags(path, options, console)
@@ -83,7 +84,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     ]
     if given:
         raise InputError(
-            f"--{given[0]} is of bags, and {path} is none (*.bag, *.db3, *.mcap, a folder of ROS 2)."
+            f"--{given[0]} is for bags, and {path} is none (*.bag, *.db3, *.mcap, a folder of "
+            "ROS 2)."
         )
     return _import_surgicai(path, options, console)
 
@@ -93,7 +95,8 @@ def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str
 
     if options.task is None:
         raise InputError(
-            f"import-demos needs --task: the file does not say it; one of {', '.join(names.SUBTASKS)}."
+            "import-demos needs --task: the file does not say it; one of "
+            f"{', '.join(names.SUBTASKS)}."
         )
     out = options.out or folders.demos_folder(f"surgicai-{options.task}")
     folders.check_folder(out, "demos.json")
@@ -122,7 +125,8 @@ def _import_bags(path: Path, options: Options, console: Console) -> dict[str, ob
     bags = bags_in(path)
     if not bags:
         raise BadFile(
-            f"Cannot read {path}: it is a folder without bags (*.bag, *.db3, *.mcap, folders of ROS 2)."
+            f"Cannot read {path}: it is a folder without bags (*.bag, *.db3, *.mcap, folders of "
+            "ROS 2)."
         )
     out = options.out or folders.demos_folder("bag")
     with console.stage(f"importing {path.name}", "bags") as progress:
@@ -138,8 +142,8 @@ def _import_bags(path: Path, options: Options, console: Console) -> dict[str, ob
     for made in summaries:
         kept = len(made.paths)
         console.say(
-            f"{kept} demonstrations of {made.task}, {made.steps} steps; {made.succeeded} of {kept} end as a success "
-            f"by our tolerances: {made.out}"
+            f"{kept} demonstrations of {made.task}, {made.steps} steps; {made.succeeded} of {kept} "
+            f"end as a success by our tolerances: {made.out}"
         )
         if made.skipped:
             console.say(

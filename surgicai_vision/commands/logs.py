@@ -1,10 +1,10 @@
 """Where a training's losses are drawn: TensorBoard, or Weights & Biases where it is installed."""
 
 import importlib.util
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Protocol, final
 
 from surgicai_vision.core.errors import InputError
 
@@ -17,7 +17,7 @@ Log = Callable[[int, dict[str, float]], None]
 
 
 def installed(package: str) -> bool:
-    """Say whether a package can be imported, without importing it."""
+    """Return True if a package can be imported, without importing it."""
     return importlib.util.find_spec(package) is not None
 
 
@@ -25,7 +25,7 @@ def installed(package: str) -> bool:
 def open_log(kind: str, out: Path) -> Iterator[Log | None]:
     """Yield what takes (epoch, losses by name), or None.
 
-    Nothing is opened before the first losses: a training that is done draws nothing.
+    Nothing is opened before the first losses: a finished training that is run again draws nothing.
 
     Args:
         kind: one of `LOGS`.
@@ -41,59 +41,81 @@ def open_log(kind: str, out: Path) -> Iterator[Log | None]:
         )
     if kind == "wandb":
         _check_login()
-        yield from _drawing(
-            lambda: _wandb(out), lambda run, losses, epoch: run.log(losses, step=epoch), "finish"
-        )
+        yield from _drawing(_WeightsAndBiases, out)
     elif kind == "tensorboard" or (kind == "auto" and installed("tensorboard")):
-        yield from _drawing(lambda: _tensorboard(out), _add_scalars, "close")
+        yield from _drawing(_TensorBoard, out)
     else:
         yield None
 
 
-def _drawing(
-    start: Callable[[], Any], draw: Callable[[Any, dict[str, float], int], None], end: str
-) -> Iterator[Log]:
-    """Yield a log that starts its writer with the first losses and ends it by the method `end`."""
-    writers: list[Any] = []
+class _Writer(Protocol):
+    """Where losses are drawn."""
+
+    def draw(self, epoch: int, losses: Mapping[str, float]) -> None:
+        """Add the losses of an epoch, by name."""
+
+    def close(self) -> None:
+        """Write what is left."""
+
+
+@final
+class _TensorBoard:
+    """An event file in `<out>-tensorboard`."""
+
+    def __init__(self, out: Path):
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer = SummaryWriter(str(out.with_name(f"{out.name}-tensorboard")))
+
+    def draw(self, epoch: int, losses: Mapping[str, float]) -> None:
+        """Add the losses of an epoch, by name."""
+        for name, value in losses.items():
+            self._writer.add_scalar(name, value, epoch)
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._writer.close()
+
+
+@final
+class _WeightsAndBiases:
+    """A run of the project `surgicai-vision`."""
+
+    def __init__(self, out: Path):
+        import wandb
+
+        self._run = wandb.init(project="surgicai-vision", name=out.name, dir=str(out.parent))
+
+    def draw(self, epoch: int, losses: Mapping[str, float]) -> None:
+        """Add the losses of an epoch, by name."""
+        self._run.log(dict(losses), step=epoch)
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._run.finish()
+
+
+def _drawing(open_writer: Callable[[Path], _Writer], out: Path) -> Iterator[Log]:
+    """Yield a log that opens its writer with the first losses, and close it at the end."""
+    writers: list[_Writer] = []
 
     def log(epoch: int, losses: dict[str, float]) -> None:
         if not writers:
-            writers.append(start())
-        draw(writers[0], {f"loss/{name}": value for name, value in losses.items()}, epoch)
+            writers.append(open_writer(out))
+        writers[0].draw(epoch, {f"loss/{name}": value for name, value in losses.items()})
 
     try:
         yield log
     finally:
         for writer in writers:
-            getattr(writer, end)()
-
-
-def _tensorboard(out: Path) -> Any:
-    """Open an event file in `<out>-tensorboard`."""
-    from torch.utils.tensorboard import SummaryWriter
-
-    return SummaryWriter(str(out.with_name(f"{out.name}-tensorboard")))
-
-
-def _add_scalars(writer: Any, losses: dict[str, float], epoch: int) -> None:
-    for name, value in losses.items():
-        writer.add_scalar(name, value, epoch)
+            writer.close()
 
 
 def _check_login() -> None:
-    """Refuse W&B without an account before any work; `WANDB_MODE=offline` keeps a run on this
-    machine.
-    """
+    """Refuse W&B without an account, unless WANDB_MODE=offline keeps the run on this machine."""
     import wandb
 
     if wandb.setup().settings.mode == "online" and not wandb.api.is_authenticated:
         raise InputError(
             "--log wandb: nobody is logged in; run `wandb login`, or set WANDB_MODE=offline."
         )
-
-
-def _wandb(out: Path) -> Any:
-    """Start a run."""
-    import wandb
-
-    return wandb.init(project="surgicai-vision", name=out.name, dir=str(out.parent))

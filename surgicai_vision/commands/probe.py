@@ -85,7 +85,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 def _rows(
     options: Options, name: str, dataset: "Dataset", console: Console
 ) -> list[dict[str, Any]]:
-    """Encode what is not at hand and probe one encoder's views."""
+    """Encode what is not in the cache and probe one encoder's views."""
     from surgicai_vision.features.cache import encode
     from surgicai_vision.features.probe import probe
 
@@ -119,7 +119,7 @@ def _rows(
 
 
 def line(row: dict[str, Any]) -> str:
-    """Return a row in one line for people."""
+    """Return one line about a probe."""
     parts = []
     for key, unit in (("tip_mm", "mm"), ("angle_deg", "°")):
         value, low, high, chance = (

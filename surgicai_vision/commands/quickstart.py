@@ -47,7 +47,7 @@ class Options:
 
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
-    """Run it, print the table and say where the page is."""
+    """Run the quickstart and print its table and where the page is."""
     from surgicai_vision.experiments.quickstart import run_quickstart
 
     result = run_quickstart(plan_of(options), options.out, console.stage, options.workers)
@@ -60,7 +60,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 
 
 def plan_of(options: Options) -> Quickstart:
-    """Return the plan the options describe."""
+    """Return the quickstart that the options describe."""
     return Quickstart(
         task=options.task,
         demonstrations=options.demonstrations,
@@ -75,7 +75,7 @@ def plan_of(options: Options) -> Quickstart:
 
 
 def table(results: list[dict[str, Any]]) -> list[str]:
-    """Return summaries as lines of a table."""
+    """Return the lines of a table of evaluations."""
     head = ("policy", "success", "95 % interval", "length [mm]", "steps")
     rows = [head, *(_row(result) for result in results)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(head))]

@@ -74,7 +74,7 @@ class Options:
 
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
-    """Record and say where the demonstrations are."""
+    """Record demonstrations and print where they are."""
     from surgicai_vision.core.executor import open_engine
     from surgicai_vision.demos.record import record
     from surgicai_vision.demos.rollout import Disturbance
@@ -83,7 +83,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 
     if options.noise_from is not None and options.noise_from > options.noise:
         raise InputError(
-            f"--noise-from is {options.noise_from:g}; it must be at most --noise, {options.noise:g}."
+            f"--noise-from is {options.noise_from:g}; "
+            f"it must be at most --noise, {options.noise:g}."
         )
     engine = open_engine(options.executor)
     config = task_config(options.task, options.env)

@@ -1,9 +1,10 @@
 """`render-demos`: render demonstrations into a LeRobot dataset."""
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import App, Parameter
 
@@ -73,7 +74,7 @@ class Options:
 
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
-    """Record where that is asked for, render, and say where the dataset is."""
+    """Record demonstrations if none are given, render them and print where the dataset is."""
     from surgicai_vision.core.executor import open_engine
     from surgicai_vision.dataset import render_demos
 
@@ -103,7 +104,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     console.say(
         f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}"
     )
-    say_error(summary, console)
+    print_video_error(summary.video_error, console)
     return {
         **dataclasses.asdict(summary),
         "task": task,
@@ -112,10 +113,10 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     }
 
 
-def say_error(summary: Any, console: Console) -> None:
-    """Say what the videos lost."""
-    if summary.video_error:
-        lost = ", ".join(f"{view} {error:.2f}" for view, error in summary.video_error.items())
+def print_video_error(errors: Mapping[str, float], console: Console) -> None:
+    """Print the error of each view's video, if there are videos."""
+    if errors:
+        lost = ", ".join(f"{view} {error:.2f}" for view, error in errors.items())
         console.say(f"mean absolute error of the videos, out of 255: {lost}")
 
 

@@ -35,7 +35,7 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Write page and tables and say where they are."""
+    """Write the page and the tables and print where they are."""
     from surgicai_vision.report import collect, write_report
     from surgicai_vision.report.tables import FOLDER
 
@@ -47,8 +47,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     cells = _cells(folder, console)
     found = collect(folder, cells)
     with console.stage("report", "parts") as progress:
-        out = options.out or None
-        page = write_report(folder, out, progress, cells=cells, strips=options.strips)
+        page = write_report(folder, options.out, progress, cells=cells, strips=options.strips)
     tables = page.parent / FOLDER
     console.say(f"report: {page}")
     console.say(f"tables: {tables}")
@@ -57,8 +56,9 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
 
 def _cells(folder: Path, console: Console) -> Sequence[Mapping[str, Any]]:
-    """Return every cell of the sweep in `folder` with its state; nothing where it is no sweep, or
-    not one of ours.
+    """Return every cell of the sweep in `folder` with its state.
+
+    Nothing is returned where the folder holds no sweep, or a grid that this version cannot read.
     """
     from surgicai_vision.core.config import from_mapping, to_mapping
     from surgicai_vision.core.files import read_json
@@ -72,7 +72,8 @@ def _cells(folder: Path, console: Console) -> Sequence[Mapping[str, Any]]:
         states = plan(from_mapping(Grid, read_json(path), str(path)), folder)
     except SurgicaiError as error:
         console.note(
-            f"The grid cannot be read here, so only cells with a result or a record are reported: {error}"
+            "The grid cannot be read here, so only cells with a result or a record are reported: "
+            f"{error}"
         )
         return ()
     return [

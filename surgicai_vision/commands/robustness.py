@@ -1,4 +1,4 @@
-"""`robustness`: run a policy while one thing at a time shifts, and draw its successes."""
+"""`robustness`: evaluate a policy while light, cameras, images or the arm shift."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -93,7 +93,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
 
 def curve_line(rows: list[dict[str, Any]]) -> str:
-    """Return one axis in one line for people."""
+    """Return one line about the successes along one axis."""
     points = ", ".join(f"{row['strength']:g}: {row['k']}/{row['n']}" for row in rows)
     area, low, high = (rows[0][key] for key in ("auc", "auc_low", "auc_high"))
     under = "" if area is None else f"; area {area:.2f} ({low:.2f}–{high:.2f})"

@@ -57,27 +57,28 @@ class Options:
 
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
-    """Roll the expert once and draw the start and the end as every camera sees them."""
+    """Roll out the expert once and draw the start and the end as every camera sees them."""
     from surgicai_vision.envs import contact_sheet
     from surgicai_vision.evaluation import policy_spec
     from surgicai_vision.evaluation.provenance import provenance
     from surgicai_vision.evaluation.rollout import evaluate
 
     if options.film:
-        return _film(options, console)
+        return _film(options.film, options, console)
     config = task_config(options.task, options.env)
     path = options.sheet or folders.OUTPUTS / f"scene-{options.task}.png"
     folders.check_file(path, "--sheet", FIGURE_SUFFIXES)
-    with console.stage(f"rolling the expert of {options.task}", "steps") as progress:
+    with console.stage(f"rolling out the expert of {options.task}", "steps") as progress:
         episode = evaluate(
             policy_spec.expert, config, [options.seed], workers=1, progress=progress
         )[0]
+    # One row a view; the columns are the modalities at the start, then those at the end.
     moments = {
         "start": episode.film.states[0],
         f"end, step {episode.row.steps}": episode.film.states[-1],
     }
     shown = [(moment, modality) for moment in moments for modality in names.MODALITIES]
-    rows, total = [], len(options.view)
+    rows = []
     with (
         console.stage("rendering", "views") as progress,
         contact_sheet.stage(config, options.size, options.quality) as see,
@@ -86,9 +87,12 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             rows.append(
                 (view, [see(moments[moment], view, modality) for moment, modality in shown])
             )
-            progress(done + 1, total)
+            progress(done + 1, len(options.view))
     outcome = "success" if episode.row.success else f"failure ({episode.row.failure})"
-    title = f"{options.task}, seed {options.seed}: the expert's episode, {outcome} after {episode.row.steps} steps"
+    title = (
+        f"{options.task}, seed {options.seed}: the expert's episode, "
+        f"{outcome} after {episode.row.steps} steps"
+    )
     figure = contact_sheet.sheet(
         rows, [f"{moment}: {modality}" for moment, modality in shown], title
     )
@@ -105,14 +109,15 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     }
 
 
-def _film(options: Options, console: Console) -> dict[str, object]:
-    """Draw a row of moments for every subtask: the expert's episode from the seed, as the first view sees it."""
+def _film(path: Path, options: Options, console: Console) -> dict[str, object]:
+    """Draw a row of images for every subtask: the expert's episode as the first view sees it."""
     from surgicai_vision.envs import contact_sheet
     from surgicai_vision.evaluation import policy_spec
     from surgicai_vision.evaluation.rollout import evaluate
 
-    path, rows, outcomes = Path(options.film or ""), [], {}
     folders.check_file(path, "--film", FIGURE_SUFFIXES)
+    rows = []
+    outcomes = {}
     with console.stage("filming", "subtasks") as progress:
         for done, subtask in enumerate(names.SUBTASKS):
             config = task_config(subtask, options.env)

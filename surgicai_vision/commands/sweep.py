@@ -78,7 +78,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 def _list(
     grid: Grid, out: Path, choice: Choice, workers: int, console: Console
 ) -> dict[str, object]:
-    """Say what each cell is, and how long the rest takes."""
+    """Print the state of each cell, and how long the rest takes."""
     from surgicai_vision.experiments.sweep import STATES, estimate, plan
 
     states = plan(grid, out, choice)
@@ -88,10 +88,11 @@ def _list(
     counts = {
         name.replace(" ", "_"): sum(state.state == name for state in states) for name in STATES
     }
+    told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
     time = estimate(grid, out, states, workers)
     console.say(
-        f"{len(states)} cells: {', '.join(f'{counts[key]} {key.replace("_", " ")}' for key in counts)}; about "
-        f"{_duration(time['seconds'])} with {workers} workers ({time['source']})."
+        f"{len(states)} cells: {told}; about {_duration(time['seconds'])} with {workers} workers "
+        f"({time['source']})."
     )
     return {"cells": len(states), **counts, "seconds": time["seconds"], "dry_run": True}
 
@@ -100,7 +101,7 @@ COUNTS = ("done", "cached", "failed", "not_run", "left")
 
 
 def _duration(seconds: float) -> str:
-    """Write a duration as people do."""
+    """Return a duration in the largest unit that fits."""
     for size, unit in ((86400, "days"), (3600, "hours"), (60, "minutes")):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.1f} {unit}"
@@ -146,7 +147,7 @@ def _listed(value: object) -> object:
 
 
 def _ablation(table: object) -> object:
-    """Return an ablation whose lists may be written as texts."""
+    """Return an ablation with its comma lists split."""
     if not isinstance(table, dict):
         return table
     return {

@@ -86,7 +86,7 @@ class Options:
 
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
-    """Let a person record and say what was kept."""
+    """Let a person drive and record, and print what was kept."""
     from surgicai_vision import envs
     from surgicai_vision.teleoperation.input_mapping import Steering
     from surgicai_vision.teleoperation.loop import Views, drive
@@ -148,6 +148,6 @@ def _config(options: Options) -> TaskConfig:
 
 
 def _tell(console: Console, message: str) -> None:
-    """Print what became of an episode, and not what the screen shows anyway."""
+    """Print what became of an episode; the page shows the rest."""
     if message.startswith(("Kept", "Start", "Discarded")):
         console.note(message.split(" Move to")[0])

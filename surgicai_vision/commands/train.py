@@ -102,7 +102,7 @@ class Options:
 
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
-    """Encode what is not at hand, train and say where the checkpoint is."""
+    """Encode what is not in the cache, train and print where the checkpoint is."""
     weights = join_weights(options.weights)
     encoder = None if options.encoder in (NO_ENCODER, STATE) else options.encoder
     if encoder:
@@ -126,7 +126,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     label = f"{options.subtask}-of-{task}" if options.subtask else task
     out = options.out or folders.train_folder(label, cell.name, cell.seed)
     folders.check_folder(out, "training.json")
-    dataset: "Dataset" = folders.open_dataset(options.dataset, task, cell.view)
+    dataset: Dataset = folders.open_dataset(options.dataset, task, cell.view)
     if options.subtask:
         from surgicai_vision.dataset.subset import of_subtask
 

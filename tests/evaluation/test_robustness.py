@@ -324,7 +324,7 @@ def test_the_verb_measures_the_expert_and_continues(tmp_path, capsys):
     ("more", "wanted"),
     [
         (["--axis", "lihgt"], "light"),
-        (["--strength", "0,x"], "expected a number"),
+        (["--strength", "0,x"], "unable to convert 'x' into float"),
         (["--strength", "0,2"], "from 0 to 1"),
         (["--axis", "blur"], "sees no images"),
         (["--axis", "light,light"], "twice"),

@@ -38,7 +38,7 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Fetch, check and say where it is."""
+    """Fetch the dataset, check it and print where it is."""
     from surgicai_vision.dataset.hub import pull_dataset
 
     out = options.out or folders.dataset_folder(options.repo.partition("/")[2] or options.repo)

@@ -39,7 +39,7 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Check, push and say where it is."""
+    """Check the dataset, push it and print where it is."""
     from surgicai_vision.dataset.hub import dataset_card, push_dataset
     from surgicai_vision.dataset.reader import open_dataset
 

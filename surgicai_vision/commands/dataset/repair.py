@@ -38,7 +38,7 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Repair and say what was kept, what was wrong and where the original is."""
+    """Repair the dataset and print what was kept, what was wrong and where the original is."""
     from surgicai_vision.dataset import repair_dataset
 
     with console.stage("verifying", "episodes") as progress:
@@ -47,7 +47,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         console.say(problem)
     if repair.original is None:
         console.say(
-            f"nothing to repair: {repair.episodes} episodes, {repair.frames} frames in {repair.path} are whole"
+            f"nothing to repair: {repair.episodes} episodes, {repair.frames} frames in "
+            f"{repair.path} are whole"
         )
     else:
         kept = f"{repair.episodes} of {repair.claimed} episodes, {repair.frames} frames kept"

@@ -10,14 +10,15 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import COUNT, DIRECTORY, VIDEO, VIEWS, default_text
-from surgicai_vision.commands.render_demos import say_error
+from surgicai_vision.commands.render_demos import print_video_error
 from surgicai_vision.core.errors import InputError
 
 app = App(
     name="view",
     help_epilogue="""\
 example:
-  surgicai-vision dataset view outputs/datasets/grasp --view back --out outputs/datasets/grasp-back""",
+  surgicai-vision dataset view outputs/datasets/grasp --view back \\
+      --out outputs/datasets/grasp-back""",
 )
 
 
@@ -46,7 +47,7 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Make the dataset and say where it is."""
+    """Make the dataset and print where it is."""
     from surgicai_vision.dataset import view_dataset
 
     path = options.dataset
@@ -66,5 +67,5 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     console.say(
         f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}"
     )
-    say_error(summary, console)
+    print_video_error(summary.video_error, console)
     return {**dataclasses.asdict(summary), "dataset": str(out)}
