@@ -1,8 +1,46 @@
 """Image-based imitation learning for robotic suturing.
 
 The flow is the vocabulary: scene → env → demos → dataset → features → policy → evaluation → report.
-Importing this package does nothing but name the version; `import surgicai_vision.envs` registers
-the gymnasium ids.
+Importing this package registers the gymnasium ids, one a task. `register_encoder`,
+`register_policy`, `register_task`, `register_camera` and `register_engine` offer parts of one's own
+in this process; docs/extending.md says how a distribution offers them in every process.
 """
 
+from typing import TYPE_CHECKING
+
+from surgicai_vision.core.plugins import resolve
+from surgicai_vision.core.tasks import register_ids
+
+if TYPE_CHECKING:
+    from surgicai_vision.core.cameras import register_camera
+    from surgicai_vision.core.executor.engines import register_engine
+    from surgicai_vision.core.tasks import register_task
+    from surgicai_vision.features.encoders import register_encoder
+    from surgicai_vision.training.policies import register_policy
+
+__all__ = [
+    "register_camera",
+    "register_encoder",
+    "register_engine",
+    "register_policy",
+    "register_task",
+]
 __version__ = "0.2.0"
+
+_PLACES = {
+    "register_camera": "surgicai_vision.core.cameras",
+    "register_encoder": "surgicai_vision.features.encoders",
+    "register_engine": "surgicai_vision.core.executor.engines",
+    "register_policy": "surgicai_vision.training.policies",
+    "register_task": "surgicai_vision.core.tasks",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import a function of `__all__` on first use."""
+    if name not in _PLACES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return resolve(f"{_PLACES[name]}:{name}")
+
+
+register_ids()

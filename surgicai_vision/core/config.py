@@ -18,6 +18,7 @@ import yaml
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnknownName, check_name
+from surgicai_vision.core.tasks import SUBTASK_STEPS, check_task, task_steps
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,8 +35,6 @@ STEPS: Mapping[str, tuple[float, float, float]] = types.MappingProxyType(
 """Step preset → translation [m], rotation [deg], jaw [rad] of an action of 1 (facts.md §1: the
 image evaluation, the RL training script, the trajectories shipped with the release)."""
 
-SUBTASK_STEPS = 200
-"""Control steps a subtask may take (paper, image policies)."""
 DWELL = 15
 """Control steps a subtask's success must hold, in a whole procedure, before the next one begins."""
 CLOCK_PERIOD, CLOCK_SIZE = 25, 3
@@ -142,13 +141,13 @@ class TaskConfig:
     """One task in one scene: everything that decides what an episode is.
 
     Attributes:
-        task: one of `names.TASKS`.
+        task: one of `tasks.task_names()`.
         scene: the scene.
         step: step-size preset, a key of `STEPS`.
         tolerance: "paper" or "released" success tolerances.
         reward: "sparse" (0 on success, else -1) or "dense".
-        max_steps: episode limit [control steps]; 0 takes the paper's, 200 a subtask, 1,000 for the
-            five in a row.
+        max_steps: episode limit [control steps]; 0 takes the task's own: the paper's 200 a subtask,
+            1,000 for the five in a row.
         randomisation: what differs from episode to episode besides the start; nothing by default.
     """
 
@@ -161,7 +160,7 @@ class TaskConfig:
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
     def __post_init__(self) -> None:
-        check_name("task", self.task, names.TASKS)
+        check_task(self.task)
         check_name("step preset", self.step, STEPS)
         check_name("tolerance preset", self.tolerance, ("paper", "released"))
         check_name("reward", self.reward, ("sparse", "dense"))
@@ -170,8 +169,7 @@ class TaskConfig:
                 f"max_steps is {self.max_steps}; it must be at least 1, or 0 for the paper's limit."
             )
         if self.max_steps == 0:
-            subtasks = len(names.SUBTASKS) if self.task == names.SUTURE else 1
-            object.__setattr__(self, "max_steps", SUBTASK_STEPS * subtasks)
+            object.__setattr__(self, "max_steps", task_steps(self.task))
 
 
 def from_mapping(cls: type[T], mapping: Mapping[str, object], where: str = "configuration") -> T:

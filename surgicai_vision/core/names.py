@@ -96,6 +96,11 @@ def camera_of(view: str) -> str:
     return view.removesuffix("_depth")
 
 
+def is_depth_view(view: str) -> bool:
+    """Return True for a view that shows a camera's depth."""
+    return view.endswith("_depth")
+
+
 def image_key(view: str) -> str:
     """LeRobot feature key of a view's RGB image."""
     return f"observation.images.{view}"

@@ -21,8 +21,9 @@ Two parts of one name are refused with an error that names both distributions.
 
 import functools
 import importlib
+import sys
 from collections.abc import Callable, Mapping
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from typing import Any, Final, cast, final
 
 from surgicai_vision.core.errors import InputError, check_name
@@ -120,7 +121,7 @@ class Registry[Part]:
             return
         before = dict(self._targets)
         try:
-            for point in entry_points(group=self.group):
+            for point in _installed(tuple(sys.path)).select(group=self.group):
                 self._add(point.name, _owner(point), point.load)
         except NameCollision:
             self._targets = before
@@ -131,6 +132,12 @@ class Registry[Part]:
         if name in self._targets:
             raise NameCollision(self.kind, name, self._targets[name][0], owner)
         self._targets[name] = (owner, load)
+
+
+@functools.cache
+def _installed(path: tuple[str, ...]) -> EntryPoints:
+    """Return the entry points of every distribution on `path`, which is `sys.path`."""
+    return entry_points()
 
 
 def _owner(point: EntryPoint) -> str:

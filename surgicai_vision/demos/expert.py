@@ -9,6 +9,7 @@ Each subtask's rule returns where the commanded tool should be next; `action_tow
 action, scaled as a whole so that translation and rotation stay in step on curved paths.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.plugins import resolve
 from surgicai_vision.demos.demonstrator import Demonstrator
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.base import SuturingEnv
@@ -30,6 +32,7 @@ from surgicai_vision.envs.geometry import (
     Stitch,
     grasp_in_needle,
 )
+from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.holes import SURFACE
 from surgicai_vision.scene.rotations import matrix_to_rotvec, rotvec_to_matrix
@@ -106,7 +109,7 @@ class Expert(Demonstrator):
     def label(self) -> NDArray[np.float32]:
         """Return the action without noise: the label of the present state, (7,)."""
         world = WorldState(self.env)
-        return action_towards(world, _RULES[self.env.subtask.name](world))
+        return action_towards(world, _rule(self.env.subtask)(world))
 
 
 class WorldState:
@@ -340,6 +343,20 @@ def _pullout(world: WorldState) -> ToolTarget:
 
 def _wrap(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+@functools.cache
+def _rule(subtask: Subtask) -> Callable[[WorldState], ToolTarget]:
+    """Return a subtask's rule: ours, or the one that another distribution's task names."""
+    if subtask.name in _RULES:
+        return _RULES[subtask.name]
+    if not subtask.expert:
+        raise InputError(
+            f"The task '{subtask.name}' has no expert; its author must name one "
+            '(`expert = "module:function"`), or take demonstrations of another kind.'
+        )
+    rule: Callable[[WorldState], ToolTarget] = resolve(subtask.expert)
+    return rule
 
 
 _RULES: dict[str, Callable[[WorldState], ToolTarget]] = {

@@ -1,17 +1,17 @@
 """Envs: the five subtasks and the whole procedure as gymnasium environments.
 
-Importing this package registers `names.ENV_IDS`. `make(TaskConfig(task="grasp"),
+`make(TaskConfig(task="grasp"),
 obs_type="pixels")` returns an unwrapped env; `gymnasium.make("surgicai_vision/Grasp-v0",
 obs_type="pixels")` takes the same names, and the fields of `TaskConfig` besides.
 """
 
+import functools
 from typing import Any
-
-import gymnasium
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig, from_mapping
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.tasks import load_subtask
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.grasp import Grasp
 from surgicai_vision.envs.handoff import Handoff
@@ -46,7 +46,13 @@ def make(
     view = ObservationConfig(obs_type, tuple(cameras), size, depth, segmentation)
     if config.task == names.SUTURE:
         return Suture(config, tuple(SUBTASKS.values()), view, render_mode)
-    return SuturingEnv(config, (SUBTASKS[config.task],), view, render_mode)
+    return SuturingEnv(config, (_subtask(config.task),), view, render_mode)
+
+
+@functools.cache
+def _subtask(task: str) -> Subtask:
+    """Return what a task that is one subtask is, of ours or of another distribution."""
+    return SUBTASKS.get(task) or load_subtask(task)()
 
 
 def make_task(
@@ -55,7 +61,7 @@ def make_task(
     """Return an env from flat arguments; the entry point of the gymnasium ids.
 
     Args:
-        task: one of `names.TASKS`.
+        task: one of `tasks.task_names()`.
         scene: a `SceneConfig`, its fields, or None for the default scene.
         **arguments: fields of `TaskConfig` and arguments of `make`.
     """
@@ -77,15 +83,3 @@ def make_task(
         else scene or SceneConfig()
     )
     return make(TaskConfig(task=task, scene=chosen, **fields), **arguments)
-
-
-for _task, _id in names.ENV_IDS.items():
-    if _id not in gymnasium.registry:
-        gymnasium.register(
-            id=_id,
-            entry_point="surgicai_vision.envs:make_task",
-            vector_entry_point="surgicai_vision.envs.vector_env:make_vector",
-            kwargs={"task": _task},
-            order_enforce=True,
-            disable_env_checker=False,
-        )

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import InputError, PhysicsError
+from surgicai_vision.core.errors import InputError, PhysicsError, check_name
+from surgicai_vision.core.tasks import task_text
 from surgicai_vision.envs import hole_crossing, observation, poses, randomisation
 from surgicai_vision.envs.camera_rig import Images
 from surgicai_vision.envs.control import StepSize
@@ -82,6 +83,9 @@ class SuturingEnv(gymnasium.Env):
         episodes.
         """
         config, pair = self.config, self.scene.pair
+        for subtask in subtasks:
+            kind = f"tolerance preset of '{subtask.name}'"
+            check_name(kind, config.tolerance, subtask.tolerances)
         smallest = needle.RADIUS * (1.0 - config.randomisation.needle_size)
         if Stitch.of(pair, smallest).possible or not any(subtask.through for subtask in subtasks):
             return
@@ -188,7 +192,7 @@ class SuturingEnv(gymnasium.Env):
     @property
     def task_description(self) -> str:
         """Return the task as a sentence, as LeRobot stores it."""
-        return names.TASK_TEXTS[self.config.task]
+        return task_text(self.config.task)
 
     @property
     def _max_episode_steps(self) -> int:
@@ -202,7 +206,7 @@ class SuturingEnv(gymnasium.Env):
 
     @property
     def phase(self) -> int:
-        """Return the present subtask's index in `names.SUBTASKS`."""
+        """Return the present subtask's index in `names.SUBTASKS`, -1 for a task of its own."""
         return int(self.simulation.memory.phase)
 
     def named(self, kind: str, name: str) -> int:

@@ -36,7 +36,10 @@ class Grasp(Subtask):
     (paper).
     """
 
-    name, through = "grasp", False
+    name = "grasp"
+    arm = PSM2
+    phase = 0
+    through = False
     tolerances = MappingProxyType(
         {"paper": Tolerance.of(1.0, 10.0), "released": Tolerance.of(3.0, 10.0)}
     )

@@ -36,6 +36,8 @@ class Handoff(Subtask):
     """Close PSM1's jaws on the needle's 105° point: 2 mm and 15°, both pads in contact (paper)."""
 
     name = "handoff"
+    arm = PSM1
+    phase = 3
     tolerances = MappingProxyType(
         {"paper": Tolerance.of(2.0, 15.0), "released": Tolerance.of(2.0, 40.0)}
     )

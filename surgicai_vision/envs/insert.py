@@ -23,6 +23,8 @@ class Insert(Subtask):
     """Bring the needle's 100° point 2 mm beyond the exit: 5 mm, 10°, through both holes (paper)."""
 
     name = "insert"
+    arm = PSM2
+    phase = 2
     tolerances = MappingProxyType(
         {"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(1.0, 5.0)}
     )

@@ -45,7 +45,10 @@ class Place(Subtask):
     (paper).
     """
 
-    name, through = "place", False
+    name = "place"
+    arm = PSM2
+    phase = 1
+    through = False
     tolerances = MappingProxyType(
         {"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(5.0, 10.0)}
     )

@@ -25,6 +25,8 @@ class Pullout(Subtask):
     """Bring the needle's 105° point to the end point: 5 mm, 20°, wholly out (paper)."""
 
     name = "pullout"
+    arm = PSM1
+    phase = 4
     tolerances = MappingProxyType(
         {"paper": Tolerance.of(5.0, 20.0), "released": Tolerance.of(5.0, 5.0)}
     )

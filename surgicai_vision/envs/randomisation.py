@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import other_cameras
 from surgicai_vision.core.config import RandomisationConfig
 from surgicai_vision.scene import Scene, needle
 from surgicai_vision.scene.holes import Hole, HolePair
@@ -36,7 +37,7 @@ RIGS = (
     ("wrist_psm2",),
 )
 """Cameras that move as one, about the first; those that follow the jaws are shifted with them, and
-see them still.
+see them still. A camera of another distribution takes the draw of "front", about its own place.
 """
 TISSUE, SURROUNDINGS = ("tissue", "flesh"), ("drape", "tray")
 """Materials of one tint."""
@@ -123,6 +124,8 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
     shifts, turns = numbers["camera_shift"].reshape(-1, 3), numbers["camera_turn"].reshape(-1, 3)
     for cameras, shift, turn, fovy in zip(RIGS, shifts, turns, numbers["camera_fovy"], strict=True):
         _aim(source, model, cameras, shift, turn, fovy)
+    for name in other_cameras():
+        _aim(source, model, (name,), shifts[0], turns[0], numbers["camera_fovy"][0])
     size, thickness = (
         1.0 + float(numbers[axis][0]) for axis in ("needle_size", "needle_thickness")
     )

@@ -1,4 +1,6 @@
-"""Subtask: what one step of the procedure is. One file a subtask; this is what they share.
+"""Subtask: what one step of the procedure is, or a task of another distribution.
+
+One file a subtask; this is what they share.
 
 A subtask says which arm moves, how an episode starts, which measured pose must meet which goal, and
 what else success needs. It keeps no state: everything an episode remembers is in the simulation's
@@ -13,10 +15,13 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from surgicai_vision.core import names
+from surgicai_vision.core.tasks import SUBTASK_STEPS
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.scene.kinematics import Pose
+
+NO_PHASE = -1
+"""The phase of a task that is no subtask of the procedure."""
 
 
 class Tolerance(NamedTuple):
@@ -48,19 +53,23 @@ class Demands:
 
 
 class Subtask(ABC):
-    """One subtask of the procedure."""
+    """One subtask of the procedure, or a task of its own."""
 
     name: ClassVar[str]
+    arm: ClassVar[str]
+    """The arm that moves, one of `names.ARMS`."""
+    text: ClassVar[str] = ""
+    """The task as a sentence, LeRobot's `task`; ours have theirs in `names.TASK_TEXTS`."""
+    phase: ClassVar[int] = NO_PHASE
+    """Index in `names.SUBTASKS` of a subtask of the procedure."""
+    expert: ClassVar[str] = ""
+    """"module:function" of the expert's rule (`demos.expert`); ours have theirs there."""
+    max_steps: ClassVar[int] = SUBTASK_STEPS
+    """Control steps an episode may take unless it is said."""
     tolerances: ClassVar[Mapping[str, Tolerance]]
     """Preset ("paper", "released") → tolerance."""
     demands: ClassVar[Mapping[str, Demands]]
     """Preset → what else success needs."""
-
-    def __init__(self) -> None:
-        self.arm = names.ACTIVE_ARM[self.name]
-        """The arm that moves."""
-        self.phase = names.SUBTASKS.index(self.name)
-        """The subtask's index in the procedure."""
 
     through: ClassVar[bool] = True
     """The needle is driven through the tissue, or already was."""

@@ -16,20 +16,30 @@ to the size of the others.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision.core.cameras import CAMERAS
 from surgicai_vision.core.errors import UnknownName
-from surgicai_vision.core.names import ARMS, FOLLOWING_CAMERAS, PSM1, PSM2
+from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.rotations import matrix_to_quaternion
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
+
+
+class Camera(Protocol):
+    """What stands in a scene under a camera's name."""
+
+    def add_to(self, spec: mujoco.MjSpec, name: str, instrument: str) -> None:
+        """Add it to a scene with both arms, whose PSMs carry `instrument`."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +51,65 @@ class CameraPose:
         direction: of view; need not be a unit vector.
         up: any vector in the upper half of the image.
         fovy: vertical field of view [rad].
+        body: name of the body that carries it; the world by default.
     """
 
     position: Vector
     direction: Vector
     up: Vector
     fovy: float
+    body: str = "world"
+
+    def add_to(self, spec: mujoco.MjSpec, name: str, instrument: str) -> None:
+        """Add the camera to its body; its pose does not depend on `instrument`."""
+        carrier = spec.body(self.body)
+        if carrier is None:
+            raise UnknownName("body", self.body, [item.name for item in spec.bodies])
+        rotation = look_at(self.direction, self.up) * [1.0, -1.0, -1.0]  # MuJoCo's z is backwards
+        carrier.add_camera(
+            name=name,
+            pos=list(self.position),
+            quat=matrix_to_quaternion(rotation).tolist(),
+            fovy=math.degrees(self.fovy),
+        )
+
+
+@dataclass(frozen=True)
+class WristCamera:
+    """The camera on an arm's insertion link.
+
+    Attributes:
+        arm: one of `names.ARMS`.
+    """
+
+    arm: str
+
+    def add_to(self, spec: mujoco.MjSpec, name: str, instrument: str) -> None:
+        """Add the camera where it sees the jaws of `instrument`."""
+        wrist_camera(self.arm, instrument).add_to(spec, name, instrument)
+
+
+@dataclass(frozen=True)
+class FollowingCamera:
+    """A camera that follows an arm's jaws from where another one stands.
+
+    Attributes:
+        stand: the camera in whose place it is.
+        arm: one of `names.ARMS`.
+    """
+
+    stand: CameraPose
+    arm: str
+
+    def add_to(self, spec: mujoco.MjSpec, name: str, instrument: str) -> None:
+        """Add the camera to the world; the body `{arm}_grasp` must be there."""
+        spec.worldbody.add_camera(
+            name=name,
+            pos=list(self.stand.position),
+            mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
+            targetbody=f"{self.arm}_grasp",
+            fovy=math.degrees(following_fovy(self.stand)),
+        )
 
 
 ENDOSCOPE = (-0.008, 0.100, 0.160)
@@ -80,14 +143,16 @@ def _endoscope(side: float) -> CameraPose:
     )
 
 
-WORLD_CAMERAS = MappingProxyType(
-    {
-        "front": _endoscope(1.0),
-        "front_right": _endoscope(-1.0),
-        "back": CameraPose((0.0, -0.0359, 0.1659), (0.0, 0.707, -0.707), (0.0, 0.707, 0.707), 0.8),
-    }
-)
-"""Camera → pose in world; "back" stands where SurgicAI's does."""
+FRONT = _endoscope(1.0)
+FRONT_RIGHT = _endoscope(-1.0)
+BACK = CameraPose((0.0, -0.0359, 0.1659), (0.0, 0.707, -0.707), (0.0, 0.707, 0.707), 0.8)
+"""Poses in world; "back" stands where SurgicAI's does."""
+WRIST_PSM1 = WristCamera(PSM1)
+WRIST_PSM2 = WristCamera(PSM2)
+FRONT_PSM1 = FollowingCamera(FRONT, PSM1)
+FRONT_PSM2 = FollowingCamera(FRONT, PSM2)
+BACK_PSM1 = FollowingCamera(BACK, PSM1)
+BACK_PSM2 = FollowingCamera(BACK, PSM2)
 
 WRIST_ASIDE, WRIST_BACK = 0.030, 0.030
 """From the wrist's pitch axis to the wrist camera: beside the shaft and up along it [m]. So the
@@ -117,6 +182,7 @@ def wrist_camera(arm: str, instrument: str) -> CameraPose:
         direction=(-x, -y, WRIST_TARGET + WRIST_BACK),
         up=(-x, -y, 0.0),
         fovy=WRIST_FOVY,
+        body=f"{arm}_outer_insertion_link",
     )
 
 
@@ -128,51 +194,15 @@ FOLLOWED = (0.0, 0.050, 0.075)
 """Point in world [m] at whose distance that holds: between the holes and the needle's home."""
 
 
-def following_fovy(camera: str) -> float:
-    """Return the vertical field of view [rad] of the cameras that stand where `camera` stands and
-    follow the jaws.
-    """
-    return 2.0 * math.atan(
-        FOLLOWING_SPAN / 2.0 / math.dist(WORLD_CAMERAS[camera].position, FOLLOWED)
-    )
+def following_fovy(stand: CameraPose) -> float:
+    """Return the vertical field of view [rad] of cameras that follow the jaws from `stand`."""
+    return 2.0 * math.atan(FOLLOWING_SPAN / 2.0 / math.dist(stand.position, FOLLOWED))
 
 
-def add_following_cameras(spec: mujoco.MjSpec) -> None:
-    """Add "front_psm1" … "back_psm2"; the arms, with their bodies `{arm}_grasp`, must be there."""
-    for name in FOLLOWING_CAMERAS:
-        camera, arm = name.split("_")
-        spec.worldbody.add_camera(
-            name=name,
-            pos=list(WORLD_CAMERAS[camera].position),
-            mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
-            targetbody=f"{arm}_grasp",
-            fovy=math.degrees(following_fovy(camera)),
-        )
-
-
-def add_world_cameras(spec: mujoco.MjSpec) -> None:
-    """Add "front", "front_right" and "back" to the world."""
-    for name, pose in WORLD_CAMERAS.items():
-        _add(spec.worldbody, name, pose)
-
-
-def add_wrist_camera(
-    spec: mujoco.MjSpec, arm: str, instrument: str = "400006", body: str | None = None
-) -> None:
-    """Add `wrist_{arm}` to the arm's insertion link, or to the named body with that link's axes."""
-    carrier = body or f"{arm}_outer_insertion_link"
-    found = spec.body(carrier)
-    if found is None:
-        raise UnknownName("body", carrier, [item.name for item in spec.bodies])
-    _add(found, f"wrist_{arm}", wrist_camera(arm, instrument))
-
-
-def add_cameras(spec: mujoco.MjSpec, instrument: str = "400006") -> None:
-    """Add all cameras to a finished scene with both arms."""
-    add_world_cameras(spec)
-    for arm in ARMS:
-        add_wrist_camera(spec, arm, instrument)
-    add_following_cameras(spec)
+def add_cameras(spec: mujoco.MjSpec, names: Iterable[str], instrument: str) -> None:
+    """Add the cameras called `names` to a scene with both arms."""
+    for name in names:
+        CAMERAS.load(name).add_to(spec, name, instrument)
 
 
 def look_at(direction: Vector, up: Vector) -> Array:
@@ -222,12 +252,3 @@ def camera_id(model: mujoco.MjModel, camera: str) -> int:
     if index < 0:
         raise UnknownName("camera", camera, [model.camera(i).name for i in range(model.ncam)])
     return int(index)
-
-
-def _add(body: mujoco.MjsBody, name: str, pose: CameraPose) -> None:
-    """Add one camera; MuJoCo's camera frame is OpenCV's turned half about x."""
-    rotation = look_at(pose.direction, pose.up) * [1.0, -1.0, -1.0]
-    quaternion = matrix_to_quaternion(rotation).tolist()
-    body.add_camera(
-        name=name, pos=list(pose.position), quat=quaternion, fovy=math.degrees(pose.fovy)
-    )

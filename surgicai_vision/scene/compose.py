@@ -19,10 +19,11 @@ import mujoco
 
 from surgicai_vision.core import config as configuration
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import other_cameras
 from surgicai_vision.core.config import SceneConfig
 from surgicai_vision.core.errors import UnknownName
 from surgicai_vision.scene import arm, holes, kinematics, needle, phantom, rotations, thread
-from surgicai_vision.scene.cameras import add_following_cameras, add_world_cameras, add_wrist_camera
+from surgicai_vision.scene.cameras import add_cameras
 from surgicai_vision.scene.visual import materials
 
 TIMESTEP = 0.002
@@ -91,16 +92,26 @@ class Scene:
         return known.index(name)
 
 
-@functools.lru_cache(maxsize=8)
 def build_scene(config: SceneConfig = SceneConfig()) -> Scene:
-    """Return the compiled scene of `config`; the same object for the same configuration in one
-    process.
+    """Return the compiled scene of `config`, the same object as long as no camera is registered.
+
+    The cameras of other distributions come last and are not in the hash: a camera has no mass, so
+    whatever else is in a scene moves and looks as it does without them.
     """
+    return _build_scene(config, other_cameras())
+
+
+@functools.lru_cache(maxsize=8)
+def _build_scene(config: SceneConfig, others: tuple[str, ...]) -> Scene:
+    """Build the scene of `config` with the cameras `others` beside ours."""
     spec = build_spec(config)
     model = spec.compile()
+    text = spec.to_xml() + configuration.digest(config)
+    if others:
+        add_cameras(spec, others, config.instrument)
+        model = spec.compile()
     free = int(model.joint("needle").qposadr[0])
     first = model.geom("needle_0").id
-    text = spec.to_xml() + configuration.digest(config)
     return Scene(
         model=model,
         config=config,
@@ -133,13 +144,12 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
         for name in names.ARMS:
             arm.add_weld(spec, name)
     materials.dress(spec, config.layout, config.instrument)
-    add_world_cameras(spec)
-    add_following_cameras(spec)
+    add_cameras(spec, names.CAMERAS, config.instrument)
     return spec
 
 
 def _add_arm(spec: mujoco.MjSpec, config: SceneConfig, name: str) -> None:
-    """Add one arm at its base pose, with its wrist camera."""
+    """Add one arm at its base pose."""
     pose = kinematics.base_in_world(name)
     quat = rotations.matrix_to_quaternion(pose[:3, :3])
     base = spec.worldbody.add_body(
@@ -150,7 +160,6 @@ def _add_arm(spec: mujoco.MjSpec, config: SceneConfig, name: str) -> None:
     ]
     bits = {"contype": touching[0], "conaffinity": touching[1]}
     arm.add_arm(spec, name, base, kinematics.INSTRUMENTS[config.instrument], bits)
-    add_wrist_camera(spec, name, config.instrument)
 
 
 def _set_options(spec: mujoco.MjSpec, thread: int) -> None:

@@ -187,7 +187,7 @@ class Session:
             skipped=self.skipped,
             steps=len(self._attempt),
             limit=self.env.config.max_steps,
-            subtask=names.SUBTASKS[self.env.phase],
+            subtask=self.env.subtask.name,
             arm=self.env.subtask.arm,
             distance=float(info["d_trans"]),
             angle=float(info["d_angle"]),

@@ -13,7 +13,7 @@ from surgicai_vision.core import names
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.envs import hole_crossing, poses
 from surgicai_vision.envs.geometry import HANDOFF_ANGLE, grasp_in_needle
-from surgicai_vision.scene import build_scene, holes, needle
+from surgicai_vision.scene import build_scene, compose, holes, needle
 from surgicai_vision.scene.arm import GRASP_DEPTH, PAD_OFFSET
 from surgicai_vision.scene.rotations import rotvec_to_matrix
 
@@ -313,11 +313,11 @@ def moved_world(monkeypatch):
             holes.HolePair(moved(pair.entry), moved(pair.exit)) for pair in holes.PAIRS["simple"]
         )
         monkeypatch.setitem(holes.PAIRS, "simple", pairs)
-        build_scene.cache_clear()
+        compose._build_scene.cache_clear()
 
     yield move
     monkeypatch.undo()
-    build_scene.cache_clear()
+    compose._build_scene.cache_clear()
 
 
 def carry_over(source, target, shift):

@@ -3,20 +3,22 @@ at.
 """
 
 import math
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 import pytest
 
+from surgicai_vision.core import cameras
 from surgicai_vision.core.config import SceneConfig
-from surgicai_vision.core.errors import UnknownName
-from surgicai_vision.core.names import ARMS, CAMERAS, FOLLOWING_CAMERAS, PARTS
+from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.core.names import ARMS, CAMERAS, FIXED_CAMERAS, FOLLOWING_CAMERAS, PARTS
+from surgicai_vision.core.plugins import NameCollision
 from surgicai_vision.scene import build_scene, kinematics
 from surgicai_vision.scene.cameras import (
     FOLLOWED,
     FOLLOWING_SPAN,
-    WORLD_CAMERAS,
-    add_wrist_camera,
+    CameraPose,
     extrinsics,
     intrinsics,
     look_at,
@@ -40,6 +42,13 @@ def at_start(instrument: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
+def stand(name: str) -> CameraPose:
+    """A fixed camera's pose in world."""
+    pose = cameras.CAMERAS.load(name)
+    assert isinstance(pose, CameraPose)
+    return pose
+
+
 @pytest.fixture(scope="module", params=sorted(kinematics.INSTRUMENTS))
 def start(request):
     return at_start(request.param)
@@ -51,10 +60,10 @@ def test_the_scene_has_the_named_cameras(start):
     assert model.ncam == len(CAMERAS)
 
 
-@pytest.mark.parametrize("name", sorted(WORLD_CAMERAS))
+@pytest.mark.parametrize("name", FIXED_CAMERAS)
 def test_world_cameras_stand_where_the_table_says(start, name):
     model, data = start
-    pose, table = extrinsics(model, data, name), WORLD_CAMERAS[name]
+    pose, table = extrinsics(model, data, name), stand(name)
     assert np.allclose(pose[:3, 3], table.position, atol=1e-12)
     assert np.allclose(
         pose[:3, 2], np.array(table.direction) / np.linalg.norm(table.direction), atol=1e-6
@@ -104,7 +113,7 @@ def test_following_cameras_see_the_jaws_in_their_middle_from_where_the_fixed_one
         data.joint(f"{arm}_outer_yaw").qpos += move
         mujoco.mj_forward(model, data)
         pose = extrinsics(model, data, camera)
-        assert np.allclose(pose[:3, 3], WORLD_CAMERAS[base].position, atol=1e-12)
+        assert np.allclose(pose[:3, 3], stand(base).position, atol=1e-12)
         grasp = (np.linalg.inv(pose) @ [*data.site(f"{arm}_grasp").xpos, 1.0])[:3]
         np.testing.assert_allclose(grasp[:2], 0.0, atol=1e-9)
         assert grasp[2] > 0
@@ -144,4 +153,50 @@ def test_wrong_names_are_refused(start):
     with pytest.raises(UnknownName, match="Did you mean 'front'"):
         extrinsics(model, data, "frnt")
     with pytest.raises(UnknownName, match="world"):
-        add_wrist_camera(mujoco.MjSpec(), "psm1")
+        CameraPose((0, 0, 1), (0, 0, -1), (0, 1, 0), 0.8, "tripod").add_to(
+            mujoco.MjSpec(), "side", "400006"
+        )
+
+
+@pytest.fixture
+def side() -> Iterator[str]:
+    """A camera of another distribution, at the scene's side."""
+    pose = CameraPose((0.12, 0.03, 0.10), (-0.9, 0.0, -0.5), (0.0, 0.0, 1.0), 0.7)
+    cameras.register_camera("side", pose)
+    yield "side"
+    cameras.CAMERAS.unregister("side")
+
+
+def test_a_registered_camera_leaves_our_scene_as_it_was(side: str) -> None:
+    cameras.CAMERAS.unregister(side)
+    plain = build_scene()
+    cameras.register_camera(
+        side, CameraPose((0.12, 0.03, 0.10), (-0.9, 0.0, -0.5), (0.0, 0.0, 1.0), 0.7)
+    )
+    scene = build_scene()
+    assert scene is build_scene() and scene.hash == plain.hash
+    assert scene.model.ncam == plain.model.ncam + 1
+    states, images = [], []
+    for model in (plain.model, scene.model):
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, 50)
+        states.append(np.concatenate([data.qpos, data.qvel]))
+        mujoco.mj_forward(model, data)
+        with FrameRenderer(model, 64, 64) as renderer:
+            images.append([renderer.render(data, camera) for camera in CAMERAS])
+            if model is scene.model:
+                seen = renderer.render(data, side, "segmentation")
+    np.testing.assert_array_equal(*states)
+    np.testing.assert_array_equal(*images)
+    assert PARTS.index("needle") in seen
+
+
+def test_a_registered_camera_is_a_view_until_it_is_taken_out(side: str) -> None:
+    assert cameras.camera_names() == (*CAMERAS, side)
+    assert cameras.view_names()[-1] == "side_depth"
+    assert cameras.check_view("side_depth") == "side_depth"
+    with pytest.raises(NameCollision, match="'surgicai-vision'"):
+        cameras.register_camera("front", stand("back"))
+    for name in ("side view", "side_depth"):
+        with pytest.raises(InputError, match=f"called '{name}'"):
+            cameras.register_camera(name, stand("back"))

@@ -16,7 +16,7 @@ from surgicai_vision.core.names import ARMS, LAYOUTS, SUBTASKS
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.simulation import Simulation
-from surgicai_vision.scene import build_scene, holes, kinematics, needle, phantom
+from surgicai_vision.scene import build_scene, compose, holes, kinematics, needle, phantom
 from surgicai_vision.scene.kinematics import DVRK_JOINTS, INSTRUMENTS
 
 GRAVITY = 9.81
@@ -242,7 +242,7 @@ def test_the_circle_through_both_holes_clears_the_phantom(layout, clearance, num
 def test_the_hash_is_that_of_the_configuration():
     first = build_scene(SceneConfig())
     assert build_scene(SceneConfig()) is first
-    build_scene.cache_clear()
+    compose._build_scene.cache_clear()
     assert build_scene(SceneConfig()).hash == first.hash
     others = [{"thread": 10}, {"hole_pair": 2}, {"layout": "3dmed"}, {"grasp": "attach"}]
     assert len({first.hash, *(build_scene(SceneConfig(**other)).hash for other in others)}) == 5

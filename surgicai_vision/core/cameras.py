@@ -1,0 +1,69 @@
+"""Cameras and views by name: ours, registered ones and those of other distributions.
+
+A view is what a policy may see of a camera: its colours, under the camera's name, or its depth.
+"""
+
+from typing import TYPE_CHECKING, Final
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.plugins import CAMERAS_GROUP, Registry
+
+if TYPE_CHECKING:
+    from surgicai_vision.scene.cameras import Camera
+
+CAMERAS: Final = Registry["Camera"](
+    "camera",
+    CAMERAS_GROUP,
+    {name: f"surgicai_vision.scene.cameras:{name.upper()}" for name in names.CAMERAS},
+)
+"""Camera name → its `scene.cameras.Camera`."""
+
+
+def register_camera(name: str, camera: "Camera", distribution: str = "") -> None:
+    """Offer a camera under a new name in this process; envs made from now on have it.
+
+    Raises:
+        NameCollision: the name is taken.
+        InputError: no camera can be called so.
+    """
+    _check_form(name)
+    CAMERAS.register(name, camera, distribution)
+
+
+def camera_names() -> tuple[str, ...]:
+    """Return the name of every camera, ours first."""
+    known = CAMERAS.names()
+    for name in known[len(names.CAMERAS) :]:
+        _check_form(name)
+    return known
+
+
+def view_names() -> tuple[str, ...]:
+    """Return the name of every view: all cameras, then the depth of each."""
+    cameras = camera_names()
+    return (*cameras, *(f"{camera}_depth" for camera in cameras))
+
+
+def check_camera(name: str) -> str:
+    """Return `name` if a camera is called so, else raise `UnknownName`."""
+    return check_name("camera", name, camera_names())
+
+
+def check_view(name: str) -> str:
+    """Return `name` if a view is called so, else raise `UnknownName`."""
+    return check_name("view", name, view_names())
+
+
+def other_cameras() -> tuple[str, ...]:
+    """Return the names of the cameras that are not ours."""
+    return camera_names()[len(names.CAMERAS) :]
+
+
+def _check_form(name: str) -> None:
+    """Refuse names that a LeRobot key or a file of ours would read otherwise."""
+    if not name.isidentifier() or name.endswith(("_depth", "_segmentation")):
+        raise InputError(
+            f"No camera can be called '{name}'; take a name of letters, digits and _ that does "
+            "not end in _depth or _segmentation."
+        )

@@ -1,0 +1,150 @@
+"""Tasks by name: ours, registered ones and those of other distributions.
+
+* `task_names()`, `check_task(name)`: without importing any task.
+* `load_subtask(name)`, `task_text(name)`, `task_steps(name)`: what a task is.
+* `register_task(subtask)`: offer one in this process.
+* `register_ids()`: every task's gymnasium id; `import surgicai_vision` calls it.
+"""
+
+import importlib.util
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import TYPE_CHECKING, Final
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.plugins import TASKS_GROUP, NameCollision, Registry
+
+if TYPE_CHECKING:
+    from surgicai_vision.envs.subtask import Subtask
+
+SUBTASK_STEPS: Final = 200
+"""Control steps a subtask may take (paper, image policies)."""
+TASKS: Final = Registry["type[Subtask]"](
+    "task",
+    TASKS_GROUP,
+    {
+        "grasp": "surgicai_vision.envs.grasp:Grasp",
+        "place": "surgicai_vision.envs.place:Place",
+        "insert": "surgicai_vision.envs.insert:Insert",
+        "handoff": "surgicai_vision.envs.handoff:Handoff",
+        "pullout": "surgicai_vision.envs.pullout:Pullout",
+        names.SUTURE: "surgicai_vision.envs.suture:Suture",
+    },
+)
+"""Task name → its subclass of `envs.subtask.Subtask`; of `suture`, the env of all five."""
+
+
+def task_names() -> tuple[str, ...]:
+    """Return the name of every task: ours in the order of the procedure, then the others."""
+    return TASKS.names()
+
+
+def check_task(name: str) -> str:
+    """Return `name` if a task is called so, else raise `UnknownName`; imports no task."""
+    return TASKS.check(name)
+
+
+def load_subtask(name: str) -> "type[Subtask]":
+    """Return the class of a task that is one subtask.
+
+    Raises:
+        UnknownName: no task is called so.
+        InputError: another distribution's task cannot be imported or is called otherwise.
+    """
+    subtask = TASKS.load(name)
+    if subtask.name != name:
+        raise InputError(
+            f"The task '{name}' of '{TASKS.owner(name)}' calls itself '{subtask.name}'; "
+            "its author must give the entry point and the class one name."
+        )
+    return subtask
+
+
+def task_text(name: str) -> str:
+    """Return a task as the sentence that LeRobot stores."""
+    return names.TASK_TEXTS.get(name) or load_subtask(name).text
+
+
+def task_steps(name: str) -> int:
+    """Return the control steps an episode of a task may take unless it is said."""
+    if name == names.SUTURE:
+        return SUBTASK_STEPS * len(names.SUBTASKS)
+    return SUBTASK_STEPS if name in names.SUBTASKS else load_subtask(name).max_steps
+
+
+def env_id(name: str) -> str:
+    """Return the gymnasium id of a task: "surgicai_vision/TouchPoint-v0" of "touch_point"."""
+    return f"surgicai_vision/{''.join(word.capitalize() for word in name.split('_'))}-v0"
+
+
+def register_task(subtask: "type[Subtask]", distribution: str = "") -> None:
+    """Offer a task under its own name in this process, with its gymnasium id.
+
+    Raises:
+        NameCollision: the name is taken.
+    """
+    TASKS.register(subtask.name, subtask, distribution)
+    register_ids()
+
+
+def register_ids() -> None:
+    """Register every task's gymnasium id, as soon as gymnasium is imported.
+
+    gymnasium has no entry points, and importing it costs a third of what `--help` may take.
+    """
+    if "gymnasium" in sys.modules:
+        _register_all()
+    elif not any(isinstance(finder, _GymnasiumFinder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _GymnasiumFinder())
+
+
+class _GymnasiumFinder(MetaPathFinder):
+    """Finds gymnasium as Python does, once, and has the ids registered when it was imported."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return the spec of gymnasium; None for every other module."""
+        if fullname != "gymnasium":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(fullname)
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def execute_and_register(module: ModuleType) -> None:
+                execute(module)
+                _register_all()
+
+            spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
+        return spec
+
+
+def _register_all() -> None:
+    """Register the id of every task; where two tasks have one name, of ours alone."""
+    try:
+        known = task_names()
+    except NameCollision as error:
+        known = names.TASKS
+        warnings.warn(str(error), stacklevel=2)
+    for task in known:
+        _register_id(task)
+
+
+def _register_id(task: str) -> None:
+    import gymnasium
+
+    if env_id(task) not in gymnasium.registry:
+        gymnasium.register(
+            id=env_id(task),
+            entry_point="surgicai_vision.envs:make_task",
+            vector_entry_point="surgicai_vision.envs.vector_env:make_vector",
+            kwargs={"task": task},
+            order_enforce=True,
+            disable_env_checker=False,
+        )
