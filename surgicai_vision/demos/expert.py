@@ -170,7 +170,7 @@ def action_towards(world: WorldState, target: ToolTarget) -> NDArray[np.float32]
 
 
 def command_error(world: WorldState, tip: Matrix) -> Matrix:
-    """Return the way from the command to T_world_tip in step sizes, in the base's axes, (6,)."""
+    """Return the way from the command to T_world_tip in step sizes and the base's axes, (6,)."""
     inverse = world.base[:3, :3].T
     shift = inverse @ (tip[:3, 3] - world.command[:3, 3]) / world.step.translation
     turn = matrix_to_rotvec(inverse @ tip[:3, :3] @ world.command[:3, :3].T @ world.base[:3, :3])

@@ -1,4 +1,4 @@
-"""Demonstrations on disk: state first, no images, one file an episode, each written whole.
+"""Demonstrations on disk: states without images, one file an episode, each written whole.
 
 A folder of demonstrations holds `demos.json` (format, version, task, demonstrator, what was
 skipped) and `episode_000000.safetensors`, `episode_000001.safetensors`, … An episode file holds the
@@ -23,7 +23,8 @@ from surgicai_vision.core.config import TaskConfig, digest, from_mapping, to_map
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_json, sha256_file, write_bytes, write_json
 
-FORMAT, VERSION = "surgicai-vision-demos", 1
+FORMAT = "surgicai-vision-demos"
+VERSION = 2
 MARKER = "demos.json"
 """The file that makes a folder a folder of demonstrations."""
 
@@ -46,7 +47,7 @@ class Demo:
 
     Attributes:
         config: the task and scene it was made in.
-        seed: seed of the start state; -1 where the episode has none (a foreign recording).
+        seed: seed of the start state; -1 where the episode has none (an imported recording).
         demonstrator: "expert", "surgicai", …
         scene_hash: hash of the compiled scene.
         code_version: version of the code that made it.
@@ -56,10 +57,11 @@ class Demo:
         reward: (T,) float32, of the step.
         success: after the step, (T,) bool.
         contact: jaws touch the needle after the step, (T,) bool.
-        executed: what was done where that was not `action`, the label: (T, 7) float32, or None.
+        executed: the executed actions where those were not `action`, the labels: (T, 7) float32,
+            or None.
 
     Raises:
-        InputError: lengths, shapes or numbers that do not fit each other.
+        InputError: lengths, shapes or numbers that do not match.
     """
 
     config: TaskConfig
@@ -76,11 +78,13 @@ class Demo:
     executed: np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        arrays = self.arrays
         for name, (dtype, axes) in ARRAYS.items():
-            array = getattr(self, name)
+            array = arrays[name]
             if array.ndim != axes or array.dtype != dtype:
                 raise InputError(
-                    f"Demo.{name} is {array.dtype} with {array.ndim} axes; it must be {dtype} with {axes}."
+                    f"Demo.{name} is {array.dtype} with {array.ndim} axes; "
+                    f"it must be {dtype} with {axes}."
                 )
         if len(self.state) != len(self.action) + 1 or not len(self.action):
             raise InputError(
@@ -88,23 +92,36 @@ class Demo:
                 "there must be at least one action and one state more than actions."
             )
         for name in ("phase", "reward", "success", "contact"):
-            if len(getattr(self, name)) != len(self.action):
+            if len(arrays[name]) != len(self.action):
                 raise InputError(
-                    f"Demo has {len(getattr(self, name))} of {name} and {len(self.action)} actions."
+                    f"Demo has {len(arrays[name])} of {name} and {len(self.action)} actions."
                 )
-        done = self.action if self.executed is None else self.executed
-        if done.shape != self.action.shape or done.dtype != np.float32:
+        executed = self.action if self.executed is None else self.executed
+        if executed.shape != self.action.shape or executed.dtype != np.float32:
             raise InputError(
-                f"Demo.executed is {done.shape} {done.dtype}; it must be {self.action.shape} float32."
+                f"Demo.executed is {executed.shape} {executed.dtype}; "
+                f"it must be {self.action.shape} float32."
             )
         if self.action.shape[1] != len(names.ACTION_NAMES):
             raise InputError(
-                f"Demo.action has {self.action.shape[1]} columns; it must have {len(names.ACTION_NAMES)}."
+                f"Demo.action has {self.action.shape[1]} columns; "
+                f"it must have {len(names.ACTION_NAMES)}."
             )
-        if not all(
-            np.isfinite(values).all() for values in (self.state, self.action, self.reward, done)
-        ):
+        numbers = (self.state, self.action, self.reward, executed)
+        if not all(np.isfinite(array).all() for array in numbers):
             raise InputError("Demo holds numbers that are not finite.")
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays by their names in `ARRAYS`."""
+        return {
+            "state": self.state,
+            "action": self.action,
+            "phase": self.phase,
+            "reward": self.reward,
+            "success": self.success,
+            "contact": self.contact,
+        }
 
     def __len__(self) -> int:
         """Return the number of control steps T."""
@@ -122,7 +139,7 @@ def demo_bytes(demo: Demo) -> bytes:
         "scene_hash": demo.scene_hash,
         "code_version": demo.code_version,
     }
-    arrays = {name: np.ascontiguousarray(getattr(demo, name)) for name in ARRAYS}
+    arrays = {name: np.ascontiguousarray(array) for name, array in demo.arrays.items()}
     if demo.executed is not None:
         arrays[EXECUTED] = np.ascontiguousarray(demo.executed)
     return save(arrays, metadata={"demo": json.dumps(details, sort_keys=True)})
@@ -148,10 +165,7 @@ def read_demo(path: Path) -> Demo:
             arrays = {name: file.get_tensor(name) for name in present}
         if not isinstance(details, dict) or details.pop("format", None) != FORMAT:
             raise BadFile(f"{path} is not a demonstration (no '{FORMAT}' in its metadata).")
-        if details.pop("version") != VERSION:
-            raise BadFile(
-                f"{path} has another format version; this release reads version {VERSION}."
-            )
+        _check_version(path, details.pop("version"))
         details["config"] = from_mapping(TaskConfig, details["config"], str(path))
         fields = {field.name for field in dataclasses.fields(Demo)} - {*ARRAYS, EXECUTED}
         if set(details) != fields:
@@ -178,20 +192,31 @@ def write_marker(folder: Path, task: str, demonstrator: str, **details: Any) -> 
 
 
 def read_marker(folder: Path) -> dict[str, Any]:
-    """Read `demos.json`; `BadFile` where `folder` is no folder of demonstrations."""
+    """Read `demos.json`.
+
+    Raises:
+        BadFile: `folder` is no folder of demonstrations, or another release wrote it.
+    """
     if not (folder / MARKER).is_file():
         raise BadFile(
             f"{folder} is not a folder of demonstrations (no {MARKER} in it); make one with "
             "'surgicai-vision record-demos' or 'import-demos'."
         )
     marker = read_json(folder / MARKER)
-    if (
-        not isinstance(marker, dict)
-        or marker.get("format") != FORMAT
-        or marker.get("version") != VERSION
-    ):
-        raise BadFile(f"{folder / MARKER} is not of format {FORMAT} version {VERSION}.")
+    if not isinstance(marker, dict) or marker.get("format") != FORMAT:
+        raise BadFile(f"{folder / MARKER} is not of format {FORMAT}.")
+    _check_version(folder / MARKER, marker.get("version"))
     return marker
+
+
+def _check_version(path: Path, version: object) -> None:
+    """Refuse a file of another format version, those of release 0.1 (version 1) among them."""
+    if version != VERSION:
+        writer = "was written by release 0.1" if version == 1 else f"has format version {version}"
+        raise BadFile(
+            f"{path} {writer}; this release reads format version {VERSION}: "
+            "record or import the demonstrations again."
+        )
 
 
 def list_demos(folder: Path) -> list[Path]:
@@ -211,5 +236,5 @@ def list_demos(folder: Path) -> list[Path]:
 
 
 def demos_digest(paths: list[Path]) -> str:
-    """sha256 over the episodes' files, in order."""
+    """Return the sha256 over the episodes' files, in order."""
     return digest([sha256_file(path) for path in paths])

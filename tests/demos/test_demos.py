@@ -9,7 +9,9 @@ from fake_env import FakeEnv, FakeExpert
 
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
+from surgicai_vision.core.files import write_json
 from surgicai_vision.demos import record as recording
+from surgicai_vision.demos import store
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.rollout import Disturbance, rollout
 from surgicai_vision.demos.store import (
@@ -94,7 +96,7 @@ def test_the_range_of_noise_reaches_the_recording(tmp_path):
         assert one.seed == other.seed and not np.array_equal(one.executed, other.executed)
 
 
-def test_an_episode_lingers_after_its_success():
+def test_an_episode_goes_on_after_its_success():
     env = FakeEnv(CONFIG)
     plain = rollout(env, FakeExpert(env), 3).demo
     longer = rollout(env, FakeExpert(env), 3, post_success_steps=4).demo
@@ -198,6 +200,20 @@ def test_damaged_episode_is_a_bad_file(tmp_path, demo, spoil):
         read_demo(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_demonstrations_of_release_0_1_are_refused_in_one_line(tmp_path, demo, monkeypatch):
+    write_json(
+        tmp_path / "demos.json",
+        {"format": "surgicai-vision-demos", "version": 1, "task": "grasp", "source": "expert"},
+    )
+    monkeypatch.setattr(store, "VERSION", 1)
+    path = write_demo(tmp_path, 0, demo)
+    monkeypatch.undo()
+    for read, file in ((read_marker, tmp_path), (list_demos, tmp_path), (read_demo, path)):
+        with pytest.raises(BadFile, match=r"was written by release 0\.1; .* again\.$") as caught:
+            read(file)
+        assert "\n" not in str(caught.value)
 
 
 def test_folder_without_marker_or_with_a_gap_is_refused(tmp_path, demo):
