@@ -187,7 +187,7 @@ def _shifted(pose: Matrix, shift: Matrix) -> Matrix:
     return moved
 
 
-# -- grasping the needle ----------------------------------------------------------------------------
+# -- grasping the needle ---------------------------------------------------------------------------
 
 
 def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: float) -> ToolTarget:
@@ -232,7 +232,7 @@ def _handoff(world: WorldState) -> ToolTarget:
     return approach_and_grasp(world, goal, HANDOFF_BACK, OPEN_HANDOFF)
 
 
-# -- carrying the needle ----------------------------------------------------------------------------------
+# -- carrying the needle ---------------------------------------------------------------------------
 
 
 def on_path(stitch: Stitch, turned: float) -> Matrix:
