@@ -59,6 +59,7 @@ class Options:
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode every view and print where the features are."""
     weights = join_weights(options.weights)
+    # What can be wrong is found before torch is imported.
     encoders.find_weights(options.encoder, weights, options.accept_licence)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
     if options.export:

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import App, Parameter
 
@@ -77,15 +77,17 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     path = options.file
     if is_bag(path) or path.is_dir():
         return _import_bags(path, options, console)
-    given = [
-        name
-        for name in ("topic", "convention", "segmentation", "bag", "env")
-        if getattr(options, name)
-    ]
+    for_bags = {
+        "--topic": options.topic,
+        "--convention": options.convention,
+        "--segmentation": options.segmentation,
+        "the table bag": options.bag,
+        "the table env": options.env,
+    }
+    given = [name for name, value in for_bags.items() if value]
     if given:
         raise InputError(
-            f"--{given[0]} is for bags, and {path} is none (*.bag, *.db3, *.mcap, a folder of "
-            "ROS 2)."
+            f"{given[0]} is for bags, and {path} is none (*.bag, *.db3, *.mcap, a folder of ROS 2)."
         )
     return _import_surgicai(path, options, console)
 
@@ -169,11 +171,12 @@ def _import_bags(path: Path, options: Options, console: Console) -> dict[str, ob
 def _config(options: Options) -> BagConfig:
     """Return the table `bag` with the command line's options put over it."""
     config = options.bag or BagConfig()
-    changes: dict[str, Any] = {
-        name: value for name in ("convention", "segmentation") if (value := getattr(options, name))
-    }
-    topics = dataclasses.replace(config.topics, **_topics(options.topic))
-    return dataclasses.replace(config, topics=topics, **changes)
+    return dataclasses.replace(
+        config,
+        topics=dataclasses.replace(config.topics, **_topics(options.topic)),
+        convention=options.convention or config.convention,
+        segmentation=options.segmentation or config.segmentation,
+    )
 
 
 def _topics(given: Sequence[str]) -> dict[str, str]:

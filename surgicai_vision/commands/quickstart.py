@@ -87,7 +87,8 @@ def table(results: list[dict[str, Any]]) -> list[str]:
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:
     low, high = result["ci95"]
-    length, steps = result["trajectory_length_mm"]["mean"], result["time_steps"]["mean"]
+    length = result["trajectory_length_mm"]["mean"]
+    steps = result["time_steps"]["mean"]
     return (
         result["policy"],
         f"{result['successes']}/{result['episodes']}",

@@ -86,6 +86,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             f"--noise-from is {options.noise_from:g}; "
             f"it must be at most --noise, {options.noise:g}."
         )
+    # Everything that can be wrong is found before any work: the engine, the task, the folders.
     engine = open_engine(options.executor)
     config = task_config(options.task, options.env)
     out = options.out or folders.demos_folder(options.task)
@@ -109,6 +110,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             learner=learner,
             progress=progress,
         )
+    # A start that the demonstrator failed from is named in the marker and counts in the share.
     tried = len(paths) + len(read_marker(out)["skipped"])
     low, high = clopper_pearson(len(paths), tried)
     console.say(f"{len(paths)} demonstrations of {options.task}: {out}")

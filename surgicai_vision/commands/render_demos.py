@@ -78,6 +78,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     from surgicai_vision.core.executor import open_engine
     from surgicai_vision.dataset import render_demos
 
+    # Everything that can be wrong is found before any work.
     engine = open_engine(options.executor)
     if options.demos and (options.task or options.episodes or options.env):
         raise InputError(

@@ -95,6 +95,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 def curve_line(rows: list[dict[str, Any]]) -> str:
     """Return one line about the successes along one axis."""
     points = ", ".join(f"{row['strength']:g}: {row['k']}/{row['n']}" for row in rows)
-    area, low, high = (rows[0][key] for key in ("auc", "auc_low", "auc_high"))
-    under = "" if area is None else f"; area {area:.2f} ({low:.2f}–{high:.2f})"
-    return f"{rows[0]['axis']:<16} {points}{under}"
+    first = rows[0]
+    area = ""
+    if first["auc"] is not None:
+        area = f"; area {first['auc']:.2f} ({first['auc_low']:.2f}–{first['auc_high']:.2f})"
+    return f"{first['axis']:<16} {points}{area}"

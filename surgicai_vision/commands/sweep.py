@@ -110,7 +110,8 @@ def _duration(seconds: float) -> str:
 
 def grid_file(given: str) -> Path:
     """Find a grid: a file, or the name or repository path of a shipped one."""
-    path, folder = Path(given), configs_folder() / "sweep"
+    path = Path(given)
+    folder = configs_folder() / "sweep"
     if path.is_file():
         return path
     shipped = {file.stem: file for file in folder.glob("*.yaml")}

@@ -142,7 +142,7 @@ def test_options_of_bags_are_refused_for_pickles(tmp_path, capsys):
         main(["import-demos", str(tmp_path / "x.pkl"), "--task", "grasp", "--topic", "needle=/n"])
         == 2
     )
-    assert "--topic is of bags" in capsys.readouterr().err
+    assert "--topic is for bags" in capsys.readouterr().err
     assert main(["import-demos", str(tmp_path), "--task", "grasp"]) == 2
     assert "a folder without bags" in capsys.readouterr().err
 
