@@ -55,7 +55,9 @@ class Memory:
 def bare(name: str, weights: str | None) -> Callable[[np.ndarray, int], np.ndarray]:
     """Return the bare loop: (frames (N, H, W, 3) uint8, batch) → features (N, dim) float16."""
     plugin = encoders.encoder_plugin(name)
-    card, network = plugin.build(plugin.card, encoders.find_weights(name, weights))
+    card, network = plugin.build(
+        plugin.card, encoders.find_weights(name, encoders.WeightsSource.of(weights))
+    )
     device = best_device()
     kind = best_dtype(device)
     network = (
@@ -93,7 +95,7 @@ def ways(
 ) -> dict[str, Callable[[], int]]:
     """Return what is timed, by name; each returns how many frames it encoded."""
     loop = bare(name, weights)
-    encoder = encoders.load_encoder(name, weights)
+    encoder = encoders.load_encoder(name, weights=encoders.WeightsSource.of(weights))
     batch = CUDA_BATCH if torch.cuda.is_available() else BATCH
     error = np.abs(loop(frames[:batch], batch).astype(np.float32) - encoder(frames[:batch])).max()
     print(f"{name}: largest difference between the ways {error:.4f}", file=sys.stderr)

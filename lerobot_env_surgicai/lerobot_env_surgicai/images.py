@@ -18,7 +18,7 @@ from surgicai_vision.training.checkpoint import SEEN
 @functools.lru_cache(maxsize=2)
 def load_encoder(name: str, weights: str | None, pool: str) -> Any:
     """Load a frozen encoder, once a process for each choice."""
-    return encoders.load_encoder(name, weights, pool=pool)
+    return encoders.load_encoder(name, pool, encoders.WeightsSource.of(weights))
 
 
 def identity(encoder: Any) -> str:

@@ -282,7 +282,7 @@ def probe_encoders() -> Finding:
         card = encoders.encoder_card(name)
         unpinned = "" if card.sha256 else " (unpinned: the hub's own hash is taken)"
         try:
-            path = encoders.find_weights(name, accept_licence=True)
+            path = encoders.find_weights(name, encoders.WeightsSource(accept_licence=True))
             detail = str(path) if path else f"{card.source} {card.revision}, always at hand"
             found[name] = {"at_hand": True, "detail": f"{detail}{unpinned if path else ''}"}
         except MissingWeights:

@@ -17,7 +17,6 @@ from surgicai_vision.commands.options import (
     VIEWS,
     WEIGHTS,
     default_text,
-    join_weights,
 )
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import check_output
@@ -58,9 +57,9 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode every view and print where the features are."""
-    weights = join_weights(options.weights)
+    weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     # What can be wrong is found before torch is imported.
-    encoders.find_weights(options.encoder, weights, options.accept_licence)
+    encoders.find_weights(options.encoder, weights)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
     if options.export:
         if options.pool != "global":
@@ -68,7 +67,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         check_output(options.export)
     from surgicai_vision.features.cache import encode
 
-    encoder = encoders.load_encoder(options.encoder, weights, options.pool, options.accept_licence)
+    encoder = encoders.load_encoder(options.encoder, options.pool, weights)
     entries = []
     rows = []
     for view in options.view:

@@ -18,13 +18,13 @@ from surgicai_vision.commands.options import (
     TASK,
     WEIGHTS,
     default_text,
-    join_weights,
     read_yaml,
     task_config,
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.features.encoders import WeightsSource
 
 app = App(
     name="evaluate",
@@ -108,7 +108,7 @@ def subject_of(options: Any) -> Any:
 
     folder = Path(options.policy)
     swap = getattr(options, "swap", None)
-    weights = join_weights(options.weights)
+    weights = WeightsSource.parse(options.weights, options.accept_licence)
     if swap and folder.suffix not in CHAIN_SUFFIXES:
         raise InputError(f"--swap {swap} is for a chain.yaml; leave it out.")
     if options.policy == REPLAY:
@@ -131,7 +131,7 @@ def subject_of(options: Any) -> Any:
     if lerobot:
         subject = lerobot_agent.subject(lerobot, options.task, weights)
     else:
-        subject = policy_spec.checkpoint_subject(folder, weights, options.accept_licence)
+        subject = policy_spec.checkpoint_subject(folder, weights)
     trained_for = subject.config.task
     if options.task not in (None, trained_for):
         raise InputError(
@@ -160,10 +160,10 @@ def _chain(path: Path, options: Any, swap: str | None = None) -> Any:
             f"{path} is a chain of the whole procedure; leave --task {options.task} out."
         )
     env = {"max_steps": config.max_steps, **options.env} if options.env else None
-    weights = join_weights(options.weights)
+    weights = WeightsSource.parse(options.weights, options.accept_licence)
     if swap != ALL:
-        return _in_env(expert_swap.swapped(config, swap, weights, options.accept_licence), env)
-    variants = expert_swap.variants_of(config, weights, options.accept_licence)
+        return _in_env(expert_swap.swapped(config, swap, weights), env)
+    variants = expert_swap.variants_of(config, weights)
     return {name: _in_env(subject, env) for name, subject in variants.items()}
 
 

@@ -99,7 +99,7 @@ WEIGHTS = Parameter(
     metavar="[NAME=]FILE",
     show_default=False,
 )
-"""Given again for another encoder; `join_weights` makes one text of it."""
+"""Given again for another encoder; `encoders.WeightsSource.parse` reads them."""
 ACCEPT_LICENCE = Parameter(help="Accept weights under a non-commercial licence.", negative=())
 EXECUTOR = Parameter(
     help="What runs the jobs: local, ray or slurm, with its options, such as ray,address=HOST:PORT "
@@ -114,11 +114,6 @@ FILE_ONLY = Parameter(accepts_keys=False, converter=_refuse_text, show=False)
 def default_text(text: str) -> Parameter:
     """Return a trait that says what an option without a value of its own defaults to."""
     return Parameter(show_default=text)
-
-
-def join_weights(given: Sequence[str]) -> str | None:
-    """Return every `--weights` as the one text that `encoders.weights_of` reads."""
-    return ",".join(given) or None
 
 
 def task_config(task: str, env: dict[str, object] | None) -> TaskConfig:

@@ -18,7 +18,6 @@ from surgicai_vision.commands.options import (
     VIEWS,
     WEIGHTS,
     default_text,
-    join_weights,
 )
 from surgicai_vision.core.files import check_output, write_json
 from surgicai_vision.features import encoders
@@ -66,9 +65,9 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Probe every encoder and view set, keep the rows and print them."""
-    weights = join_weights(options.weights)
+    weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     for encoder in options.encoder:
-        encoders.find_weights(encoder, weights, options.accept_licence)
+        encoders.find_weights(encoder, weights)
     dataset = folders.open_dataset(options.dataset, options.task, options.view)
     label = "-".join(
         (dataset.task, "+".join(options.encoder).replace(":", "-"), "+".join(options.view))
@@ -90,7 +89,7 @@ def _rows(
     from surgicai_vision.features.probe import probe
 
     encoder = encoders.load_encoder(
-        name, join_weights(options.weights), options.pool, options.accept_licence
+        name, options.pool, encoders.WeightsSource.parse(options.weights, options.accept_licence)
     )
     entries = {}
     for view in options.view:

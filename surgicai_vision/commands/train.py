@@ -20,7 +20,6 @@ from surgicai_vision.commands.options import (
     VIEWS,
     WEIGHTS,
     default_text,
-    join_weights,
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
@@ -103,10 +102,10 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode what is not in the cache, train and print where the checkpoint is."""
-    weights = join_weights(options.weights)
+    weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     encoder = None if options.encoder in (NO_ENCODER, STATE) else options.encoder
     if encoder:
-        encoders.find_weights(encoder, weights, options.accept_licence)
+        encoders.find_weights(encoder, weights)
     from surgicai_vision.experiments.run import Cell, train_cell
 
     task = names.SUTURE if options.subtask else options.task
@@ -134,7 +133,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     cell = replace(cell, task=dataset.task)
     with open_log(options.log, out) as log:
         train_cell(
-            cell, dataset, out, console.stage, weights, accept_licence=options.accept_licence,
+            cell, dataset, out, console.stage, weights,
             start=options.start, save_every=options.save_every, log=log,
         )  # fmt: skip
     console.say(f"checkpoint: {out}")

@@ -23,6 +23,7 @@ from surgicai_vision.evaluation.policy_spec import Subject
 from surgicai_vision.evaluation.run import evaluate_into
 from surgicai_vision.evaluation.statistics import clopper_pearson, holm, mcnemar
 from surgicai_vision.evaluation.storage import MARKER, parquet_bytes, read_rows
+from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 
 CURVES, MARK = "survival.parquet", "survival.json"
 EXPERT, ALL, AS_IT_IS = "expert", "all", "as-it-is"
@@ -31,8 +32,7 @@ EXPERT, ALL, AS_IT_IS = "expert", "all", "as-it-is"
 def swapped(
     config: hierarchical.Chain,
     subtask: str | None,
-    weights: str | None = None,
-    accept_licence: bool = False,
+    weights: WeightsSource = ANYWHERE,
 ) -> Subject:
     """Return the subject of a chain with the expert in the place of one subtask's policy.
 
@@ -41,15 +41,14 @@ def swapped(
     Args:
         config: the chain.
         subtask: one of `names.SUBTASKS`, or None for the chain as it is.
-        weights: file with the encoders' pretrained weights.
-        accept_licence: accept weights under a non-commercial licence.
+        weights: where pretrained weights come from.
     """
-    plain = hierarchical.subject(config, weights, accept_licence)
+    plain = hierarchical.subject(config, weights)
     if subtask is None:
         return dataclasses.replace(plain, about={**plain.about, "swap": None})
     check_name("subtask", subtask, names.SUBTASKS)
     change: dict[str, Any] = {subtask: EXPERT}
-    other = hierarchical.subject(dataclasses.replace(config, **change), weights, accept_licence)
+    other = hierarchical.subject(dataclasses.replace(config, **change), weights)
     make = functools.partial(_named, other.make_agent, plain.name)
     # With experts in every place a chain knows no scene; the task stays that of the chain as it is.
     about = {**other.about, "swap": subtask}
@@ -110,14 +109,14 @@ def survival_curves(
 
 
 def variants_of(
-    config: hierarchical.Chain, weights: str | None = None, accept_licence: bool = False
+    config: hierarchical.Chain, weights: WeightsSource = ANYWHERE
 ) -> dict[str, Subject]:
     """Return folder name → subject: the chain as it is, then each subtask that is not the expert's
     already swapped.
     """
     learned = [subtask for subtask in names.SUBTASKS if getattr(config, subtask) != EXPERT]
-    swaps = {subtask: swapped(config, subtask, weights, accept_licence) for subtask in learned}
-    return {AS_IT_IS: swapped(config, None, weights, accept_licence), **swaps}
+    swaps = {subtask: swapped(config, subtask, weights) for subtask in learned}
+    return {AS_IT_IS: swapped(config, None, weights), **swaps}
 
 
 def _stages(swap: str, stages: Sequence[int]) -> list[dict[str, Any]]:

@@ -35,6 +35,7 @@ from surgicai_vision.evaluation import lerobot_agent
 from surgicai_vision.evaluation.agent import Actions, Agent, Env, FeatureTable, Observation
 from surgicai_vision.evaluation.agents import BASELINES, PolicyAgent, one_thread
 from surgicai_vision.evaluation.policy_spec import Subject, checkpoint_subject, policy_agent
+from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 
 ORDER = "order"
 GRASP = names.SUBTASKS.index("grasp")
@@ -94,13 +95,12 @@ class Chain:
         return tuple(getattr(self, subtask) for subtask in names.SUBTASKS)
 
 
-def subject(chain: Chain, weights: str | None = None, accept_licence: bool = False) -> Subject:
+def subject(chain: Chain, weights: WeightsSource = ANYWHERE) -> Subject:
     """Return the subject of a chain, every checkpoint checked.
 
     Args:
         chain: who decides and who acts.
-        weights: files with the encoders' pretrained weights, as `encoders.weights_of` takes them.
-        accept_licence: accept weights under a non-commercial licence.
+        weights: where pretrained weights come from.
 
     Raises:
         BadFile: a folder that is no checkpoint.
@@ -111,7 +111,7 @@ def subject(chain: Chain, weights: str | None = None, accept_licence: bool = Fal
     configs = {}
     for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True):
         if policy not in BASELINES:
-            configs[subtask] = _low_subject(policy, subtask, weights, accept_licence).config
+            configs[subtask] = _low_subject(policy, subtask, weights).config
             if configs[subtask].task != subtask:
                 raise InputError(
                     f"{policy} was trained for '{configs[subtask].task}', not for '{subtask}'."
@@ -130,29 +130,27 @@ def subject(chain: Chain, weights: str | None = None, accept_licence: bool = Fal
         raise InputError(
             "The chain's policies were trained in different scenes or with different steps; give one kind."
         )
-    about["views"] = list(_views(chain, weights, accept_licence))
+    about["views"] = list(_views(chain, weights))
     name = f"chain-{chain.termination}-{digest(chain)[:8]}"
-    return Subject(
-        name, made[0], functools.partial(ChainAgent, name, chain, weights, accept_licence), about
-    )
+    return Subject(name, made[0], functools.partial(ChainAgent, name, chain, weights), about)
 
 
-def _low_subject(policy: str, subtask: str, weights: str | None, accept_licence: bool) -> Subject:
+def _low_subject(policy: str, subtask: str, weights: WeightsSource) -> Subject:
     """Return the subject of a low-level policy's folder, ours or LeRobot's."""
     lerobot = lerobot_agent.find(Path(policy))
     if lerobot:
         return lerobot_agent.subject(lerobot, subtask, weights)
-    return checkpoint_subject(Path(policy), weights, accept_licence)
+    return checkpoint_subject(Path(policy), weights)
 
 
-def _views(chain: Chain, weights: str | None, accept_licence: bool) -> tuple[str, ...]:
+def _views(chain: Chain, weights: WeightsSource) -> tuple[str, ...]:
     """Every view some policy of the chain sees."""
     from surgicai_vision.training.checkpoint import read_checkpoint
 
     seen = set() if chain.hlp == ORDER else set(read_checkpoint(Path(chain.hlp)).views)
     for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True):
         if policy not in BASELINES:
-            seen.update(_low_subject(policy, subtask, weights, accept_licence).about["views"])
+            seen.update(_low_subject(policy, subtask, weights).about["views"])
     return tuple(view for view in names.CAMERAS if view in seen)
 
 
@@ -181,20 +179,18 @@ class ChainAgent(Agent):
     whether the present subtask has ended; it tells it which subtask, and so which arm, is on.
     """
 
-    def __init__(
-        self, name: str, chain: Chain, weights: str | None = None, accept_licence: bool = False
-    ):
+    def __init__(self, name: str, chain: Chain, weights: WeightsSource = ANYWHERE):
         self.name, self.chain = name, chain
-        self.cameras = _views(chain, weights, accept_licence)
+        self.cameras = _views(chain, weights)
         self._low: list[Agent] = [
             BASELINES[policy]()
             if policy in BASELINES
-            else _low_subject(policy, subtask, weights, accept_licence).make_agent()
+            else _low_subject(policy, subtask, weights).make_agent()
             for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True)
         ]
         self._high: PolicyAgent | None = None
         if chain.hlp != ORDER:
-            self._high = policy_agent(Path(chain.hlp), weights, accept_licence)
+            self._high = policy_agent(Path(chain.hlp), weights)
         self._agents = [*self._low, *([self._high] if self._high else [])]
         sizes = {agent.image_size for agent in self._agents if agent.cameras}
         if len(sizes) > 1:

@@ -33,6 +33,7 @@ from surgicai_vision.core.files import read_json, sha256_file
 from surgicai_vision.evaluation.agent import Actions, Agent, Env, Observation, images_of
 from surgicai_vision.evaluation.agents import one_thread
 from surgicai_vision.evaluation.policy_spec import Subject
+from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 
 CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
 PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")
@@ -67,13 +68,13 @@ class Sight:
     sha256: str = ""
 
 
-def subject(folder: Path, task: str | None = None, weights: str | None = None) -> Subject:
+def subject(folder: Path, task: str | None = None, weights: WeightsSource = ANYWHERE) -> Subject:
     """Return the subject of a checkpoint folder of `find`.
 
     Args:
         folder: holds config.json and model.safetensors.
         task: the task, where the checkpoint does not say it.
-        weights: file with the encoder's pretrained weights.
+        weights: where pretrained weights come from.
 
     Raises:
         BadFile: a checkpoint that is damaged.
@@ -174,12 +175,17 @@ class LeRobotAgent(Agent):
         name: how tables call it.
         folder: its checkpoint.
         sight: what it sees.
-        weights: file with the encoder's pretrained weights.
+        weights: where pretrained weights come from.
         text: the task in words, as its dataset says it; empty for the env's own.
     """
 
     def __init__(
-        self, name: str, folder: Path, sight: Sight, weights: str | None = None, text: str = ""
+        self,
+        name: str,
+        folder: Path,
+        sight: Sight,
+        weights: WeightsSource = ANYWHERE,
+        text: str = "",
     ):
         self.name, self.cameras, self.image_size = name, sight.cameras, sight.image_size
         self._policy, self._before, self._after = _load(folder, weights)
@@ -272,7 +278,7 @@ def _set_random(device: str, state: Any) -> None:
         torch.cuda.set_rng_state(state, device)
 
 
-def _load(folder: Path, weights: str | None) -> tuple[Any, Any, Any]:
+def _load(folder: Path, weights: WeightsSource) -> tuple[Any, Any, Any]:
     """Return policy, pre- and post-processor; plug-ins are found as LeRobot's own commands find
     them.
     """
@@ -280,15 +286,13 @@ def _load(folder: Path, weights: str | None) -> tuple[Any, Any, Any]:
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    from surgicai_vision.features import encoders
-
     register_third_party_plugins()
     try:
         config = PreTrainedConfig.from_pretrained(folder)
         # The checkpoint holds the backbone; LeRobot would download it first, only to overwrite it.
         if getattr(config, "pretrained_backbone_weights", None):
             config.pretrained_backbone_weights = None  # type: ignore[attr-defined]
-        own = encoders.weights_of(str(getattr(config, "encoder", None)), weights)
+        own = weights.file_for(str(getattr(config, "encoder", None)))
         if own and hasattr(config, "encoder_weights"):
             config.encoder_weights = str(own)
         with contextlib.redirect_stdout(
@@ -308,11 +312,9 @@ def _load(folder: Path, weights: str | None) -> tuple[Any, Any, Any]:
     return policy.eval(), before, after
 
 
-def _encoder(sight: Sight, weights: str | None) -> Any:
+def _encoder(sight: Sight, weights: WeightsSource) -> Any:
     """Load the encoder whose features the policy sees, verified."""
-    from surgicai_vision.features import encoders
-
-    encoder = encoders.load_encoder(str(sight.encoder), weights)
+    encoder = load_encoder(str(sight.encoder), weights=weights)
     if sight.sha256 and encoder.weights_sha256 != sight.sha256:
         raise InputError(
             f"The policy was trained on encoder '{sight.encoder}' with weights sha256 {sight.sha256}, got "

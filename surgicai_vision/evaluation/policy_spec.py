@@ -18,6 +18,7 @@ from surgicai_vision.evaluation.agents import (
     ReplayAgent,
     mean_demonstration,
 )
+from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 
 if TYPE_CHECKING:
     from surgicai_vision.dataset.protocol import Dataset
@@ -76,9 +77,7 @@ def replay_subject(dataset: "Dataset") -> Subject:
     return Subject(ReplayAgent.name, dataset.config, functools.partial(ReplayAgent, actions), about)
 
 
-def checkpoint_subject(
-    folder: Path, weights: str | None = None, accept_licence: bool = False
-) -> Subject:
+def checkpoint_subject(folder: Path, weights: WeightsSource = ANYWHERE) -> Subject:
     """Return the subject of a checkpoint folder; its weights are looked up at once.
 
     Raises:
@@ -96,7 +95,7 @@ def checkpoint_subject(
         )
     encoder = checkpoint.encoder
     if encoder:
-        encoders.find_weights(encoder.name, weights, accept_licence)
+        encoders.find_weights(encoder.name, weights)
     about = {
         "checkpoint": {
             "weights_sha256": encoder.weights_sha256 if encoder else None,
@@ -111,7 +110,7 @@ def checkpoint_subject(
         "views": list(checkpoint.views),
         "encoder": encoder.name if encoder else checkpoint_name(checkpoint),
     }
-    make = functools.partial(policy_agent, folder, weights, accept_licence)
+    make = functools.partial(policy_agent, folder, weights)
     return Subject(checkpoint_name(checkpoint), checkpoint.task, make, about)
 
 
@@ -136,9 +135,7 @@ def baseline(name: str) -> Agent:
     return BASELINES[name]()
 
 
-def policy_agent(
-    folder: Path, weights: str | None = None, accept_licence: bool = False
-) -> PolicyAgent:
+def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent:
     """Make the agent of a checkpoint folder (in a worker process).
 
     Raises:
@@ -148,6 +145,6 @@ def policy_agent(
 
     policy = policies.load_policy(folder)
     checkpoint = policy.checkpoint
-    encoder = policies.load_encoder_of(checkpoint, weights, accept_licence)
+    encoder = policies.load_encoder_of(checkpoint, weights)
     name, vector = checkpoint_name(checkpoint), policy.inputs.vector or names.STATE
     return PolicyAgent(name, policy, encoder, checkpoint.views, checkpoint.image_size, vector)

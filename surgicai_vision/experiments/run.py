@@ -16,7 +16,7 @@ from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.policy_spec import policy_name
 from surgicai_vision.features.cache import Features, encode
-from surgicai_vision.features.encoders import load_encoder
+from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 
 if TYPE_CHECKING:
     from surgicai_vision.dataset.protocol import Dataset
@@ -108,9 +108,7 @@ def train_cell(
     dataset: "Dataset",
     out: Path,
     stage: Stage,
-    weights: str | None = None,
-    *,
-    accept_licence: bool = False,
+    weights: WeightsSource = ANYWHERE,
     start: Path | None = None,
     subtask: str | None = None,
     save_every: int = 0,
@@ -124,8 +122,7 @@ def train_cell(
         dataset: an opened dataset of the cell's task.
         out: checkpoint folder; one of the same training is continued, or left as it is.
         stage: shows progress.
-        weights: file with the encoder's pretrained weights.
-        accept_licence: accept weights under a non-commercial licence.
+        weights: where pretrained weights come from.
         start: checkpoint folder to start from (fine-tuning).
         subtask: train on this subtask's frames of the dataset's whole procedures.
         save_every: also keep a checkpoint every so many epochs.
@@ -143,7 +140,7 @@ def train_cell(
     recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
     dataset = with_frame_stride(dataset, recipe.frame_stride)
     begin = policies.load_policy(start) if start else None
-    features = _encode(cell, dataset, stage, weights, accept_licence)
+    features = _encode(cell, dataset, stage, weights)
     subsets: list[Callable[[Dataset], DatasetSubset]] = []
     if cell.demonstrations is not None:
         subsets.append(functools.partial(first_episodes, count=cell.demonstrations))
@@ -165,9 +162,7 @@ def encode_cell(
     cell: Cell,
     dataset: "Dataset",
     stage: Stage,
-    weights: str | None = None,
-    *,
-    accept_licence: bool = False,
+    weights: WeightsSource = ANYWHERE,
 ) -> list[Features]:
     """Encode the cell's views, all frames that its recipe takes, or find them in the cache."""
     from surgicai_vision.dataset.subset import with_frame_stride
@@ -175,16 +170,14 @@ def encode_cell(
 
     recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
     dataset = with_frame_stride(dataset, recipe.frame_stride)
-    return _encode(cell, dataset, stage, weights, accept_licence)
+    return _encode(cell, dataset, stage, weights)
 
 
-def _encode(
-    cell: Cell, dataset: "Dataset", stage: Stage, weights: str | None, accept_licence: bool
-) -> list[Features]:
+def _encode(cell: Cell, dataset: "Dataset", stage: Stage, weights: WeightsSource) -> list[Features]:
     """Encode the cell's views, all frames of `dataset`."""
     if not cell.encoder:
         return []
-    encoder = load_encoder(cell.encoder, weights, cell.pool, accept_licence)
+    encoder = load_encoder(cell.encoder, cell.pool, weights)
     features = []
     for view in cell.view:
         with stage(f"features: {cell.encoder}, {view}", "frames") as progress:

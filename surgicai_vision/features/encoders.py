@@ -1,21 +1,23 @@
 """Encoders by name, imported on first use; other distributions add theirs (`core.plugins`).
 
-* `encoder_names()`, `check_encoder_name(name)`, `encoder_card(name)`, `find_weights(name, …)`.
-* `load_encoder(name, weights=None, pool="global", accept_licence=False) -> encoders.base.Encoder`:
-  a callable from (batch, height, width, 3) uint8 RGB to (batch, dimension) float32.
+* `encoder_names()`, `check_encoder_name(name)`, `encoder_card(name)`.
+* `WeightsSource`: where pretrained weights come from; `find_weights(name, weights)`.
+* `load_encoder(name, pool, weights) -> encoders.base.Encoder`: a callable from (batch, height,
+  width, 3) uint8 RGB to (batch, dimension) float32.
 """
 
-import importlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
+from encoders.weights import find
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.plugins import ENCODERS_GROUP, Registry, resolve
 
 if TYPE_CHECKING:
-    from encoders.base import EncoderCard, Plugin
+    from encoders.base import Encoder, EncoderCard, Plugin
 
 ENCODERS: Final = Registry["Plugin"](
     "encoder",
@@ -94,20 +96,69 @@ def encoder_card(name: str) -> "EncoderCard":
     return encoder_plugin(name).card
 
 
-def load_encoder(
-    name: str,
-    weights: Path | str | None = None,
-    pool: str = "global",
-    accept_licence: bool = False,
-) -> Any:
+@dataclass(frozen=True)
+class WeightsSource:
+    """Where pretrained weights come from, and whether their licence is accepted.
+
+    What no file is named for is looked for in the folder $SURGICAI_VISION_WEIGHTS, in the hub's
+    cache and by a download, in this order.
+
+    Attributes:
+        files: (encoder's name, its weights file) of each file given; the name is "" for the file of
+            every encoder that has none of its own.
+        accept_licence: accept weights under a non-commercial licence.
+    """
+
+    files: tuple[tuple[str, Path], ...] = ()
+    accept_licence: bool = False
+
+    @classmethod
+    def parse(cls, given: Iterable[str], accept_licence: bool = False) -> "WeightsSource":
+        """Read the texts FILE and NAME=FILE; one text may hold several between commas.
+
+        Raises:
+            UnknownName: a NAME that no encoder has.
+            InputError: two files for the same encoder.
+        """
+        files: dict[str, Path] = {}
+        parts = [
+            part for text in given for part in ([text] if Path(text).is_file() else text.split(","))
+        ]
+        for part in parts:
+            owner, equals, path = part.partition("=")
+            if not equals or "/" in owner or Path(part).is_file():
+                owner = ""
+                path = part
+            else:
+                check_encoder_name(owner)
+            if owner in files:
+                encoder = f"encoder '{owner}'" if owner else "every encoder"
+                raise InputError(f"--weights names two files for {encoder}; give one.")
+            files[owner] = Path(path)
+        return cls(tuple(files.items()), accept_licence)
+
+    @classmethod
+    def of(cls, file: Path | str | None, accept_licence: bool = False) -> "WeightsSource":
+        """Return the source that takes `file` for every encoder, or names no file where it is None."""
+        return cls(() if file is None else (("", Path(file)),), accept_licence)
+
+    def file_for(self, encoder: str) -> Path | None:
+        """Return the file that is meant for `encoder`, or None where no file is named for it."""
+        files = dict(self.files)
+        return files.get(encoder, files.get(""))
+
+
+ANYWHERE: Final = WeightsSource()
+"""No file is named; a non-commercial licence is not accepted."""
+
+
+def load_encoder(name: str, pool: str = "global", weights: WeightsSource = ANYWHERE) -> "Encoder":
     """Load an encoder by name, frozen for good.
 
     Args:
         name: one of `encoder_names()`.
-        weights: a weights file, as `weights_of` takes it; without it the folder
-            $SURGICAI_VISION_WEIGHTS, the hub's cache and a download are tried, in this order.
-        pool: "global", "spatial" or "tokens".
-        accept_licence: accept weights under a non-commercial licence.
+        pool: one of `POOLS`.
+        weights: where its pretrained weights come from.
 
     Raises:
         UnknownName: a name or pool that does not exist.
@@ -115,50 +166,16 @@ def load_encoder(
         BadFile: a weights file that is missing, damaged or of another architecture.
     """
     plugin = encoder_plugin(name)
-    path = find_weights(name, weights, accept_licence)
-    base = importlib.import_module("encoders.base")
+    path = find_weights(name, weights)
     check_name("pool", pool, POOLS)
     card, network = plugin.build(plugin.card, path)
-    return base.Encoder(card, network, pool)
+    encoder: Encoder = resolve("encoders.base:Encoder")(card, network, pool)  # imports torch
+    return encoder
 
 
-def find_weights(
-    name: str, weights: Path | str | None = None, accept_licence: bool = False
-) -> Path | None:
-    """Find an encoder's weights file without loading it (or torch); see `load_encoder` for the
-    errors.
-    """
+def find_weights(name: str, weights: WeightsSource = ANYWHERE) -> Path | None:
+    """Find an encoder's weights file without loading it (or torch); see `load_encoder`."""
     plugin = encoder_plugin(name)
-    lookup = importlib.import_module("encoders.weights")
-    return lookup.find(
-        plugin.card, weights_of(name, weights), accept_licence, OFFLINE_ENCODERS, plugin.known
+    return find(
+        plugin.card, weights.file_for(name), weights.accept_licence, OFFLINE_ENCODERS, plugin.known
     )
-
-
-def weights_of(name: str, given: Path | str | None) -> Path | None:
-    """Return the weights file that is meant for encoder `name`, or None.
-
-    Args:
-        name: an encoder.
-        given: FILE (for every encoder that has none of its own), NAME=FILE (for that encoder
-            alone), or several of them between commas.
-
-    Raises:
-        UnknownName: a NAME that no encoder has.
-        InputError: two files for the same encoder.
-    """
-    if given is None or isinstance(given, Path) or Path(given).is_file():
-        return Path(given) if given is not None else None
-    files: dict[str, Path] = {}
-    for part in given.split(","):
-        owner, equals, path = part.partition("=")
-        if not equals or "/" in owner:
-            owner, path = "", part
-        else:
-            check_encoder_name(owner)
-        if owner in files:
-            raise InputError(
-                f"--weights names two files for {f'encoder {owner!r}' if owner else 'every encoder'}."
-            )
-        files[owner] = Path(path)
-    return files.get(name, files.get(""))

@@ -16,7 +16,7 @@ from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, check_name
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.core.plugins import POLICIES_GROUP, Registry
-from surgicai_vision.features.encoders import load_encoder
+from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 
 if TYPE_CHECKING:
     from policies.base import Plugin
@@ -111,9 +111,7 @@ def restore(checkpoint: Any) -> Any:
     return policy
 
 
-def load_encoder_of(
-    checkpoint: Any, weights: Path | str | None = None, accept_licence: bool = False
-) -> Any:
+def load_encoder_of(checkpoint: Any, weights: WeightsSource = ANYWHERE) -> Any:
     """Load the encoder a policy was trained on, verified; None for a policy without images.
 
     Raises:
@@ -123,6 +121,6 @@ def load_encoder_of(
 
     record, encoder = checkpoint.encoder, None
     if record:
-        encoder = load_encoder(record.name, weights, record.pool, accept_licence)
+        encoder = load_encoder(record.name, record.pool, weights)
     check_encoder(checkpoint, encoder)
     return encoder

@@ -16,7 +16,12 @@ from encoders.imagenet_lite_early import IMAGENET_LITE_EARLY
 from encoders.packaged import network_from, packaged_file
 from surgicai_vision.core.errors import BadFile, InputError, MissingWeights, UnknownName
 from surgicai_vision.features import encoders
-from surgicai_vision.features.encoders import encoder_card, encoder_names, load_encoder
+from surgicai_vision.features.encoders import (
+    WeightsSource,
+    encoder_card,
+    encoder_names,
+    load_encoder,
+)
 
 OFFLINE = encoders.OFFLINE_ENCODERS
 
@@ -267,10 +272,10 @@ def test_missing_weights_are_named_at_once(monkeypatch: pytest.MonkeyPatch, tmp_
 
 def test_weights_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(BadFile, match="not a file"):
-        load_encoder("r3m", weights=tmp_path / "none.bin")
+        load_encoder("r3m", weights=WeightsSource.of(tmp_path / "none.bin"))
     (tmp_path / "some.bin").write_bytes(b"x")
     with pytest.raises(InputError, match="leave --weights out"):
-        load_encoder("random", weights=tmp_path / "some.bin")
+        load_encoder("random", weights=WeightsSource.of(tmp_path / "some.bin"))
 
 
 GOLDEN = (0.15637, 0.0, 0.07037, 0.09735, 0.0)

@@ -14,7 +14,12 @@ from safetensors.torch import load_file, save_file
 from encoders import imagenet, weights
 from encoders.base import Encoder
 from surgicai_vision.core.errors import BadFile, InputError, MissingWeights, UnknownName
-from surgicai_vision.features.encoders import encoder_card, find_weights, load_encoder
+from surgicai_vision.features.encoders import (
+    WeightsSource,
+    encoder_card,
+    find_weights,
+    load_encoder,
+)
 
 
 def table_of(network: torch.nn.Module, prefix: str = "") -> dict[str, torch.Tensor]:
@@ -39,7 +44,7 @@ def r3m_file(path: Path, depth: int = 18) -> Path:
 
 def test_r3m_loader(tmp_path: Path) -> None:
     path = r3m_file(tmp_path / "r3m.bin")
-    encoder = load_encoder("r3m-18", path)
+    encoder = load_encoder("r3m-18", weights=WeightsSource.of(path))
     assert encoder(hopper()).shape == (1, 512)
     wanted = torch.load(path, weights_only=True)["r3m"]["module.convnet.conv1.weight"].float()
     got = encoder._network.state_dict()["conv1.weight"].float()
@@ -54,7 +59,7 @@ def test_clip_loader_takes_the_image_tower(tmp_path: Path) -> None:
         tmp_path / "clip.bin", {**table_of(network, "visual."), "logit_scale": torch.zeros(())}
     )
     with pytest.warns(UserWarning, match="not the published"):
-        encoder = load_encoder("clip", path)
+        encoder = load_encoder("clip", weights=WeightsSource.of(path))
     assert_stable(encoder, 512)
 
 
@@ -63,7 +68,7 @@ def test_dinov2_loader_resamples_positions(tmp_path: Path) -> None:
         tmp_path / "dino.pth",
         table_of(timm.create_model("vit_small_patch14_dinov2", num_classes=0)),
     )
-    assert_stable(load_encoder("dinov2", path), 384)
+    assert_stable(load_encoder("dinov2", weights=WeightsSource.of(path)), 384)
 
 
 def test_vc1_loader_leaves_the_decoder_out(tmp_path: Path) -> None:
@@ -73,13 +78,15 @@ def test_vc1_loader_leaves_the_decoder_out(tmp_path: Path) -> None:
     extra = {"mask_token": torch.zeros(1, 1, 768), "decoder_embed.weight": torch.zeros(2, 2)}
     path = saved(tmp_path / "vc1.bin", {"model": {**tensors, **extra}})
     with pytest.raises(InputError, match="--accept-licence"):
-        load_encoder("vc1", path)
-    assert_stable(load_encoder("vc1", path, accept_licence=True), 768)
+        load_encoder("vc1", weights=WeightsSource.of(path))
+    assert_stable(load_encoder("vc1", weights=WeightsSource.of(path, accept_licence=True)), 768)
 
 
 def test_any_timm_network(tmp_path: Path) -> None:
     save_file(table_of(timm.create_model("resnet18")), tmp_path / "r.safetensors")
-    encoder = load_encoder("timm:resnet18.a1_in1k", tmp_path / "r.safetensors")
+    encoder = load_encoder(
+        "timm:resnet18.a1_in1k", weights=WeightsSource.of(tmp_path / "r.safetensors")
+    )
     assert encoder.card.dim == encoder.dim == 512 and encoder.card.licence
     with pytest.raises(UnknownName, match="resnet1"):
         load_encoder("timm:resnet19")
@@ -116,7 +123,7 @@ def test_known_imagenet_file_classifies(
     listed beside it.
     """
     path = known_file(shared)
-    encoder, tensors = load_encoder("imagenet", path), load_file(path)
+    encoder, tensors = load_encoder("imagenet", weights=WeightsSource.of(path)), load_file(path)
     logits = (
         torch.from_numpy(encoder(photograph(name))) @ tensors["fc.weight"].T + tensors["fc.bias"]
     )
@@ -169,7 +176,7 @@ def test_order_and_hash_of_the_weights_folder(
     assert find_weights("r3m-18") == tmp_path / "r3m-18.bin"
     given = tmp_path / "given.bin"
     given.write_bytes(b"x")
-    assert find_weights("r3m-18", given) == given
+    assert find_weights("r3m-18", weights=WeightsSource.of(given)) == given
     (tmp_path / "r3m").mkdir()
     (tmp_path / "r3m" / "pytorch_model.bin").write_bytes(b"tampered")
     with pytest.raises(BadFile, match=str(encoder_card("r3m").sha256)):
@@ -184,12 +191,12 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
     saved(tmp_path / "list.bin", [torch.zeros(2)])
     for name in ("cut.bin", "text.bin", "text.safetensors", "list.bin"):
         with pytest.raises(BadFile) as caught:
-            load_encoder("r3m-18", tmp_path / name)
+            load_encoder("r3m-18", weights=WeightsSource.of(tmp_path / name))
         assert name in str(caught.value) and "\n" not in str(caught.value)
     with pytest.raises(BadFile, match=r"lacks|wrong shape"):
-        load_encoder("r3m-34", whole)
+        load_encoder("r3m-34", weights=WeightsSource.of(whole))
     with pytest.raises(BadFile, match="does not hold"):
-        load_encoder("dinov2", whole)
+        load_encoder("dinov2", weights=WeightsSource.of(whole))
 
 
 def test_files_that_would_run_code_are_refused(tmp_path: Path) -> None:
@@ -199,5 +206,5 @@ def test_files_that_would_run_code_are_refused(tmp_path: Path) -> None:
 
     saved(tmp_path / "harm.bin", {"convnet.conv1.weight": Harm()})
     with pytest.raises(BadFile, match="weights alone"):
-        load_encoder("r3m-18", tmp_path / "harm.bin")
+        load_encoder("r3m-18", weights=WeightsSource.of(tmp_path / "harm.bin"))
     assert not (tmp_path / "harm").exists()

@@ -98,13 +98,19 @@ def test_open_names_pools_and_licences(capsys: pytest.CaptureFixture[str]) -> No
 def test_weights_are_given_for_all_or_for_each(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    of = encoders.weights_of
-    assert of("r3m", None) is None
-    assert of("r3m", "a.bin") == of("r3m", Path("a.bin")) == Path("a.bin")
-    both = "imagenet=a.pth,timm:resnet18.a1_in1k=b.pth,c.bin"
-    assert [of(name, both) for name in ("imagenet", "timm:resnet18.a1_in1k", "r3m")] == [
-        Path("a.pth"), Path("b.pth"), Path("c.bin")
-    ]  # fmt: skip
+    def of(name: str, *given: str) -> Path | None:
+        return encoders.WeightsSource.parse(given).file_for(name)
+
+    assert of("r3m") is None
+    assert of("r3m", "a.bin") == Path("a.bin")
+    assert encoders.WeightsSource.of("a.bin").file_for("r3m") == Path("a.bin")
+    for both in (
+        ("imagenet=a.pth,timm:resnet18.a1_in1k=b.pth,c.bin",),
+        ("imagenet=a.pth", "timm:resnet18.a1_in1k=b.pth", "c.bin"),
+    ):
+        assert of("imagenet", *both) == Path("a.pth")
+        assert of("timm:resnet18.a1_in1k", *both) == Path("b.pth")
+        assert of("r3m", *both) == Path("c.bin")
     assert of("clip", "imagenet=a.pth") is None
     assert of("clip", "some/x=1.pth") == Path("some/x=1.pth")
     odd = tmp_path / "a,clip=b.bin"

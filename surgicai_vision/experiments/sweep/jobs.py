@@ -28,6 +28,7 @@ from surgicai_vision.evaluation.run import evaluate_into
 from surgicai_vision.experiments.run import Cell, encode_cell, train_cell
 from surgicai_vision.experiments.sweep.lerobot import LEROBOT_POLICIES, SCRATCH, train_lerobot
 from surgicai_vision.experiments.sweep.plan import CELL_FILE, PROBE_FILE, REFERENCE_FILE
+from surgicai_vision.features.encoders import WeightsSource
 
 Table = Mapping[str, Any]
 
@@ -44,7 +45,7 @@ def encode_features(
     """Job "sweep-features": put what a cell sees into the feature cache."""
     os.environ.update(environment)
     features = encode_cell(
-        _cell(cell), _dataset(dataset), silent_stage, accept_licence=accept_licence
+        _cell(cell), _dataset(dataset), silent_stage, WeightsSource(accept_licence=accept_licence)
     )
     write_json(folder / "features.json", [entry.folder.name for entry in features])
 
@@ -65,7 +66,7 @@ def train_policy(
         _dataset(dataset),
         folder,
         silent_stage,
-        accept_licence=accept_licence,
+        weights=WeightsSource(accept_licence=accept_licence),
         **options,
     )
 
@@ -90,7 +91,13 @@ def run_cell(
     stage = functools.partial(timed, silent_stage, seconds)
     with stage() as measured:
         subject = _subject(
-            what, policies, _dataset(dataset), policy, measured, accept_licence, options
+            what,
+            policies,
+            _dataset(dataset),
+            policy,
+            measured,
+            WeightsSource(accept_licence=accept_licence),
+            options,
         )
         about = {
             **subject.about,
@@ -142,7 +149,7 @@ def run_probe(
 
     os.environ.update(environment)
     what, data = _cell(cell), _dataset(dataset)
-    features = encode_cell(what, data, silent_stage, accept_licence=accept_licence)
+    features = encode_cell(what, data, silent_stage, WeightsSource(accept_licence=accept_licence))
     row = {
         "task": what.task,
         "encoder": what.encoder,
@@ -158,25 +165,25 @@ def _subject(
     dataset: RenderedDataset,
     policy: Path,
     stage: Stage,
-    accept_licence: bool,
+    weights: WeightsSource,
     options: Table,
 ) -> Subject:
     """Return who acts in a cell; trained here unless it is a chain."""
     if cell.chain:
-        return _chain(cell, policies, accept_licence)
+        return _chain(cell, policies, weights)
     if cell.policy in LEROBOT_POLICIES:
         from surgicai_vision.evaluation import lerobot_agent
 
         with stage("policy", "steps"):
-            train_lerobot(cell, dataset, policy, accept_licence=accept_licence, **options)
+            train_lerobot(cell, dataset, policy, weights=weights, **options)
         where = lerobot_agent.find(policy)
         assert where is not None, "lerobot-train ended well and left no checkpoint"
-        return lerobot_agent.subject(where, cell.task)
-    train_cell(cell, dataset, policy, stage, accept_licence=accept_licence)
-    return checkpoint_subject(policy, accept_licence=accept_licence)
+        return lerobot_agent.subject(where, cell.task, weights)
+    train_cell(cell, dataset, policy, stage, weights)
+    return checkpoint_subject(policy, weights)
 
 
-def _chain(cell: Cell, policies: Mapping[str, str], accept_licence: bool) -> Subject:
+def _chain(cell: Cell, policies: Mapping[str, str], weights: WeightsSource) -> Subject:
     """Return the subject of a chain, named by what it is and not by where its policies lie."""
     from surgicai_vision.evaluation import hierarchical
 
@@ -184,8 +191,8 @@ def _chain(cell: Cell, policies: Mapping[str, str], accept_licence: bool) -> Sub
     made = from_mapping(
         hierarchical.Chain, {"hlp": policies["hlp"], **low, "termination": cell.chain}
     )
-    subject = hierarchical.subject(made, accept_licence=accept_licence)
-    make = functools.partial(hierarchical.ChainAgent, cell.name, made, None, accept_licence)
+    subject = hierarchical.subject(made, weights)
+    make = functools.partial(hierarchical.ChainAgent, cell.name, made, weights)
     about = {**subject.about, "encoder": cell.encoder}
     return dataclasses.replace(subject, name=cell.name, make_agent=make, about=about)
 

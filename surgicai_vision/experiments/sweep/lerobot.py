@@ -13,7 +13,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.processes import OFFLINE, run_module
 from surgicai_vision.experiments.run import OWN, Cell
-from surgicai_vision.features import encoders
+from surgicai_vision.features.encoders import WeightsSource, load_encoder
 
 if TYPE_CHECKING:
     from surgicai_vision.dataset import Dataset, RenderedDataset
@@ -40,7 +40,7 @@ def train_lerobot(
     *,
     steps: int,
     batch: int,
-    accept_licence: bool,
+    weights: WeightsSource,
 ) -> None:
     """Train a policy of LeRobot into `out`, as `lerobot-train` writes it.
 
@@ -51,7 +51,7 @@ def train_lerobot(
         out: folder to make.
         steps: updates.
         batch: batch size.
-        accept_licence: accept weights under a non-commercial licence.
+        weights: where pretrained weights come from.
 
     Raises:
         SurgicaiError: LeRobot failed; the message ends with the last of what it said.
@@ -63,7 +63,7 @@ def train_lerobot(
     root = dataset.path
     if cell.encoder != OWN:
         root = out.with_name(SCRATCH)
-        _export(cell, dataset, root, accept_licence)
+        _export(cell, dataset, root, weights)
     arguments = _arguments(cell, dataset, root, out)
     arguments += [f"--steps={steps}", f"--batch_size={batch}", f"--save_freq={steps}"]
     done = run_module("lerobot.scripts.lerobot_train", *arguments, variables=VARIABLES)
@@ -71,12 +71,12 @@ def train_lerobot(
         raise SurgicaiError(f"lerobot-train failed for {cell.name}:\n{done.stderr[-2000:]}")
 
 
-def _export(cell: Cell, dataset: "RenderedDataset", root: Path, accept_licence: bool) -> None:
+def _export(cell: Cell, dataset: "RenderedDataset", root: Path, weights: WeightsSource) -> None:
     """Write a dataset with the cell's features in place of images."""
     from surgicai_vision.dataset.feature_export import export_features
     from surgicai_vision.features.cache import encode
 
-    encoder = encoders.load_encoder(str(cell.encoder), None, cell.pool, accept_licence)
+    encoder = load_encoder(str(cell.encoder), cell.pool, weights)
     rows = [encode(dataset, view, encoder).rows for view in cell.view]
     about = {
         "encoder": cell.encoder,

@@ -86,7 +86,7 @@ def plan(grid: Grid, out: Path, choice: Choice = EVERYTHING) -> list[CellState]:
 def _missing(encoder: str, accept_licence: bool) -> str:
     """Return why an encoder's weights cannot be had, or "" where they are at hand."""
     try:
-        encoders.find_weights(encoder, accept_licence=accept_licence)
+        encoders.find_weights(encoder, encoders.WeightsSource(accept_licence=accept_licence))
     except MissingWeights as error:
         return str(error)
     return ""
