@@ -8,7 +8,7 @@ LeRobot's own metadata writer, `reading` opens a dataset without torch, `checkin
 of videos.
 """
 
-from surgicai_vision.dataset.convert import DatasetSummary, view_dataset
+from surgicai_vision.dataset.convert import DatasetSummary, convert_dataset
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.render import render_demos
@@ -25,5 +25,5 @@ __all__ = [
     "open_dataset",
     "render_demos",
     "repair_dataset",
-    "view_dataset",
+    "convert_dataset",
 ]

@@ -1,7 +1,7 @@
 """Make a dataset from a dataset, without rendering: fewer views, or videos in the place of images.
 
-    view_dataset(Path("dataset"), Path("dataset-back"), views=("back",))
-    made = view_dataset(Path("dataset"), Path("dataset-h264"), video="h264")
+    convert_dataset(Path("dataset"), Path("dataset-back"), views=("back",))
+    made = convert_dataset(Path("dataset"), Path("dataset-h264"), video="h264")
     made.video_error                # view → mean absolute error of its pixels, out of 255
 
 Columns, depth, segmentation and, without `video`, the images are taken over byte by byte. A video
@@ -57,7 +57,7 @@ class DatasetSummary:
     video_error: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
-def view_dataset(
+def convert_dataset(
     path: Path,
     out: Path,
     *,
@@ -102,7 +102,7 @@ def view_dataset(
     if not (out / names.META_FILE).exists():
         with building(out) as (store, result):
             more: dict[str, Any] = {"store": store, "workers": workers, "engine": engine}
-            write_view(dataset, result, views, video, {"request": request}, progress, **more)
+            write_converted(dataset, result, views, video, {"request": request}, progress, **more)
     return finished(out, request, started)
 
 
@@ -130,7 +130,7 @@ def finished(out: Path, request: Mapping[str, Any], started: float) -> DatasetSu
     )
 
 
-def write_view(
+def write_converted(
     dataset: RenderedDataset,
     out: Path,
     views: Sequence[str],

@@ -75,7 +75,7 @@ configs:
 {names.TASK_TEXTS[dataset.task]}
 
 {meta["episodes"]} simulated demonstrations of the task `{dataset.task}` in robotic suturing: {dataset.length} frames
-at {dataset.fps} per second, by {", ".join(meta["sources"])}. LeRobot {CODEBASE_VERSION} format, by surgicai-vision
+at {dataset.fps} per second, by {", ".join(meta["demonstrators"])}. LeRobot {CODEBASE_VERSION} format, by surgicai-vision
 ({meta["code_version"]}). Images of {size} pixels, {stored}
 
 | column | content |

@@ -65,6 +65,12 @@ class RenderedDataset:
                 "'surgicai-vision render-demos'."
             )
         self.meta = read_json(self.path / names.META_FILE)
+        if isinstance(self.meta, dict) and self.meta.get("format") != schema.FORMAT:
+            raise BadFile(
+                f"{self.path} was written by another version of surgicai-vision (format "
+                f"{self.meta.get('format', 1)}; this version reads {schema.FORMAT}); render it "
+                "again with 'surgicai-vision render-demos'."
+            )
         try:
             self.task: str = self.meta["task"]
             self.config = from_mapping(

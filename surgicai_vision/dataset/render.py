@@ -35,7 +35,7 @@ from surgicai_vision.core.files import (
 )
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import codecs, schema
-from surgicai_vision.dataset.convert import DatasetSummary, check_video, finished, write_view
+from surgicai_vision.dataset.convert import DatasetSummary, check_video, finished, write_converted
 from surgicai_vision.dataset.reader import open_dataset
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
 from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, assemble, compression
@@ -88,6 +88,7 @@ def render_demos(
 
     Raises:
         UnknownName: a view or codec that does not exist.
+        InputError: a folder of demonstrations that is given twice.
         BadFile: `demos` holds no readable demonstrations, or of another scene.
         OutputExists: `out` holds something else.
     """
@@ -95,7 +96,7 @@ def render_demos(
     _check_images(views, size, video)
     check_frame_stride(frame_stride)
     check_output(out, may_resume=names.META_FILE)
-    sources = [demos] if isinstance(demos, Path) else list(demos)
+    sources = _distinct([demos] if isinstance(demos, Path) else demos)
     paths = [path for source in sources for path in list_demos(source)]
     options: dict[str, Any] = {
         "views": list(views),
@@ -126,8 +127,20 @@ def render_demos(
         assemble(shards, lossless, table, names.TASK_TEXTS[config.task], meta)
         if video:
             more: dict[str, Any] = {"store": store, "workers": workers, "engine": engine}
-            write_view(open_dataset(lossless), result, views, video, {}, progress, **more)
+            write_converted(open_dataset(lossless), result, views, video, {}, progress, **more)
     return finished(out, request, started)
+
+
+def _distinct(folders: Sequence[Path]) -> list[Path]:
+    """Return the folders of demonstrations; refuse one that is given twice."""
+    known: set[Path] = set()
+    for folder in folders:
+        if folder.resolve() in known:
+            raise InputError(
+                f"The demonstrations in {folder} are given twice; give each folder once."
+            )
+        known.add(folder.resolve())
+    return list(folders)
 
 
 def _job(path: Path, options: Mapping[str, Any], frames: int) -> Job:
@@ -158,7 +171,7 @@ class _Origin(NamedTuple):
     length: int
     config: TaskConfig
     scene_hash: str
-    source: str
+    demonstrator: str
     code_version: str
 
     @classmethod
@@ -185,6 +198,7 @@ def _meta(
 ) -> dict[str, Any]:
     """Return the content of `meta/surgicai.json`."""
     return {
+        "format": schema.FORMAT,
         "request": request,
         "task": config.task,
         "task_config": to_mapping(config),
@@ -198,7 +212,7 @@ def _meta(
         "fps": names.FPS // request.get("frame_stride", 1),
         "renderers": sorted({summary["renderer"] for summary in summaries}),
         "scene_hash": origins[0].scene_hash,
-        "sources": sorted({origin.source for origin in origins}),
+        "demonstrators": sorted({origin.demonstrator for origin in origins}),
         "demos_digest": request["demos"],
         "demos_requests": [read_marker(source).get("request") for source in sources],
         "demos_code_versions": sorted({origin.code_version for origin in origins}),

@@ -14,6 +14,9 @@ import numpy as np
 
 from surgicai_vision.core import names
 
+FORMAT = 2
+"""Version of `meta/surgicai.json`; surgicai-vision 0.1 wrote none."""
+
 VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         names.STATE: names.STATE_NAMES,

@@ -37,7 +37,7 @@ episodes: 10
 VERBS = {
     "record-demos": "record-demos --task grasp --episodes 500 --workers 2 --out {out}",
     "render-demos": "render-demos --demos {demos} --size 512 --depth --workers 2 --out {out}",
-    "dataset view": "dataset view {dataset} --video h264 --workers 2 --out {out}",
+    "dataset convert": "dataset convert {dataset} --video h264 --workers 2 --out {out}",
     "evaluate": "evaluate expert --task grasp --episodes 500 --workers 2 --out {out}",
     "robustness": "robustness expert --task grasp --episodes 500 --workers 2 --out {out}",
     "sweep": "sweep {grid} --workers 2 --out {out}",

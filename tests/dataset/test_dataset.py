@@ -368,6 +368,27 @@ def test_damaged_dataset_is_a_bad_file(tmp_path, fake, demos, spoil):
     assert "\n" not in str(caught.value)
 
 
+def test_a_dataset_of_another_format_is_refused_in_one_line(tmp_path, fake, demos):
+    render(demos, tmp_path / "set", depth=False)
+    meta = tmp_path / "set" / names.META_FILE
+    content = json.loads(meta.read_text())
+    del content["format"]  # as surgicai-vision 0.1 wrote it
+    meta.write_text(json.dumps(content))
+    with pytest.raises(BadFile, match=r"another version .*format 1; this version reads 2.*render"):
+        open_dataset(tmp_path / "set")
+
+
+def test_demonstrations_given_twice_are_refused(tmp_path, fake, demos, capsys):
+    (tmp_path / "link").symlink_to(demos)
+    for twice in ([demos, demos], [demos, tmp_path / "link"], [demos, demos / ".." / demos.name]):
+        with pytest.raises(InputError, match="are given twice; give each folder once"):
+            render(twice, tmp_path / "set")
+    assert not (tmp_path / "set").exists()
+    arguments = ["--demos", f"{demos},{demos}", "--out", str(tmp_path / "set")]
+    assert main(["render-demos", *arguments]) == 2
+    assert "are given twice" in capsys.readouterr().err
+
+
 def test_one_row_group_an_episode(tmp_path, fake, demos):
     render(demos, tmp_path / "set")
     file = pq.ParquetFile(tmp_path / "set/data/chunk-000/file-000.parquet")

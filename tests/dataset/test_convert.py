@@ -14,11 +14,11 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
 from surgicai_vision.dataset import (
     check_dataset,
+    convert_dataset,
     open_dataset,
     render_demos,
     repair_dataset,
     video_jobs,
-    view_dataset,
 )
 from surgicai_vision.dataset.video import CODECS
 
@@ -45,7 +45,7 @@ def render(demos, out, **more):
 
 def test_a_subset_of_views_is_what_rendering_them_gives(tmp_path, demos):
     render(demos, tmp_path / "both")
-    made = view_dataset(tmp_path / "both", tmp_path / "front", views=("front",))
+    made = convert_dataset(tmp_path / "both", tmp_path / "front", views=("front",))
     rendered = render(demos, tmp_path / "alone", views=("front",))
     assert made.digest == rendered.digest
     assert made.video_error == {}
@@ -63,7 +63,7 @@ def test_a_subset_of_views_is_what_rendering_them_gives(tmp_path, demos):
 
 def test_views_come_in_the_order_asked_for(tmp_path, demos):
     render(demos, tmp_path / "set")
-    view_dataset(tmp_path / "set", tmp_path / "turned", views=("back", "front"))
+    convert_dataset(tmp_path / "set", tmp_path / "turned", views=("back", "front"))
     assert open_dataset(tmp_path / "turned").views == ("back", "front")
     assert check_dataset(tmp_path / "turned").problems == ()
 
@@ -100,9 +100,9 @@ def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(
 ):
     render(demos, tmp_path / "set")
     monkeypatch.setattr(video_jobs, "BLOCK_FRAMES", 8)
-    alone = view_dataset(tmp_path / "set", tmp_path / "alone", video="h264", workers=0)
+    alone = convert_dataset(tmp_path / "set", tmp_path / "alone", video="h264", workers=0)
     monkeypatch.setattr(video_jobs, "_dataset", None)  # not in this process
-    together = view_dataset(tmp_path / "set", tmp_path / "together", video="h264", workers=2)
+    together = convert_dataset(tmp_path / "set", tmp_path / "together", video="h264", workers=2)
     assert (alone.digest, alone.video_error) == (together.digest, together.video_error)
     assert (
         open_dataset(tmp_path / "alone").fingerprint
@@ -116,14 +116,14 @@ def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(
 
 def test_views_of_a_video_dataset_and_its_repair(tmp_path, demos):
     render(demos, tmp_path / "video", video="h264")
-    view_dataset(tmp_path / "video", tmp_path / "back", views=("back",))
+    convert_dataset(tmp_path / "video", tmp_path / "back", views=("back",))
     assert check_dataset(tmp_path / "back").problems == ()
     np.testing.assert_array_equal(
         open_dataset(tmp_path / "back").frames("back"),
         open_dataset(tmp_path / "video").frames("back"),
     )
     with pytest.raises(InputError, match="holds videos already"):
-        view_dataset(tmp_path / "video", tmp_path / "again", video="av1")
+        convert_dataset(tmp_path / "video", tmp_path / "again", video="av1")
     row = tmp_path / "back/meta/episodes/chunk-000/file-000.parquet"
     pq.write_table(pq.read_table(row).slice(0, 1), row)
     assert repair_dataset(tmp_path / "back").episodes == 3
@@ -132,19 +132,19 @@ def test_views_of_a_video_dataset_and_its_repair(tmp_path, demos):
 
 def test_the_same_command_again_does_nothing_and_wrong_ones_are_refused(tmp_path, demos):
     render(demos, tmp_path / "set")
-    first = view_dataset(tmp_path / "set", tmp_path / "back", views=("back",))
+    first = convert_dataset(tmp_path / "set", tmp_path / "back", views=("back",))
     shutil.rmtree(tmp_path / "set/data/chunk-000", ignore_errors=False)
     (tmp_path / "set").rename(tmp_path / "gone")
     render(demos, tmp_path / "set")
-    assert view_dataset(tmp_path / "set", tmp_path / "back", views=("back",)).digest == first.digest
+    assert convert_dataset(tmp_path / "set", tmp_path / "back", views=("back",)).digest == first.digest
     with pytest.raises(OutputExists):
-        view_dataset(tmp_path / "set", tmp_path / "back", views=("front",))
+        convert_dataset(tmp_path / "set", tmp_path / "back", views=("front",))
     with pytest.raises(UnknownName, match="Allowed: back, front"):
-        view_dataset(tmp_path / "set", tmp_path / "other", views=("wrist_psm1",))
+        convert_dataset(tmp_path / "set", tmp_path / "other", views=("wrist_psm1",))
     with pytest.raises(UnknownName, match="Did you mean 'h264'"):
-        view_dataset(tmp_path / "set", tmp_path / "other", video="h26")
+        convert_dataset(tmp_path / "set", tmp_path / "other", video="h26")
     with pytest.raises(InputError, match="each once"):
-        view_dataset(tmp_path / "set", tmp_path / "other", views=("back", "back"))
+        convert_dataset(tmp_path / "set", tmp_path / "other", views=("back", "back"))
     assert not (tmp_path / "other").exists()
     assert not list(tmp_path.glob("*.work"))
 
@@ -154,7 +154,7 @@ def test_the_command_line_knows_the_codecs(tmp_path, demos, capsys):
 
     assert tuple(CODECS) == VIDEO.choices
     render(demos, tmp_path / "set")
-    assert main(["dataset", "view", str(tmp_path / "set"), "--view", "back", "--json"]) == 0
+    assert main(["dataset", "convert", str(tmp_path / "set"), "--view", "back", "--json"]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert result["dataset"] == str(tmp_path / "set-back")
-    assert main(["dataset", "view", str(tmp_path / "set")]) == 2
+    assert main(["dataset", "convert", str(tmp_path / "set")]) == 2

@@ -1,4 +1,4 @@
-"""`dataset view`: take some views of a dataset, or store them as video, without rendering."""
+"""`dataset convert`: take some views of a dataset, or store them as video, without rendering."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -14,18 +14,22 @@ from surgicai_vision.commands.render_demos import print_video_error
 from surgicai_vision.core.errors import InputError
 
 app = App(
-    name="view",
+    name="convert",
     help_epilogue="""\
 example:
+<<<<<<< HEAD:surgicai_vision/commands/dataset/view.py
   surgicai-vision dataset view outputs/datasets/grasp --view back \\
       --out outputs/datasets/grasp-back""",
+=======
+  surgicai-vision dataset convert outputs/datasets/grasp --view back""",
+>>>>>>> 334b9fe (convert in place of view; demonstrations given twice are refused; datasets have a format):surgicai_vision/commands/dataset/convert.py
 )
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of `dataset view`.
+    """Options of `dataset convert`.
 
     Attributes:
         dataset: A dataset of ours.
@@ -47,8 +51,13 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
+<<<<<<< HEAD:surgicai_vision/commands/dataset/view.py
     """Make the dataset and print where it is."""
     from surgicai_vision.dataset import view_dataset
+=======
+    """Make the dataset and say where it is."""
+    from surgicai_vision.dataset import convert_dataset
+>>>>>>> 334b9fe (convert in place of view; demonstrations given twice are refused; datasets have a format):surgicai_vision/commands/dataset/convert.py
 
     path = options.dataset
     ending = "-".join(part for part in ("+".join(options.view or ()), options.video) if part)
@@ -56,7 +65,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         raise InputError("There is nothing to do: give --view VIEW[,VIEW], --video CODEC or both.")
     out = options.out or path.with_name(f"{path.name}-{ending}")
     with console.stage("writing", "frames") as progress:
-        summary = view_dataset(
+        summary = convert_dataset(
             path,
             out,
             views=options.view,
