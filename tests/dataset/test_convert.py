@@ -136,7 +136,9 @@ def test_the_same_command_again_does_nothing_and_wrong_ones_are_refused(tmp_path
     shutil.rmtree(tmp_path / "set/data/chunk-000", ignore_errors=False)
     (tmp_path / "set").rename(tmp_path / "gone")
     render(demos, tmp_path / "set")
-    assert convert_dataset(tmp_path / "set", tmp_path / "back", views=("back",)).digest == first.digest
+    assert (
+        convert_dataset(tmp_path / "set", tmp_path / "back", views=("back",)).digest == first.digest
+    )
     with pytest.raises(OutputExists):
         convert_dataset(tmp_path / "set", tmp_path / "back", views=("front",))
     with pytest.raises(UnknownName, match="Allowed: back, front"):

@@ -12,6 +12,7 @@ import pytest
 from fake_demos import write_demos
 from fake_env import FakeEnv
 
+from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
