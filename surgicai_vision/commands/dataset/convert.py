@@ -17,12 +17,7 @@ app = App(
     name="convert",
     help_epilogue="""\
 example:
-<<<<<<< HEAD:surgicai_vision/commands/dataset/view.py
-  surgicai-vision dataset view outputs/datasets/grasp --view back \\
-      --out outputs/datasets/grasp-back""",
-=======
   surgicai-vision dataset convert outputs/datasets/grasp --view back""",
->>>>>>> 334b9fe (convert in place of view; demonstrations given twice are refused; datasets have a format):surgicai_vision/commands/dataset/convert.py
 )
 
 
@@ -51,13 +46,8 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-<<<<<<< HEAD:surgicai_vision/commands/dataset/view.py
     """Make the dataset and print where it is."""
-    from surgicai_vision.dataset import view_dataset
-=======
-    """Make the dataset and say where it is."""
     from surgicai_vision.dataset import convert_dataset
->>>>>>> 334b9fe (convert in place of view; demonstrations given twice are refused; datasets have a format):surgicai_vision/commands/dataset/convert.py
 
     path = options.dataset
     ending = "-".join(part for part in ("+".join(options.view or ()), options.video) if part)
