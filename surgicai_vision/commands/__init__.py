@@ -11,7 +11,7 @@ An option is a field `name: Annotated[type, TRAIT, ...] = default`, with traits 
 `cyclopts.Parameter` of its own. Its line under `Attributes:` in the docstring is its help, unless
 its trait has one. What cyclopts makes of the type:
 
-* `bool`: `--name` and `--no-name` (`Parameter(negative=())` leaves the second out).
+* `bool`: `--name` and `--no-name`.
 * `tuple[type, ...]`: a comma list, which may also be given piece by piece.
 * `type | None`: may be left out; `default_text("...")` says in `--help` what happens then.
 * a field with `dataclasses.field(kw_only=False)`: a positional argument.

@@ -29,7 +29,7 @@ class Options:
 
     action: Annotated[str, Parameter(choices=ACTIONS, metavar="ACTION")] = field(kw_only=False)
     keep: Annotated[tuple[Path, ...], LIST, Parameter(metavar="DIR[,DIR]")] = ()
-    all: Annotated[bool, Parameter(negative=())] = False
+    all: bool = False
 
 
 @app.default

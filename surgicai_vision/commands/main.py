@@ -124,7 +124,9 @@ def explain(error: CycloptsError) -> InputError:
     common = app.meta.assemble_argument_collection()
     match error:
         case UnknownCommandError(unused_tokens=[given, *_], app=App() as group):
-            allowed = [*group, *_names(common)] if given.startswith("-") else [*group]
+            dashed = given.startswith("-")
+            allowed = [name for name in group if name.startswith("-") == dashed]
+            allowed += _names(common) if dashed else []
             return UnknownName(f"command of {chain}" if chain else "command", given, allowed)
         case UnknownOptionError(token=token, argument_collection=own):
             given = (token.keyword or token.value).partition("=")[0]

@@ -59,7 +59,8 @@ def _check_encoders(_: type, given: Sequence[str]) -> None:
 
 def _show_list(values: Sequence[object]) -> str:
     """Return the default of a comma list as it would be typed."""
-    return ",".join(f"{value:g}" if isinstance(value, float) else str(value) for value in values)
+    shown = (f"{value:g}" if isinstance(value, float) else str(value) for value in values)
+    return ",".join(shown) or "none"
 
 
 def within(low: int, high: int) -> Parameter:
@@ -95,12 +96,13 @@ ENCODERS = Parameter(
 )
 POOL = Parameter(choices=encoders.POOLS)
 WEIGHTS = Parameter(
-    help="File with the encoder's pretrained weights; NAME=FILE for the encoder NAME alone.",
+    help="File with the encoder's pretrained weights; NAME=FILE for the encoder NAME alone; "
+    "repeat it for another encoder.",
     metavar="[NAME=]FILE",
     show_default=False,
 )
 """Given again for another encoder; `encoders.WeightsSource.parse` reads them."""
-ACCEPT_LICENCE = Parameter(help="Accept weights under a non-commercial licence.", negative=())
+ACCEPT_LICENCE = Parameter(help="Accept weights under a non-commercial licence.")
 EXECUTOR = Parameter(
     help="What runs the jobs: local, ray or slurm, with its options, such as ray,address=HOST:PORT "
     "or slurm,partition=cpu,minutes=60.",

@@ -48,7 +48,7 @@ class Options:
     only: Annotated[
         tuple[str, ...], Parameter(metavar="AXIS=VALUE[,VALUE]"), default_text("all")
     ] = ()
-    dry_run: Annotated[bool, Parameter(negative=())] = False
+    dry_run: bool = False
     workers: Annotated[int, COUNT] = folders.CORES
     attempts: Annotated[int, COUNT] = 3
     executor: Annotated[str, EXECUTOR] = "local"

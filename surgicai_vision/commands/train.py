@@ -88,7 +88,9 @@ class Options:
             metavar="NAME",
         ),
     ] = "paper"
-    change: Annotated[tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]")] = ()
+    change: Annotated[
+        tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]"), default_text("none")
+    ] = ()
     epochs: Annotated[int | None, COUNT, default_text("the recipe's")] = None
     start: Annotated[Path | None, DIRECTORY] = None
     save_every: Annotated[int, NOT_NEGATIVE] = 0

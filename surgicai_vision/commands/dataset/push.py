@@ -32,9 +32,9 @@ class Options:
 
     dataset: Annotated[Path, DIRECTORY] = field(kw_only=False)
     repo: Annotated[str, Parameter(metavar="USER/NAME")]
-    private: Annotated[bool, Parameter(negative=())] = False
+    private: bool = False
     licence: Annotated[str, Parameter(metavar="NAME")] = "mit"
-    dry_run: Annotated[bool, Parameter(negative=())] = False
+    dry_run: bool = False
 
 
 @app.default
