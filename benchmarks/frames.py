@@ -63,9 +63,9 @@ def compare(demos: Path, dataset_folder: Path, size: int, frame_stride: int) -> 
         assert np.array_equal(env.get_state(), demo.state[0]), "the start is not the one recorded"
         for step in range(min(len(demo), stop - start)):
             for view, (colours, depth) in stored.items():
-                live = seen["pixels"][view]
+                live = seen[view]
                 good = np.array_equal(live, colours[step]) and np.array_equal(
-                    seen["depth"][view], depth[step]
+                    seen[f"{view}_depth"], depth[step]
                 )
                 found["compared"] += 1
                 if not good:

@@ -57,7 +57,7 @@ if __name__ == "__main__":
         for state, action in zip(demo.state, demo.action):
             env.set_state_vector(state)
             seen = env.observe()
-            row = {names.image_key(view): seen["pixels"][view] for view in ("front", "back")}
+            row = {names.image_key(view): seen[view] for view in ("front", "back")}
             text = names.TASK_TEXTS[demo.config.task]
             row |= {names.STATE: seen["agent_pos"], names.ACTION: action, "task": text}
             dataset.add_frame(row)

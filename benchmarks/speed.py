@@ -258,7 +258,7 @@ def measure_workers(repeats: int, steps: int, obs_type: str, share: int) -> dict
 def _vector(workers: int, share: int, chosen: dict[str, Any]) -> gymnasium.vector.VectorEnv:
     """Return a vector env of the subtask insert that never truncates."""
     task = names.ENV_IDS["insert"]
-    chosen = {"max_steps": 10**6, **chosen}
+    chosen = {"max_episode_steps": 10**6, **chosen}
     if share:
         return gymnasium.make_vec(task, workers * share, workers=workers, **chosen)
     return gymnasium.make_vec(task, workers, "async", vector_kwargs={"context": "spawn"}, **chosen)

@@ -5,7 +5,6 @@ gymnasium ids.
 worker process that is handed an env of ours; nothing else is needed.
 """
 
-import surgicai_vision.envs  # noqa: F401  # registers the gymnasium ids
 from lerobot_env_surgicai.configuration_surgicai_bc import SurgicaiBcConfig
 from lerobot_env_surgicai.environment import SurgicaiEnv
 

@@ -14,14 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from numpy.typing import NDArray
 
-import surgicai_vision.envs  # noqa: F401  # registers the gymnasium ids
 from lerobot_env_surgicai.encoding import EncodeViews
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig, to_mapping
@@ -129,7 +130,7 @@ class SurgicaiEnv(EnvConfig):
         `_max_episode_steps`.
         """
         config = to_mapping(self.task_config())
-        del config["task"]
+        del config["task"], config["max_steps"]
         return {
             **config,
             "obs_type": "pixels_agent_pos",
@@ -168,9 +169,27 @@ class SurgicaiEnv(EnvConfig):
 
 
 def make_one(gym_id: str, disable_env_checker: bool, arguments: dict[str, Any]) -> gymnasium.Env:
-    """Make one env; a function of this module, so that a worker process that unpickles it registers
-    the ids.
+    """Make one env.
+
+    A function of this module, so that a worker process that unpickles it registers the ids.
     """
-    return FreezeAfterEpisodeEnd(
-        gymnasium.make(gym_id, disable_env_checker=disable_env_checker, **arguments)
-    )
+    env = gymnasium.make(gym_id, disable_env_checker=disable_env_checker, **arguments)
+    return FreezeAfterEpisodeEnd(NestImages(env))
+
+
+class NestImages(gymnasium.ObservationWrapper):
+    """Show an env's images as LeRobot expects them: under one key "pixels", by view."""
+
+    def __init__(self, env: gymnasium.Env):
+        super().__init__(env)
+        flat = env.observation_space
+        assert isinstance(flat, spaces.Dict)
+        images = {view: space for view, space in flat.spaces.items() if view in names.CAMERAS}
+        self.observation_space = spaces.Dict(
+            {"pixels": spaces.Dict(images), AGENT_POS: flat[AGENT_POS]}
+        )
+
+    def observation(self, observation: dict[str, NDArray[Any]]) -> dict[str, Any]:
+        """Return the observation with its images under "pixels"."""
+        images = {view: frame for view, frame in observation.items() if view in names.CAMERAS}
+        return {"pixels": images, AGENT_POS: observation[AGENT_POS]}

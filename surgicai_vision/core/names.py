@@ -101,6 +101,11 @@ def is_depth_view(view: str) -> bool:
     return view.endswith("_depth")
 
 
+def frame_key(camera: str, modality: str) -> str:
+    """Return an env's observation key of a camera's frame: "front", "front_depth"."""
+    return camera if modality == RGB else f"{camera}_{modality}"
+
+
 def image_key(view: str) -> str:
     """LeRobot feature key of a view's RGB image."""
     return f"observation.images.{view}"

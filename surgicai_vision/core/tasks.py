@@ -137,14 +137,20 @@ def _register_all() -> None:
 
 
 def _register_id(task: str) -> None:
+    """Register the id of one task.
+
+    gymnasium's `TimeLimit` ends the episodes of our tasks; those of other distributions, which are
+    not imported here, end their episodes themselves.
+    """
     import gymnasium
 
-    if env_id(task) not in gymnasium.registry:
-        gymnasium.register(
-            id=env_id(task),
-            entry_point="surgicai_vision.envs:make_task",
-            vector_entry_point="surgicai_vision.envs.vector_env:make_vector",
-            kwargs={"task": task},
-            order_enforce=True,
-            disable_env_checker=False,
-        )
+    if env_id(task) in gymnasium.registry:
+        return
+    is_ours = task in names.TASKS
+    gymnasium.register(
+        id=env_id(task),
+        entry_point=f"surgicai_vision.envs:{'make_registered' if is_ours else 'make_task'}",
+        vector_entry_point="surgicai_vision.envs.vector_env:make_vector",
+        max_episode_steps=task_steps(task) if is_ours else None,
+        kwargs={"task": task},
+    )

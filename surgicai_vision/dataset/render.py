@@ -267,7 +267,7 @@ def render_episode(
         env.set_state_vector(state)
         observation = env.observe()
         for key, view, modality in keys:
-            frame = observation["pixels" if modality == names.RGB else modality][view]
+            frame = observation[names.frame_key(view, modality)]
             frame = np.repeat(frame, 3, axis=2) if modality == names.SEGMENTATION else frame
             content[key].append(codecs.encode(frame))
             statistics[key].add(frame)

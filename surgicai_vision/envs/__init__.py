@@ -1,11 +1,12 @@
 """Envs: the five subtasks and the whole procedure as gymnasium environments.
 
-`make(TaskConfig(task="grasp"),
-obs_type="pixels")` returns an unwrapped env; `gymnasium.make("surgicai_vision/Grasp-v0",
-obs_type="pixels")` takes the same names, and the fields of `TaskConfig` besides.
+`make(TaskConfig(task="grasp"), obs_type="pixels")` returns an unwrapped env.
+`gymnasium.make("surgicai_vision/Grasp-v0", obs_type="pixels")` takes the same names and the fields
+of `TaskConfig`, except `max_steps`: there the limit is gymnasium's `max_episode_steps`.
 """
 
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 from surgicai_vision.core import names
@@ -13,6 +14,7 @@ from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskCo
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.tasks import load_subtask
 from surgicai_vision.envs.base import SuturingEnv
+from surgicai_vision.envs.goal import GoalSuture, GoalSuturingEnv
 from surgicai_vision.envs.grasp import Grasp
 from surgicai_vision.envs.handoff import Handoff
 from surgicai_vision.envs.insert import Insert
@@ -22,7 +24,7 @@ from surgicai_vision.envs.pullout import Pullout
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.envs.suture import Suture
 
-__all__ = ["SUBTASKS", "SuturingEnv", "make", "make_task"]
+__all__ = ["SUBTASKS", "GoalSuturingEnv", "SuturingEnv", "make", "make_registered", "make_task"]
 
 SUBTASKS: dict[str, Subtask] = {
     subtask.name: subtask for subtask in (Grasp(), Place(), Insert(), Handoff(), Pullout())
@@ -38,15 +40,19 @@ def make(
     depth: bool = False,
     segmentation: bool = False,
     render_mode: str | None = None,
+    truncates: bool = True,
 ) -> SuturingEnv:
     """Return the unwrapped env of a task; see `observation` for what the arguments choose."""
     size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
     if len(size) != 2:
         raise InputError(f"image_size is {size}; it must be one side or (height, width) [pixel].")
     view = ObservationConfig(obs_type, tuple(cameras), size, depth, segmentation)
+    shows_goal = obs_type == "goal"
     if config.task == names.SUTURE:
-        return Suture(config, tuple(SUBTASKS.values()), view, render_mode)
-    return SuturingEnv(config, (_subtask(config.task),), view, render_mode)
+        procedure = GoalSuture if shows_goal else Suture
+        return procedure(config, tuple(SUBTASKS.values()), view, render_mode, truncates)
+    single = GoalSuturingEnv if shows_goal else SuturingEnv
+    return single(config, (_subtask(config.task),), view, render_mode, truncates)
 
 
 @functools.cache
@@ -58,7 +64,7 @@ def _subtask(task: str) -> Subtask:
 def make_task(
     task: str, scene: SceneConfig | dict[str, Any] | None = None, **arguments: Any
 ) -> SuturingEnv:
-    """Return an env from flat arguments; the entry point of the gymnasium ids.
+    """Return an env from flat arguments.
 
     Args:
         task: one of `tasks.task_names()`.
@@ -83,3 +89,23 @@ def make_task(
         else scene or SceneConfig()
     )
     return make(TaskConfig(task=task, scene=chosen, **fields), **arguments)
+
+
+def make_registered(task: str, **arguments: Any) -> SuturingEnv:
+    """Return the env of a gymnasium id; gymnasium wraps it in a `TimeLimit`.
+
+    Args:
+        task: one of `names.TASKS`.
+        **arguments: as for `make_task`, without `max_steps`.
+    """
+    refuse_max_steps(arguments)
+    return make_task(task, truncates=False, **arguments)
+
+
+def refuse_max_steps(arguments: Mapping[str, Any]) -> None:
+    """Raise `InputError` where two arguments would limit an episode."""
+    if "max_steps" in arguments:
+        raise InputError(
+            f"max_steps is {arguments['max_steps']}; of a gymnasium id the limit of an episode is "
+            f"gymnasium's own argument: max_episode_steps={arguments['max_steps']}."
+        )

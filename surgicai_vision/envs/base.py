@@ -50,6 +50,7 @@ class SuturingEnv(gymnasium.Env):
         subtasks: the subtasks of the task, in order.
         view: what it shows.
         render_mode: None or "rgb_array".
+        truncates: end episodes at `config.max_steps`; False where gymnasium's `TimeLimit` does.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # gymnasium declares no ClassVar
@@ -63,10 +64,14 @@ class SuturingEnv(gymnasium.Env):
         subtasks: tuple[Subtask, ...],
         view: ObservationConfig,
         render_mode: str | None = None,
+        truncates: bool = True,
     ):
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"render_mode is '{render_mode}'; allowed: None, rgb_array.")
-        self.config, self.view, self.render_mode = config, view, render_mode
+        self.config = config
+        self.view = view
+        self.render_mode = render_mode
+        self._truncates = truncates
         self.scene = build_scene(config.scene)
         axes = config.randomisation
         self.simulation = Simulation(self.scene, own_model=bool(axes.on), latency=axes.latency)
@@ -75,6 +80,7 @@ class SuturingEnv(gymnasium.Env):
         self.observation_space = view.space()
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
         self._subtasks = subtasks
+        self.simulation.memory.phase = float(subtasks[0].phase)
         self._step_size = StepSize.of(config.step)
         self._images = Images(self.simulation.model)
 
@@ -146,7 +152,8 @@ class SuturingEnv(gymnasium.Env):
         terminated = info["is_success"] or info["physics_error"]
         seen = self._observe(target)
         simulation.forget_reads()
-        return seen, self.reward(info), terminated, memory.steps >= self.config.max_steps, info
+        truncated = self._truncates and memory.steps >= self.config.max_steps
+        return seen, self.reward(info), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the front camera's image, (480, 640, 3) uint8, when `render_mode` is
@@ -255,24 +262,6 @@ class SuturingEnv(gymnasium.Env):
             return 0.0 if info["is_success"] else -1.0
         return -(info["d_trans"] + info["d_angle"] / 10.0)
 
-    def compute_reward(
-        self, achieved_goal: NDArray, desired_goal: NDArray, info: Any = None
-    ) -> NDArray[np.float64]:
-        """Return the rewards of goals of obs_type "goal", (batch, 8) or (8,): vectorised, for HER.
-
-        On what was observed it is the reward of the step. A relabelled goal asks for what held when
-        it was achieved: an insertion that missed the holes is no example of one that passed them,
-        but is one of reaching that pose.
-        """
-        distance, turn = observation.goal_errors(achieved_goal, desired_goal)
-        if self.config.reward == "dense":
-            return -(distance + turn / 10.0)
-        tolerance = self.subtask.tolerances[self.config.tolerance]
-        met = np.asarray(achieved_goal)[..., 7] >= np.asarray(desired_goal)[..., 7]
-        return np.where(
-            (distance <= tolerance.distance) & (turn <= tolerance.angle) & met, 0.0, -1.0
-        )
-
     # -- observing ---------------------------------------------------------------------------------
 
     def agent_pos(self) -> NDArray[np.float32]:
@@ -309,16 +298,8 @@ class SuturingEnv(gymnasium.Env):
         return self._observe(self._target())
 
     def _observe(self, target: Target) -> Observation:
-        achieved, desired = target
         if self.view.obs_type == "state":
             return self._state_vector(target)
-        if self.view.obs_type == "goal":
-            jaw = self.simulation.jaw(self.subtask.arm)
-            return {
-                "observation": self.agent_pos(),
-                "achieved_goal": observation.goal_vector(achieved, jaw, self._meets_demands()),
-                "desired_goal": observation.goal_vector(desired, 0.0, True),
-            }
         seen = self._images.look(self.data, self.view)
         if self.view.obs_type == "pixels_agent_pos":
             seen["agent_pos"] = self.agent_pos()

@@ -18,21 +18,14 @@ class Images:
         self._model = model
         self._renderer: Any = None
 
-    def look(self, data: mujoco.MjData, view: ObservationConfig) -> dict[str, Any]:
-        """Return the images of an observation: group → camera → image."""
+    def look(self, data: mujoco.MjData, view: ObservationConfig) -> dict[str, NDArray[Any]]:
+        """Return the frames of an observation by `names.frame_key`."""
         renderer = self._sized(view.image_size)
-        groups = {"pixels": names.RGB}
-        if view.depth:
-            groups["depth"] = names.DEPTH
-        if view.segmentation:
-            groups["segmentation"] = names.SEGMENTATION
-        seen = {
-            camera: renderer.render_all(data, camera, groups.values()) for camera in view.cameras
-        }
-        return {
-            group: {camera: seen[camera][modality] for camera in view.cameras}
-            for group, modality in groups.items()
-        }
+        frames: dict[str, NDArray[Any]] = {}
+        for camera in view.cameras:
+            for modality, frame in renderer.render_all(data, camera, view.modalities).items():
+                frames[names.frame_key(camera, modality)] = frame
+        return frames
 
     def image(self, data: mujoco.MjData, camera: str, size: tuple[int, int]) -> NDArray[Any]:
         """Return one RGB image, (height, width, 3) uint8."""

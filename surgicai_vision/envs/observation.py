@@ -10,10 +10,9 @@ is x y z [cm],
                     measured frame that success is judged by and its goal, in world, x y z [m],
                     rotation vector, jaw, and 1 where what success needs besides the pose holds
                     (contact, holes passed, needle out), else 0.
-`pixels`            Dict with `pixels`: view → (height, width, 3) uint8 RGB; with depth=True
-`depth`: view →
-                    (height, width, 1) float32 [m]; with segmentation=True `segmentation`: view →
-                    (…, 1) uint8.
+`pixels`            Dict of images: "front" is (height, width, 3) uint8 RGB; with depth=True also
+                    "front_depth" (height, width, 1) float32 [m], with segmentation=True also
+                    "front_segmentation" (height, width, 1) uint8.
 `pixels_agent_pos`  the same and `agent_pos` (7,) float32: x y z [m], roll pitch yaw [rad], jaw
 [rad] of the active
                     arm's measured tip in its own base, as a dVRK reports it.
@@ -80,6 +79,12 @@ class ObservationConfig:
         """Say whether it holds images."""
         return self.obs_type in ("pixels", "pixels_agent_pos")
 
+    @property
+    def modalities(self) -> tuple[str, ...]:
+        """Return what is rendered of each camera, a part of `names.MODALITIES`."""
+        shown = {names.RGB: True, names.DEPTH: self.depth, names.SEGMENTATION: self.segmentation}
+        return tuple(modality for modality in names.MODALITIES if shown[modality])
+
     def space(self) -> spaces.Space:
         """Return the observation space."""
         if self.obs_type == "state":
@@ -89,20 +94,19 @@ class ObservationConfig:
                 {"observation": _box(7), "achieved_goal": _box(8), "desired_goal": _box(8)}
             )
         height, width = self.image_size
-        groups: dict[str, spaces.Space] = {
-            "pixels": self._views(spaces.Box(0, 255, (height, width, 3), np.uint8))
+        frame_spaces: dict[str, spaces.Space] = {
+            names.RGB: spaces.Box(0, 255, (height, width, 3), np.uint8),
+            names.DEPTH: spaces.Box(0.0, np.inf, (height, width, 1), np.float32),
+            names.SEGMENTATION: spaces.Box(0, len(names.PARTS) - 1, (height, width, 1), np.uint8),
         }
-        if self.depth:
-            groups["depth"] = self._views(spaces.Box(0.0, np.inf, (height, width, 1), np.float32))
-        if self.segmentation:
-            last = len(names.PARTS) - 1
-            groups["segmentation"] = self._views(spaces.Box(0, last, (height, width, 1), np.uint8))
+        parts: dict[str, spaces.Space] = {
+            names.frame_key(camera, modality): frame_spaces[modality]
+            for camera in self.cameras
+            for modality in self.modalities
+        }
         if self.obs_type == "pixels_agent_pos":
-            groups["agent_pos"] = _box(7)
-        return spaces.Dict(groups)
-
-    def _views(self, space: spaces.Box) -> spaces.Dict:
-        return spaces.Dict(dict.fromkeys(self.cameras, space))
+            parts["agent_pos"] = _box(7)
+        return spaces.Dict(parts)
 
 
 def _box(size: int) -> spaces.Box:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.processes import Child
+from surgicai_vision.envs import make_task, refuse_max_steps
 
 Tree = Any
 """Arrays, or dicts of trees."""
@@ -34,6 +35,7 @@ def make_vector(
     num_envs: int = 1,
     workers: int = 0,
     autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    max_episode_steps: int = 0,
     **arguments: Any,
 ) -> VectorEnv:
     """Return a vector env; the vector entry point of the gymnasium ids.
@@ -42,12 +44,15 @@ def make_vector(
         num_envs: number of envs.
         workers: worker processes, at most as many as envs; 0 steps all envs in this process.
         autoreset_mode: gymnasium's: "NextStep" (default), "SameStep" or "Disabled".
+        max_episode_steps: limit of an episode [control steps]; 0 takes the paper's.
         **arguments: what `envs.make_task` takes.
     """
     if num_envs < 1 or workers < 0:
         raise InputError(
             f"num_envs is {num_envs}, workers is {workers}; allowed: at least 1, at least 0."
         )
+    refuse_max_steps(arguments)
+    arguments["max_steps"] = max_episode_steps
     mode = AutoresetMode(autoreset_mode)
     if workers:
         return SuturingVectorEnv(num_envs, min(workers, num_envs), mode, arguments)
@@ -205,8 +210,6 @@ class _Failure:
 
 
 def _make(arguments: dict[str, Any]) -> Any:
-    from surgicai_vision.envs import make_task
-
     return make_task(**arguments)
 
 

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,11 @@ type FeatureTable = dict[tuple[str, tuple[str, ...]], dict[int, NDArray[np.float
 """(encoder's fingerprint, views) → id of an observation → its features."""
 
 
-def images_of(observation: Observation) -> Mapping[str, NDArray[np.uint8]]:
-    """Return the images of an observation, camera → (height, width, 3)."""
+def frame_of(observation: Observation, key: str) -> NDArray[Any]:
+    """Return a camera's frame (height, width, channels) by its key, such as "front_depth"."""
     assert isinstance(observation, Mapping), "the env of an agent with cameras shows images"
-    images: Mapping[str, NDArray[np.uint8]] = observation["pixels"]
-    return images
+    frame: NDArray[Any] = observation[key]
+    return frame
 
 
 class Agent(abc.ABC):

@@ -17,7 +17,7 @@ from surgicai_vision.evaluation.agent import (
     Env,
     FeatureTable,
     Observation,
-    images_of,
+    frame_of,
 )
 
 if TYPE_CHECKING:
@@ -253,9 +253,8 @@ def _image(observation: Observation, view: str) -> NDArray[np.uint8]:
     if view in names.DEPTH_VIEWS:
         from surgicai_vision.dataset.codecs import grey
 
-        assert isinstance(observation, Mapping), "the env of an agent with cameras shows images"
-        return grey(observation["depth"][names.camera_of(view)])
-    return images_of(observation)[view]
+        return grey(frame_of(observation, view))
+    return frame_of(observation, view)
 
 
 @contextmanager

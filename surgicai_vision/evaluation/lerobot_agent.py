@@ -30,7 +30,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
-from surgicai_vision.evaluation.agent import Actions, Agent, Env, Observation, images_of
+from surgicai_vision.evaluation.agent import Actions, Agent, Env, Observation, frame_of
 from surgicai_vision.evaluation.agents import one_thread
 from surgicai_vision.evaluation.policy_spec import Subject
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
@@ -245,11 +245,11 @@ class LeRobotAgent(Agent):
         raw: dict[str, Any] = {"agent_pos": np.stack([env.agent_pos() for env in envs])}
         if self._encoder is None:
             raw["pixels"] = {
-                view: np.stack([images_of(o)[view] for o in observations]) for view in self.cameras
+                view: np.stack([frame_of(o, view) for o in observations]) for view in self.cameras
             }
         else:
             views = [
-                self._encoder(np.stack([images_of(o)[view] for o in observations]))
+                self._encoder(np.stack([frame_of(o, view) for o in observations]))
                 for view in self.cameras
             ]
             raw["environment_state"] = np.concatenate(views, axis=1)

@@ -73,13 +73,13 @@ def test_every_frame_is_the_image_of_its_state(tmp_path, fake, demos):
             observation = env.observe()
             for view in ("front", "back"):
                 np.testing.assert_array_equal(
-                    dataset.frames(view, frame, frame + 1)[0], observation["pixels"][view]
+                    dataset.frames(view, frame, frame + 1)[0], observation[view]
                 )
                 np.testing.assert_array_equal(
-                    dataset.depth(view, frame, frame + 1)[0], observation["depth"][view]
+                    dataset.depth(view, frame, frame + 1)[0], observation[f"{view}_depth"]
                 )
                 parts = dataset.segmentation(view, frame, frame + 1)[0]
-                np.testing.assert_array_equal(parts, observation["segmentation"][view])
+                np.testing.assert_array_equal(parts, observation[f"{view}_segmentation"])
             np.testing.assert_array_equal(columns[names.STATE][frame], env.agent_pos())
             np.testing.assert_array_equal(columns[names.BOTH_ARMS][frame], env.both_arms())
             np.testing.assert_array_equal(
@@ -534,13 +534,13 @@ def test_rendering_does_not_depend_on_the_workers_and_equals_what_was_seen_live(
         for view in ("front", "back"):
             frame = row + step
             np.testing.assert_array_equal(
-                dataset.frames(view, frame, frame + 1)[0], observation["pixels"][view]
+                dataset.frames(view, frame, frame + 1)[0], observation[view]
             )
             np.testing.assert_array_equal(
-                dataset.depth(view, frame, frame + 1)[0], observation["depth"][view]
+                dataset.depth(view, frame, frame + 1)[0], observation[f"{view}_depth"]
             )
             parts = dataset.segmentation(view, frame, frame + 1)[0]
-            np.testing.assert_array_equal(parts, observation["segmentation"][view])
+            np.testing.assert_array_equal(parts, observation[f"{view}_segmentation"])
         np.testing.assert_array_equal(columns[names.STATE][row + step], observation["agent_pos"])
         observation, reward, *_, info = env.step(action)
         assert columns[names.REWARD][row + step] == np.float32(reward)

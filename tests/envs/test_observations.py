@@ -71,12 +71,12 @@ def test_vision_holds_images_and_proprioception_only(obs_type, depth, segmentati
     config = TaskConfig("grasp")
     env = envs.make(config, obs_type, cameras, (24, 32), depth=depth, segmentation=segmentation)
     seen, _ = env.reset(seed=0)
-    expected = {f"pixels.{camera}": ((24, 32, 3), np.uint8) for camera in cameras}
+    expected = dict.fromkeys(cameras, ((24, 32, 3), np.uint8))
     for group, dtype, chosen in (
         ("depth", np.float32, depth),
         ("segmentation", np.uint8, segmentation),
     ):
-        expected |= {f"{group}.{camera}": ((24, 32, 1), dtype) for camera in cameras if chosen}
+        expected |= {f"{camera}_{group}": ((24, 32, 1), dtype) for camera in cameras if chosen}
     if obs_type == "pixels_agent_pos":
         expected["agent_pos"] = ((7,), np.float32)
     assert {key: (part.shape, part.dtype.type) for key, part in flat(seen).items()} == expected
@@ -97,7 +97,7 @@ def test_proprioception_does_not_know_the_needle(task):
     env.set_state(qpos, env.data.qvel)
     moved = env.observe()
     assert np.array_equal(moved["agent_pos"], seen["agent_pos"])
-    assert not np.array_equal(moved["pixels"]["back"], seen["pixels"]["back"])
+    assert not np.array_equal(moved["back"], seen["back"])
 
 
 # -- starts ----------------------------------------------------------------------------------------
@@ -168,13 +168,17 @@ def test_the_needle_starts_where_the_released_code_puts_it():
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_compute_reward_is_the_reward(task, reward, tolerance):
     env = make(task, obs_type="goal", reward=reward, tolerance=tolerance)
-    seen, _ = env.reset(seed=0)
-    expert, rows, rewards, infos = Expert(env), [], [], []
+    plain = make(task, reward=reward, tolerance=tolerance)
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    expert, rows, rewards, infos, exact = Expert(env), [], [], [], []
     for _ in range(150):
-        seen, got, ended, _, info = env.step(expert.action())
+        action = expert.action()
+        seen, got, ended, _, info = env.step(action)
         rows.append(seen)
         rewards.append(got)
         infos.append(info)
+        exact.append(plain.step(action)[1])
         if ended:
             break
     achieved, desired = (
@@ -182,15 +186,17 @@ def test_compute_reward_is_the_reward(task, reward, tolerance):
     )
     vectorised = env.compute_reward(achieved, desired, infos)
     assert vectorised.shape == (len(rows),)
-    assert np.allclose(vectorised, rewards, rtol=0, atol=1e-6)
-    assert env.compute_reward(achieved[0], desired[0], infos[0]) == pytest.approx(
-        rewards[0], abs=1e-6
-    )
+    assert vectorised.tolist() == rewards
+    assert env.compute_reward(achieved[0], desired[0], infos[0]) == rewards[0]
+    ends = env.compute_terminated(achieved, desired, infos)
+    assert ends.tolist() == [info["is_success"] for info in infos]
+    assert not env.compute_truncated(achieved, desired, infos).any()
     expected = [-(info["d_trans"] + info["d_angle"] / 10) for info in infos]
     if reward == "sparse":
         expected = [0.0 if info["is_success"] else -1.0 for info in infos]
         assert infos[-1]["is_success"]
-    assert np.allclose(rewards, expected, rtol=0, atol=1e-12)
+    assert np.allclose(exact, expected, rtol=0, atol=1e-12)
+    assert np.allclose(rewards, exact, rtol=0, atol=1e-6)  # goals are float32
 
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
@@ -209,3 +215,28 @@ def test_the_goals_pose_alone_is_no_reward(task):
     assert batch.tolist() == [-1.0 if asked else 0.0, 0.0]
     relabelled = seen["achieved_goal"]  # as HER does: what was achieved is what was wanted
     assert env.compute_reward(seen["achieved_goal"], relabelled) == 0.0
+
+
+@pytest.mark.parametrize("task", names.TASKS)
+def test_rewards_can_be_computed_before_the_first_reset(task):
+    seen, _ = make(task, obs_type="goal").reset(seed=0)
+    env = make(task, obs_type="goal")
+    goal = seen["desired_goal"]
+    assert env.compute_reward(goal, goal) == 0.0
+    assert env.compute_reward(seen["achieved_goal"], goal) == -1.0
+    assert env.compute_terminated(goal, goal).tolist() is True
+    assert env.compute_truncated(np.stack([goal] * 3), goal).tolist() == [False] * 3
+
+
+def test_a_physics_error_terminates_whatever_the_goal_is():
+    env = make("grasp", obs_type="goal")
+    seen, info = env.reset(seed=0)
+    achieved, desired = np.stack([seen["achieved_goal"]] * 2), np.stack([seen["desired_goal"]] * 2)
+    infos = np.array([info, info | {"physics_error": True}])
+    assert env.compute_terminated(achieved, desired, infos).tolist() == [False, True]
+    assert env.compute_terminated(achieved[0], desired[0], infos[1]).tolist() is True
+
+
+@pytest.mark.parametrize("obs_type", [name for name in names.OBS_TYPES if name != "goal"])
+def test_only_goal_envs_compute_rewards_of_goals(obs_type):
+    assert not hasattr(make("grasp", obs_type=obs_type), "compute_reward")

@@ -54,7 +54,7 @@ def played(env, seed, steps=10):
 
 def image(env):
     """What the front camera sees."""
-    return env.observe()["pixels"]["front"]
+    return env.observe()["front"]
 
 
 @pytest.mark.parametrize("axis", RANDOMISATION_LIMITS)
@@ -149,9 +149,7 @@ def test_restored_elsewhere_it_looks_and_moves_the_same():
     other.set_state_vector(one.get_state())
     for _ in range(4):
         for view in ("front", "back"):
-            np.testing.assert_array_equal(
-                one.observe()["pixels"][view], other.observe()["pixels"][view]
-            )
+            np.testing.assert_array_equal(one.observe()[view], other.observe()[view])
         np.testing.assert_array_equal(one.get_state(), other.get_state())
         assert one.measure()["d_trans"] == other.measure()["d_trans"]
         action = rng.uniform(-1, 1, 7).astype(np.float32)

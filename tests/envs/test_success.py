@@ -13,7 +13,7 @@ from surgicai_vision.core import names
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.envs import hole_crossing, poses
 from surgicai_vision.envs.geometry import HANDOFF_ANGLE, grasp_in_needle
-from surgicai_vision.scene import build_scene, compose, holes, needle
+from surgicai_vision.scene import compose, holes, needle
 from surgicai_vision.scene.arm import GRASP_DEPTH, PAD_OFFSET
 from surgicai_vision.scene.rotations import rotvec_to_matrix
 

@@ -85,16 +85,14 @@ def test_images_of_workers_are_those_of_single_envs(mode):
             np.testing.assert_array_equal(
                 observation["agent_pos"][index], expected[index]["agent_pos"]
             )
-            np.testing.assert_array_equal(
-                observation["pixels"]["front"][index], expected[index]["pixels"]["front"]
-            )
+            np.testing.assert_array_equal(observation["front"][index], expected[index]["front"])
     finally:
         vector.close()
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_lerobot_finds_its_attributes(mode):
-    vector = make_vec("grasp", mode, max_steps=120)
+    vector = make_vec("grasp", mode, max_episode_steps=120)
     try:
         assert vector.call("_max_episode_steps") == (120, 120)
         assert vector.call("task") == ("grasp", "grasp")
@@ -114,7 +112,11 @@ def test_shares_of_envs_are_one_sync_vector(autoreset):
     """Three envs on two workers, over ends of episodes: the same as in this process, infos and
     masks included.
     """
-    arguments = {"max_steps": 3, "autoreset_mode": autoreset, "randomisation": {"friction": 0.2}}
+    arguments = {
+        "max_episode_steps": 3,
+        "autoreset_mode": autoreset,
+        "randomisation": {"friction": 0.2},
+    }
     ours, plain = (
         gymnasium.make_vec(names.ENV_IDS["place"], 3, workers=workers, **arguments)
         for workers in (2, 0)

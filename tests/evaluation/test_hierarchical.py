@@ -183,9 +183,7 @@ def test_policies_of_a_chain_share_features() -> None:
         one.share(shared)
         for slot in range(3):
             one.reset(slot, None, 0)
-    observations = [
-        {"pixels": {"back": np.full((4, 4, 3), value, np.uint8)}} for value in (1, 2, 3)
-    ]
+    observations = [{"back": np.full((4, 4, 3), value, np.uint8)} for value in (1, 2, 3)]
     envs = [SimpleNamespace(agent_pos=lambda: np.zeros(7, np.float32))] * 3
     assert agents[0].act([0, 2], envs[:2], observations[::2])[:, 0].tolist() == [1, 3]
     assert agents[1].act([0, 1, 2], envs, observations)[:, 0].tolist() == [1, 2, 3]

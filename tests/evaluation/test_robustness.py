@@ -181,13 +181,13 @@ def test_a_corruption_leaves_the_env_and_everything_but_images_alone():
     agent = Watcher()
     wrapped = CorruptedAgent(agent, CORRUPTIONS["noise"], 1.0)
     wrapped.reset(3, None, 7)
-    given = {"pixels": {"front": np.full((8, 8, 3), 100, np.uint8)}, "agent_pos": np.ones(7)}
+    given = {"front": np.full((8, 8, 3), 100, np.uint8), "agent_pos": np.ones(7)}
     wrapped.act([3], [None], [given])
     wrapped.act([3], [None], [given])
-    assert (given["pixels"]["front"] == 100).all()
+    assert (given["front"] == 100).all()
     seen = agent.seen
     assert seen[0]["agent_pos"] is given["agent_pos"]
-    assert not np.array_equal(seen[0]["pixels"]["front"], seen[1]["pixels"]["front"])
+    assert not np.array_equal(seen[0]["front"], seen[1]["front"])
 
 
 def test_a_wrapper_passes_on_every_member_of_the_agent():

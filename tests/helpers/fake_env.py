@@ -76,13 +76,13 @@ class FakeEnv:
             views[camera] = np.stack(
                 [red, 90 * number + y, x * 0 + 100 * self.state[0]], -1
             ).astype(np.uint8)
-        observation = {"pixels": views, "agent_pos": self.agent_pos()}
+        observation = views | {"agent_pos": self.agent_pos()}
         if self.depth:
             depth = (0.1 + 0.001 * y + 0.01 * self.state[1]).astype(np.float32)[..., None]
-            observation["depth"] = dict.fromkeys(self.cameras, depth)
+            observation |= {f"{camera}_depth": depth for camera in self.cameras}
         if self.segmentation:
             parts = ((x + y + int(self.state[2])) % 6).astype(np.uint8)[..., None]
-            observation["segmentation"] = dict.fromkeys(self.cameras, parts)
+            observation |= {f"{camera}_segmentation": parts for camera in self.cameras}
         return observation
 
 

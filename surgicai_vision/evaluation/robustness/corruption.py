@@ -21,7 +21,7 @@ from surgicai_vision.evaluation.agent import (
     Env,
     FeatureTable,
     Observation,
-    images_of,
+    frame_of,
 )
 
 Image = NDArray[np.uint8]
@@ -148,11 +148,9 @@ class CorruptedAgent(Agent):
         return self._agent.act(slots, envs, seen)
 
     def _seen(self, slot: int, observation: Observation) -> Observation:
-        if not self.cameras:
-            return observation
-        assert isinstance(observation, dict), "the env of an agent with cameras shows images"
         changed = {}
-        for view, image in images_of(observation).items():
+        for view in self.cameras:
+            image = frame_of(observation, view)
             moment = Moment(self._seeds[slot], self._steps[slot], names.CAMERAS.index(view))
             changed[view] = self._change(image, self._strength, moment)
-        return {**observation, "pixels": changed}
+        return {**observation, **changed} if isinstance(observation, dict) else observation
