@@ -184,12 +184,12 @@ class NestImages(gymnasium.ObservationWrapper):
         super().__init__(env)
         flat = env.observation_space
         assert isinstance(flat, spaces.Dict)
-        images = {view: space for view, space in flat.spaces.items() if view in names.CAMERAS}
+        images = {view: space for view, space in flat.spaces.items() if view != AGENT_POS}
         self.observation_space = spaces.Dict(
             {"pixels": spaces.Dict(images), AGENT_POS: flat[AGENT_POS]}
         )
 
     def observation(self, observation: dict[str, NDArray[Any]]) -> dict[str, Any]:
         """Return the observation with its images under "pixels"."""
-        images = {view: frame for view, frame in observation.items() if view in names.CAMERAS}
+        images = {view: frame for view, frame in observation.items() if view != AGENT_POS}
         return {"pixels": images, AGENT_POS: observation[AGENT_POS]}
