@@ -9,7 +9,8 @@ from lerobot.optim import AdamConfig
 from lerobot.utils.constants import OBS_STATE
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.cameras import camera_names, check_camera
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
 
@@ -61,7 +62,7 @@ class SurgicaiBcConfig(PreTrainedConfig):
         if self.encoder:
             encoders.check_encoder_name(self.encoder)
         for view in self.views:
-            check_name("view", view, names.CAMERAS)
+            check_camera(view)
         self.recipe()
 
     def recipe(self) -> Any:
@@ -102,10 +103,11 @@ class SurgicaiBcConfig(PreTrainedConfig):
             return state
         if not self.views:
             visual = [key for key, feature in given.items() if feature.type is FeatureType.VISUAL]
-            self.views = [view for view in names.CAMERAS if names.image_key(view) in visual]
+            self.views = [view for view in camera_names() if names.image_key(view) in visual]
             if not self.views:
                 raise InputError(
-                    f"surgicai_bc found no view of {', '.join(names.CAMERAS)} in {', '.join(given)}."
+                    f"surgicai_bc found no view of {', '.join(camera_names())} "
+                    f"in {', '.join(given)}."
                 )
         return [*map(names.image_key, self.views), *state]
 

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from lerobot_env_surgicai.encoding import EncodeViews
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import check_camera
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig, to_mapping
-from surgicai_vision.core.errors import check_name
+from surgicai_vision.core.tasks import env_id
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.features import encoders
 
@@ -44,7 +45,7 @@ class SurgicaiEnv(EnvConfig):
     saved configuration is whole.
 
     Attributes:
-        task: one of `names.TASKS`.
+        task: one of `tasks.task_names()`.
         dataset: a dataset of ours.
         cameras: views.
         image_size: height and width of an image [px].
@@ -77,7 +78,7 @@ class SurgicaiEnv(EnvConfig):
     def __post_init__(self) -> None:
         self._fill(TaskConfig(), ["front", "back"], 224)
         for camera in self.views:
-            check_name("camera", camera, names.CAMERAS)
+            check_camera(camera)
         self.task_config()
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(names.ACTION_NAMES),))}
         self.features[AGENT_POS] = PolicyFeature(FeatureType.STATE, (len(names.STATE_NAMES),))
@@ -122,7 +123,7 @@ class SurgicaiEnv(EnvConfig):
     @property
     def gym_id(self) -> str:
         """Return the gymnasium id of the task."""
-        return names.ENV_IDS[self.task_config().task]
+        return env_id(self.task_config().task)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

@@ -19,8 +19,10 @@ from cyclopts import App, Parameter, Token, validators
 from cyclopts.argument import Argument, ArgumentCollection
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import TaskConfig, convert, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
+from surgicai_vision.core.tasks import task_names
 from surgicai_vision.features import encoders
 
 Source = Callable[[App, tuple[str, ...], ArgumentCollection], None]
@@ -70,7 +72,7 @@ def within(low: int, high: int) -> Parameter:
     )
 
 
-TASK = Parameter(choices=names.TASKS)
+TASK = Parameter(choices=task_names())
 SUBTASK = Parameter(choices=names.SUBTASKS)
 DIRECTORY = Parameter(metavar="DIR")
 COUNT = Parameter(converter=_whole_number, validator=validators.Number(gte=1), metavar="N")
@@ -81,7 +83,7 @@ IMAGE_SIZE = Parameter.combine(within(16, 960), Parameter(metavar="PX"))
 LIST = Parameter(show_default=_show_list)
 UNIQUE = Parameter(show_default=_show_list, validator=_refuse_repetition)
 """A comma list that holds nothing twice."""
-VIEWS = Parameter.combine(UNIQUE, Parameter(choices=names.CAMERAS, metavar="VIEW[,VIEW]"))
+VIEWS = Parameter.combine(UNIQUE, Parameter(choices=camera_names(), metavar="VIEW[,VIEW]"))
 VIDEO = Parameter(
     help="Store RGB as video; the error is measured.", choices=("h264", "av1"), metavar="CODEC"
 )

@@ -18,6 +18,7 @@ from surgicai_vision.commands.options import (
     task_config,
 )
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_names
 
 app = App(
     name="scene",
@@ -45,7 +46,7 @@ class Options:
 
     task: Annotated[str, TASK] = "grasp"
     seed: Annotated[int, NOT_NEGATIVE] = names.TRAIN_SEED
-    view: Annotated[tuple[str, ...], VIEWS] = names.CAMERAS
+    view: Annotated[tuple[str, ...], VIEWS] = camera_names()
     size: Annotated[int, IMAGE_SIZE] = 336
     quality: Annotated[str, Parameter(choices=QUALITIES)] = "high"
     sheet: Annotated[

@@ -23,6 +23,7 @@ from surgicai_vision.commands.options import (
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.tasks import task_text
 from surgicai_vision.teleoperation.keyboard import key_table
 
 app = App(
@@ -99,7 +100,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     out = options.out or folders.OUTPUTS / "teleoperation" / options.task
     folders.check_folder(out, "demos.json")
     rules = Rules(options.episodes, options.auto_keep, options.keep_failures, options.skip_idle)
-    with WebView(options.view, names.TASK_TEXTS[options.task], options.port) as page:
+    with WebView(options.view, task_text(options.task), options.port) as page:
         env = envs.make(config)
         with open_recordings(out, config, env.scene.hash, options.seed) as recordings:
             session = Session(

@@ -3,6 +3,7 @@
 A view is what a policy may see of a camera: its colours, under the camera's name, or its depth.
 """
 
+import zlib
 from typing import TYPE_CHECKING, Final
 
 from surgicai_vision.core import names
@@ -47,12 +48,20 @@ def view_names() -> tuple[str, ...]:
 
 def check_camera(name: str) -> str:
     """Return `name` if a camera is called so, else raise `UnknownName`."""
-    return check_name("camera", name, camera_names())
+    return CAMERAS.check(name)
 
 
 def check_view(name: str) -> str:
     """Return `name` if a view is called so, else raise `UnknownName`."""
-    return check_name("view", name, view_names())
+    check_name("view", name, view_names())
+    CAMERAS.check(names.camera_of(name))
+    return name
+
+
+def camera_number(name: str) -> int:
+    """Return a number of the camera's own, the same in every process, for random numbers."""
+    known = name in names.CAMERAS
+    return names.CAMERAS.index(name) if known else zlib.crc32(name.encode())
 
 
 def other_cameras() -> tuple[str, ...]:

@@ -63,22 +63,35 @@ class Registry[Part]:
             name: (DISTRIBUTION, functools.partial(resolve, target))
             for name, target in ours.items()
         }
+        self._collisions: dict[str, NameCollision] = {}
         self._is_searched = False
 
     def names(self) -> tuple[str, ...]:
-        """Return every name: ours, then registered ones, then those of installed distributions."""
+        """Return every name: ours, then registered ones, then those of installed distributions.
+
+        A name that two distributions offer is there as well; only its use is refused.
+        """
         self._search()
         return tuple(self._targets)
 
     def check(self, name: str) -> str:
-        """Return `name` if a part is called so, else raise `UnknownName`; imports no part."""
-        return check_name(self.kind, name, self.names())
+        """Return `name` if a part is called so; imports no part.
+
+        Raises:
+            UnknownName: no part is called so.
+            NameCollision: two distributions offer one.
+        """
+        check_name(self.kind, name, self.names())
+        if name in self._collisions:
+            raise self._collisions[name]
+        return name
 
     def load(self, name: str) -> Part:
         """Return the part called `name`, imported on first use.
 
         Raises:
             UnknownName: no part is called so.
+            NameCollision: two distributions offer one.
             InputError: another distribution's part cannot be imported.
         """
         self.check(name)
@@ -116,17 +129,15 @@ class Registry[Part]:
         return self._targets[name][0]
 
     def _search(self) -> None:
-        """Read the entry points of the group, once; a collision is told at every look-up."""
+        """Read the entry points of the group, once; note names that are taken."""
         if self._is_searched:
             return
-        before = dict(self._targets)
-        try:
-            for point in _installed(tuple(sys.path)).select(group=self.group):
-                self._add(point.name, _owner(point), point.load)
-        except NameCollision:
-            self._targets = before
-            raise
         self._is_searched = True
+        for point in _installed(tuple(sys.path)).select(group=self.group):
+            try:
+                self._add(point.name, _owner(point), point.load)
+            except NameCollision as collision:
+                self._collisions[point.name] = collision
 
     def _add(self, name: str, owner: str, load: Callable[[], object]) -> None:
         if name in self._targets:

@@ -8,7 +8,6 @@
 
 import importlib.util
 import sys
-import warnings
 from collections.abc import Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.core.plugins import TASKS_GROUP, NameCollision, Registry
+from surgicai_vision.core.plugins import TASKS_GROUP, Registry
 
 if TYPE_CHECKING:
     from surgicai_vision.envs.subtask import Subtask
@@ -126,13 +125,8 @@ class _GymnasiumFinder(MetaPathFinder):
 
 
 def _register_all() -> None:
-    """Register the id of every task; where two tasks have one name, of ours alone."""
-    try:
-        known = task_names()
-    except NameCollision as error:
-        known = names.TASKS
-        warnings.warn(str(error), stacklevel=2)
-    for task in known:
+    """Register the id of every task."""
+    for task in task_names():
         _register_id(task)
 
 

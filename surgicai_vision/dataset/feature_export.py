@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.files import write_json
+from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.reader import RenderedDataset
 from surgicai_vision.dataset.stats import column_statistics
@@ -71,7 +72,7 @@ def export_features(
             "exported_from": dataset.fingerprint,
             "digest": schema.dataset_digest(digests),
         }
-        assemble(shards, out, features, names.TASK_TEXTS[dataset.task], meta)
+        assemble(shards, out, features, task_text(dataset.task), meta)
 
 
 def _write_shard(folder: Path, columns: Mapping[str, np.ndarray]) -> Path:

@@ -25,6 +25,7 @@ from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
 from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output
 from surgicai_vision.core.progress import Progress
+from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.metadata import CODEBASE_VERSION
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
@@ -72,7 +73,7 @@ configs:
 
 # {repo.partition("/")[2]}
 
-{names.TASK_TEXTS[dataset.task]}
+{task_text(dataset.task)}
 
 {meta["episodes"]} simulated demonstrations of the task `{dataset.task}` in robotic suturing: {dataset.length} frames
 at {dataset.fps} per second, by {", ".join(meta["demonstrators"])}. LeRobot {CODEBASE_VERSION} format, by surgicai-vision
@@ -104,7 +105,7 @@ COLUMN_TEXTS = {
     names.STATE: f"measured tip of the active arm in its base: {', '.join(names.STATE_NAMES)}",
     names.ACTION: f"{', '.join(names.ACTION_NAMES)}, each in [-1, 1]",
     names.NEEDLE_POSE: "needle in the world: x, y, z and quaternion w, x, y, z",
-    names.PHASE: f"index in {', '.join(names.SUBTASKS)}",
+    names.PHASE: f"index in {', '.join(names.SUBTASKS)}; -1 in another task",
     names.SEED: "seed of the episode's start",
     names.REWARD: "reward of the frame's action",
     names.SUCCESS: "success after the frame's action",

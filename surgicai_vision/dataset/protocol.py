@@ -22,7 +22,7 @@ class Dataset(Protocol):
 
     @property
     def task(self) -> str:
-        """Name of the task, one of `names.TASKS`."""
+        """Name of the task, one of `core.tasks.task_names()`."""
 
     @property
     def config(self) -> TaskConfig:

@@ -21,6 +21,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
@@ -124,7 +125,7 @@ class RenderedDataset:
     @property
     def sights(self) -> tuple[str, ...]:
         """What `frames` shows: the views, and their depth views where depth was rendered."""
-        depth = tuple(view for view in names.DEPTH_VIEWS if names.camera_of(view) in self.views)
+        depth = tuple(f"{view}_depth" for view in camera_names() if view in self.views)
         return self.views + (depth if self.has_depth else ())
 
     @property
@@ -148,7 +149,7 @@ class RenderedDataset:
         """Return the RGB images of a view, or a depth view's grey ones, (stop - start, H, W, 3)
         uint8.
         """
-        if view in names.DEPTH_VIEWS:
+        if names.is_depth_view(view):
             return codecs.grey(self.depth(names.camera_of(view), start, stop))
         return self._images(names.image_key(self._view(view)), start, stop)
 

@@ -23,8 +23,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import check_camera
 from surgicai_vision.core.config import TaskConfig, check_frame_stride, from_mapping, to_mapping
-from surgicai_vision.core.errors import BadFile, InputError, check_name
+from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.executor import LOCAL, Engine, Job, RunContext, building, job, run
 from surgicai_vision.core.files import (
     check_output,
@@ -34,6 +35,7 @@ from surgicai_vision.core.files import (
     write_json,
 )
 from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.convert import DatasetSummary, check_video, finished, write_converted
 from surgicai_vision.dataset.reader import open_dataset
@@ -124,7 +126,7 @@ def render_demos(
         table = schema.features(views, size, depth, segmentation)
         lossless = store / "lossless" if video else result
         shutil.rmtree(lossless, ignore_errors=True)
-        assemble(shards, lossless, table, names.TASK_TEXTS[config.task], meta)
+        assemble(shards, lossless, table, task_text(config.task), meta)
         if video:
             more: dict[str, Any] = {"store": store, "workers": workers, "engine": engine}
             write_converted(open_dataset(lossless), result, views, video, {}, progress, **more)
@@ -157,7 +159,7 @@ def _job(path: Path, options: Mapping[str, Any], frames: int) -> Job:
 def _check_images(views: Sequence[str], size: int, video: str | None) -> None:
     """Refuse views, sizes and codecs that cannot be rendered."""
     for view in views:
-        check_name("view", view, names.CAMERAS)
+        check_camera(view)
     if not views or len(set(views)) != len(views):
         raise InputError(f"views are {', '.join(views) or 'none'}; give at least one, each once.")
     if not SIZES[0] <= size <= SIZES[1]:

@@ -53,7 +53,7 @@ class Demo:
         code_version: version of the code that made it.
         state: whole simulator state before each step and after the last, (T + 1, n) float64.
         action: (T, 7) float32, in [-1, 1].
-        phase: index in `names.SUBTASKS` before each step, (T,) int8.
+        phase: index in `names.SUBTASKS` before each step, -1 in another task, (T,) int8.
         reward: (T,) float32, of the step.
         success: after the step, (T,) bool.
         contact: jaws touch the needle after the step, (T,) bool.

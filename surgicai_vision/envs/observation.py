@@ -29,6 +29,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_names, check_camera
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.envs import poses
 from surgicai_vision.scene.kinematics import STARTS, Pose
@@ -64,11 +65,11 @@ class ObservationConfig:
     def __post_init__(self) -> None:
         check_name("obs_type", self.obs_type, names.OBS_TYPES)
         for camera in self.cameras:
-            check_name("camera", camera, names.CAMERAS)
+            check_camera(camera)
         if len(set(self.cameras)) != len(self.cameras):
             raise InputError(f"cameras names one view twice: {', '.join(self.cameras)}.")
         if self.visual and not self.cameras:
-            raise InputError(f"cameras is empty; allowed: {', '.join(names.CAMERAS)}.")
+            raise InputError(f"cameras is empty; allowed: {', '.join(camera_names())}.")
         if min(self.image_size) < 16 or self.image_size[0] > 960 or self.image_size[1] > 1280:
             raise InputError(
                 f"image_size is {self.image_size}; allowed: 16 × 16 to 960 × 1280 (height × width)."

@@ -16,7 +16,7 @@ class Memory:
     """The running record of one episode.
 
     Attributes:
-        phase: index of the present subtask in `names.SUBTASKS`.
+        phase: index of the present subtask in `names.SUBTASKS`, -1 in another task.
         steps: control steps taken.
         tip_path: length of the active tip's way so far [m].
         passed: hole planes passed by the tip in travel direction, 0..2; 3 when the base is out as

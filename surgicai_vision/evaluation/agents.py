@@ -181,7 +181,7 @@ class PolicyAgent(Agent):
         self.views = views
         self.image_size = image_size
         self.cameras = tuple(dict.fromkeys(map(names.camera_of, views)))
-        self.depth = any(view in names.DEPTH_VIEWS for view in views)
+        self.depth = any(map(names.is_depth_view, views))
         self._policy = policy
         self._encoder = encoder
         self._vector = VECTORS[vector]
@@ -250,7 +250,7 @@ class PolicyAgent(Agent):
 
 def _image(observation: Observation, view: str) -> NDArray[np.uint8]:
     """Return what a policy sees of a view, (height, width, 3)."""
-    if view in names.DEPTH_VIEWS:
+    if names.is_depth_view(view):
         from surgicai_vision.dataset.codecs import grey
 
         return grey(frame_of(observation, view))

@@ -29,6 +29,7 @@ from typing import Any, final
 import numpy as np
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import DWELL, TaskConfig, digest, to_mapping
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.evaluation import lerobot_agent
@@ -151,7 +152,7 @@ def _views(chain: Chain, weights: WeightsSource) -> tuple[str, ...]:
     for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True):
         if policy not in BASELINES:
             seen.update(_low_subject(policy, subtask, weights).about["views"])
-    return tuple(view for view in names.CAMERAS if view in seen)
+    return tuple(view for view in camera_names() if view in seen)
 
 
 @dataclass

@@ -27,9 +27,11 @@ from typing import Any, final
 import numpy as np
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
+from surgicai_vision.core.tasks import task_text
 from surgicai_vision.evaluation.agent import Actions, Agent, Env, Observation, frame_of
 from surgicai_vision.evaluation.agents import one_thread
 from surgicai_vision.evaluation.policy_spec import Subject
@@ -88,7 +90,7 @@ def subject(folder: Path, task: str | None = None, weights: WeightsSource = ANYW
         "+".join(sight.cameras) or "proprioception",
     )
     name = "-".join(part for part in (policy["type"], encoder, views) if part)
-    text = names.TASK_TEXTS[config.task]
+    text = task_text(config.task)
     about = {
         "checkpoint": {"policy_sha256": sha256_file(folder / WEIGHTS), "policy": policy["type"]},
         "folder": str(folder),
@@ -148,7 +150,7 @@ def _sight(folder: Path, inputs: Mapping[str, Any], features: Mapping[str, Any])
             features["weights_sha256"],
         )
     shapes = {key: value["shape"] for key, value in inputs.items() if value["type"] == VISUAL}
-    known = {names.image_key(view): view for view in names.CAMERAS}
+    known = {names.image_key(view): view for view in camera_names()}
     for key in shapes:
         check_name(f"image of {folder}", key, known)
     sizes = {tuple(shape[1:]) for shape in shapes.values()}

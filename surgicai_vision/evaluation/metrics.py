@@ -29,7 +29,7 @@ class EpisodeMetrics:
     """One episode.
 
     Attributes:
-        task: one of `names.TASKS`.
+        task: one of `tasks.task_names()`.
         policy: how tables call who acted.
         seed: seed of the start.
         success: whether the task succeeded; never with an error.

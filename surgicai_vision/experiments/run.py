@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import check_view
 from surgicai_vision.core.config import read_changes
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.progress import Stage
+from surgicai_vision.core.tasks import check_task
 from surgicai_vision.evaluation.policy_spec import policy_name
 from surgicai_vision.features.cache import Features, encode
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
@@ -30,7 +32,7 @@ class Cell:
     """What is trained and evaluated.
 
     Attributes:
-        task: one of `names.TASKS`.
+        task: one of `tasks.task_names()`.
         encoder: encoder's name; `OWN` for a policy that trains a network of its own on the images;
             None for a policy without images.
         view: its views, in the order of the features; empty without images.
@@ -62,15 +64,15 @@ class Cell:
     swap: str | None = None
 
     def __post_init__(self) -> None:
-        check_name("task", self.task, names.TASKS)
-        if self.chain and any(view in names.DEPTH_VIEWS for view in self.view):
+        check_task(self.task)
+        if self.chain and any(map(names.is_depth_view, self.view)):
             raise InputError(
                 f"A chain sees no depth views ({', '.join(self.view)}); give views in colour."
             )
         if self.swap:
             check_name("subtask", self.swap, names.SUBTASKS)
         for view in self.view:
-            check_name("view", view, names.VIEWS)
+            check_view(view)
         if (self.encoder is None) != (not self.view):
             raise InputError(
                 f"encoder '{self.encoder}' with views {list(self.view)}; give both or neither."

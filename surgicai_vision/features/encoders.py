@@ -83,6 +83,7 @@ def check_encoder_name(name: str) -> str:
     """Return `name` if an encoder may be called so; imports nothing."""
     if not name.startswith(tuple(OPEN_ENCODERS)):
         check_name("encoder", name, _choices())
+        ENCODERS.check(name)
     return name
 
 

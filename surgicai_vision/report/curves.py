@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from markupsafe import Markup
 
 from surgicai_vision.core import names
+from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Point, Series
@@ -31,7 +32,7 @@ class Chart:
 def data_curves(groups: Sequence[Group]) -> list[Chart]:
     """Return success against the number of demonstrations, one chart a task with several."""
     found = []
-    for task in names.TASKS:
+    for task in task_names():
         candidates = [item for item in groups if _evaluated(item, task) and item.condition.plain]
         candidates = [item for item in candidates if item.condition.demonstrations]
         members = _by_condition(
@@ -49,7 +50,7 @@ def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
     One chart a task and axis.
     """
     found = []
-    for task in names.TASKS:
+    for task in task_names():
         mine = [item for item in groups if _evaluated(item, task) and not item.condition.swap]
         for axis in dict.fromkeys(item.condition.axis for item in mine if item.condition.axis):
             members = _by_condition(_with_zero(mine, axis), _base)

@@ -19,7 +19,7 @@ class Condition:
     """What was evaluated, but for the training seed.
 
     Attributes:
-        task: one of `names.TASKS`.
+        task: one of `tasks.task_names()`.
         encoder: the encoder; without one "proprioception" or "state", or the name of the chain or
             reference.
         views: its views.

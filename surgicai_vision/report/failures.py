@@ -4,7 +4,7 @@ import base64
 import io
 from collections.abc import Iterator, Sequence
 
-from surgicai_vision.core import names
+from surgicai_vision.core.tasks import task_names
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.report.filmstrips import Reel, Strip
 from surgicai_vision.report.groups import Group, best_trained, of_task
@@ -35,7 +35,7 @@ def failure_sheet(groups: Sequence[Group], reel: Reel) -> bytes | None:
 
 def _failures(groups: Sequence[Group], reel: Reel) -> Iterator[Strip]:
     """Yield the strips of failures that were rendered, task by task."""
-    for task in names.TASKS:
+    for task in task_names():
         best = best_trained(of_task(groups, task))
         seen = set()
         for strip in reel.strips.values():

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.errors import SurgicaiError
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.storage import read_film
@@ -124,7 +125,7 @@ def _rollout(choice: Choice, reel: Reel) -> dict[str, object] | None:
 def _views(groups: Sequence[Group]) -> list[dict[str, object]]:
     """Render every modality of the views that were used, at the start of an episode."""
     used = {names.camera_of(view) for item in groups for view in item.condition.views}
-    shown = [view for view in names.CAMERAS if view in (used or {"front", "back"})]
+    shown = [view for view in camera_names() if view in (used or {"front", "back"})]
     chosen = choose(groups, success=True) or choose(groups, success=False)
     if chosen is None:
         return []

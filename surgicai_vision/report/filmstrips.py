@@ -16,6 +16,7 @@ import numpy as np
 from surgicai_vision.core import names
 from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import SurgicaiError
+from surgicai_vision.core.tasks import task_names
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.storage import read_film
 from surgicai_vision.report.groups import Group, of_task
@@ -95,7 +96,7 @@ def make_reel(
         progress: called as progress(strips done, strips).
     """
     reel = Reel(
-        compared={task: chosen for task in names.TASKS if (chosen := comparison(groups, task))}
+        compared={task: chosen for task in task_names() if (chosen := comparison(groups, task))}
     )
     wanted = {choice.identity: choice for choice in _wanted(groups, reel.compared)}
     reel.wanted = len(wanted)
@@ -198,4 +199,4 @@ def _strip(choice: Choice, image: Any) -> Strip | None:
 
 def sight(view: str) -> tuple[str, str]:
     """Return camera and modality of a view."""
-    return names.camera_of(view), names.DEPTH if view in names.DEPTH_VIEWS else names.RGB
+    return names.camera_of(view), names.DEPTH if names.is_depth_view(view) else names.RGB

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
-from surgicai_vision.core import names
+from surgicai_vision.core.tasks import task_names
 from surgicai_vision.report import charts, curves, paper, sections, text
 from surgicai_vision.report.episodes import group_details, letters
 from surgicai_vision.report.filmstrips import Reel
@@ -39,7 +39,7 @@ def numbers(
 ) -> dict[str, object]:
     """Return everything but images and provenance."""
     index = {item.condition: at for at, item in enumerate(groups)}
-    best = {task: best_trained(of_task(groups, task)) for task in names.TASKS}
+    best = {task: best_trained(of_task(groups, task)) for task in task_names()}
     return {
         **headline(groups),
         "counts": _counts(collected),

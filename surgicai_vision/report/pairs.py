@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from surgicai_vision.core import names
+from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.groups import Group, of_task
@@ -57,7 +57,7 @@ class Pair:
 def compare(groups: Sequence[Group]) -> list[Pair]:
     """Return every pair of each task, the smallest p-value first."""
     pairs: list[Pair] = []
-    for task in names.TASKS:
+    for task in task_names():
         trained = [
             item for item in of_task(groups, task) if item.condition.trained and item.episodes
         ]

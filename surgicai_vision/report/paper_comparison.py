@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from surgicai_vision.core import names
+from surgicai_vision.core.tasks import task_names
 from surgicai_vision.report import paper, text
 from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.groups import Group
@@ -26,7 +26,7 @@ def beside_paper(
         return []
     known.sort(key=lambda item: -abs((item.condition.demonstrations or 0) - _DEMONSTRATIONS))
     ours = {(c.task, c.encoder, c.view): item for item in known if (c := item.condition)}
-    tasks = [task for task in names.TASKS if any(task == mine for mine, _, _ in ours)]
+    tasks = [task for task in task_names() if any(task == mine for mine, _, _ in ours)]
     others = sorted({encoder for _, encoder, _ in ours} - set(paper.ENCODERS))
     rows = []
     for task in tasks:

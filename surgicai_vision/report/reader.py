@@ -12,7 +12,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision.core import files, names
+from surgicai_vision.core import files
+from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.evaluation.storage import (
@@ -273,7 +274,7 @@ def _noted(line: str, shared: Mapping[str, Any]) -> Missing | None:
     state, task, name, seed, reason = match.groups()
     encoder, _, last = name.rpartition("-")
     views = tuple(last.split("+"))
-    known = encoder and all(view in names.VIEWS for view in views)
+    known = encoder and all(view in view_names() for view in views)
     cell = {
         "task": task,
         "encoder": encoder if known else name,

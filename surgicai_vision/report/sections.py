@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from markupsafe import Markup
 
 from surgicai_vision.core import names
+from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation.statistics import clopper_pearson
 from surgicai_vision.report import charts, paper, text
 from surgicai_vision.report.experiment_key import Condition
@@ -90,7 +91,7 @@ def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict
     for views in dict.fromkeys(item.condition.views for item in plain):
         mine = [item for item in plain if item.condition.views == views]
         columns = list(dict.fromkeys(item.condition.policy for item in mine))
-        tasks = [task for task in names.TASKS if of_task(mine, task)]
+        tasks = [task for task in task_names() if of_task(mine, task)]
         rows = []
         for task in tasks:
             known = {item.condition.policy: item for item in of_task(mine, task)}

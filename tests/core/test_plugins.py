@@ -58,9 +58,13 @@ def test_entry_points_of_installed_distributions_are_read(site: Path) -> None:
 
 
 def test_a_collision_names_both_distributions(site: Path) -> None:
-    install(site, "their-numbers", "pi = math:e")
-    with pytest.raises(NameCollision, match=r"'surgicai-vision'.*'their-numbers'"):
-        numbers().names()
+    install(site, "their-numbers", "pi = math:e\ntau = math:tau")
+    registry = numbers()
+    assert registry.names() == ("pi", "tau")
+    assert registry.check("tau") == "tau"
+    for look_up in (registry.check, registry.load, registry.owner):
+        with pytest.raises(NameCollision, match=r"'surgicai-vision'.*'their-numbers'"):
+            look_up("pi")
 
 
 def test_a_part_that_cannot_be_imported_is_told_with_its_distribution(site: Path) -> None:

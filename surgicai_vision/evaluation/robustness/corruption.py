@@ -14,7 +14,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
@@ -151,6 +151,6 @@ class CorruptedAgent(Agent):
         changed = {}
         for view in self.cameras:
             image = frame_of(observation, view)
-            moment = Moment(self._seeds[slot], self._steps[slot], names.CAMERAS.index(view))
+            moment = Moment(self._seeds[slot], self._steps[slot], camera_number(view))
             changed[view] = self._change(image, self._strength, moment)
         return {**observation, **changed} if isinstance(observation, dict) else observation

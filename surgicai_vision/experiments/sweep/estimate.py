@@ -11,9 +11,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import read_json
+from surgicai_vision.core.tasks import task_steps
 from surgicai_vision.experiments.run import OWN, Cell
 from surgicai_vision.experiments.sweep.grid import Grid, chain_parts
 from surgicai_vision.experiments.sweep.lerobot import LEROBOT_POLICIES
@@ -110,7 +110,7 @@ def _train(grid: Grid, cell: Cell) -> float:
 
 def _cell_seconds(grid: Grid, cell: Cell) -> float:
     """Return the estimate of one cell: training, unless chains share it, and evaluation."""
-    steps = grid.episodes * 200 * (len(names.SUBTASKS) if cell.task == names.SUTURE else 1)
+    steps = grid.episodes * task_steps(cell.task)
     look = len(cell.view) * (SEE + LIVE * _encode(cell.encoder))
     return (
         START

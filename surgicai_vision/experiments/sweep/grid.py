@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_names, view_names
 from surgicai_vision.core.config import (
     RandomisationConfig,
     TaskConfig,
@@ -241,18 +242,18 @@ class Grid:
     def views(self) -> tuple[str, ...]:
         """Every view some cell needs."""
         seen = {view for cell in self.cells for view in cell.view}
-        return tuple(view for view in names.VIEWS if view in seen)
+        return tuple(view for view in view_names() if view in seen)
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """Every camera that is rendered."""
         needed = {names.camera_of(view) for view in self.views}
-        return tuple(camera for camera in names.CAMERAS if camera in needed)
+        return tuple(camera for camera in camera_names() if camera in needed)
 
     @property
     def has_depth(self) -> bool:
         """Whether depth is rendered."""
-        return self.depth or any(view in names.DEPTH_VIEWS for view in self.views)
+        return self.depth or any(map(names.is_depth_view, self.views))
 
     @property
     def disturbance(self) -> Disturbance:
