@@ -12,18 +12,14 @@ network both end at once with one line.
 import io
 import os
 import shutil
-import socket
-import urllib.parse
-import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
+from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output
+from surgicai_vision.core.hub import connect, refusals_in_one_line
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import schema
@@ -31,11 +27,11 @@ from surgicai_vision.dataset.metadata import CODEBASE_VERSION
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.validate.check import CheckReport, check_dataset
 
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+
 CARD = "README.md"
 LICENCE = "mit"
-CONNECT_SECONDS = 3.0
-"""How long the Hub may take to answer before it counts as out of reach."""
-
 KEPT = ("meta", "data", "videos")
 """Folders of a LeRobot v3 dataset; nothing else of a folder is pushed or pulled."""
 
@@ -121,7 +117,7 @@ def push_dataset(
     private: bool = False,
     licence: str = LICENCE,
     progress: Progress | None = None,
-    api: Any = None,
+    api: "HfApi | None" = None,
 ) -> str:
     """Push a dataset of ours with its card, in one commit; return the commit's address.
 
@@ -139,7 +135,7 @@ def push_dataset(
         SurgicaiError: offline, or the Hub refuses.
     """
     dataset = open_dataset(path)
-    api = _api(repo, api)
+    api = connect(repo, api)
     _whole(check_dataset(path, progress), str(path))
     from huggingface_hub import CommitOperationAdd
 
@@ -147,7 +143,7 @@ def push_dataset(
     files = [file for name in KEPT for file in sorted((path / name).rglob("*")) if file.is_file()]
     operations = [CommitOperationAdd(file.relative_to(path).as_posix(), file) for file in files]
     operations.append(CommitOperationAdd(CARD, io.BytesIO(card.encode())))
-    with _hub(repo):
+    with refusals_in_one_line(repo):
         api.create_repo(repo, repo_type="dataset", private=private, exist_ok=True)
         text = f"{dataset.meta['episodes']} episodes of {dataset.task}"
         commit = api.create_commit(repo, operations, commit_message=text, repo_type="dataset")
@@ -166,7 +162,7 @@ def pull_dataset(
     *,
     revision: str | None = None,
     progress: Progress | None = None,
-    api: Any = None,
+    api: "HfApi | None" = None,
 ) -> CheckReport:
     """Fetch a dataset into the new folder `out` and check it; the same command goes on with what
     was fetched.
@@ -178,10 +174,10 @@ def pull_dataset(
         SurgicaiError: offline, or the Hub refuses.
     """
     check_output(out)
-    api = _api(repo, api)
+    api = connect(repo, api)
     with building(out) as (store, result):
         fetched = store / "fetched"
-        with _hub(repo):
+        with refusals_in_one_line(repo):
             wanted = [f"{name}/**" for name in KEPT]
             api.snapshot_download(
                 repo,
@@ -204,61 +200,3 @@ def _whole(report: CheckReport, where: str) -> None:
         raise BadFile(
             f"{where} is damaged: {report.problems[0]} See `surgicai-vision dataset check --help`."
         )
-
-
-def _api(repo: str, api: Any) -> Any:
-    """Return the Hub's client after a look at the name and the network."""
-    from huggingface_hub import HfApi, constants
-    from huggingface_hub.errors import HFValidationError
-    from huggingface_hub.utils import validate_repo_id
-
-    try:
-        validate_repo_id(repo)
-    except HFValidationError:
-        raise InputError(f"'{repo}' is no name on the Hub; it is written user/name.") from None
-    if repo.count("/") != 1:
-        raise InputError(f"'{repo}' does not say whose it is; write user/name.")
-    if api is not None:
-        return api
-    if constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in (
-        "1",
-        "TRUE",
-        "YES",
-        "ON",
-    ):
-        raise SurgicaiError(
-            "HF_HUB_OFFLINE is set: nothing is pushed or pulled; unset it to use the Hub."
-        )
-    _reach(constants.ENDPOINT)
-    return HfApi()
-
-
-def _reach(endpoint: str) -> None:
-    """Raise `SurgicaiError` at once where the Hub, or the proxy on the way to it, does not
-    answer.
-    """
-    wanted = urllib.parse.urlsplit(endpoint)
-    proxy = urllib.request.getproxies().get(wanted.scheme)
-    target = urllib.parse.urlsplit(proxy) if proxy else wanted
-    port = target.port or (443 if target.scheme == "https" else 80)
-    try:
-        socket.create_connection((target.hostname or "", port), timeout=CONNECT_SECONDS).close()
-    except OSError as error:
-        raise SurgicaiError(
-            f"The Hub at {wanted.hostname} cannot be reached ({error.strerror or error}); nothing is pushed or pulled."
-        ) from None
-
-
-@contextmanager
-def _hub(repo: str) -> Iterator[None]:
-    """Turn what the Hub refuses into one line."""
-    import httpx
-    from huggingface_hub.errors import HfHubHTTPError
-
-    try:
-        yield
-    except (HfHubHTTPError, httpx.HTTPError, OSError) as error:
-        text = next(
-            (line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__
-        )
-        raise SurgicaiError(f"The Hub refused {repo}: {text[:200]}") from None

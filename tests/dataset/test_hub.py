@@ -1,61 +1,21 @@
 """Push and pull, against a Hub that is a folder."""
 
 import json
-import shutil
-from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import yaml
 from fake_demos import render_with_fake_env, write_demos
+from fake_hub import FakeHub
 
 from surgicai_vision.commands.main import main
-from surgicai_vision.core import names
+from surgicai_vision.core import hub, names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
-from surgicai_vision.dataset import check_dataset, hub, open_dataset, render_demos
+from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 from surgicai_vision.dataset.hub import dataset_card, pull_dataset, push_dataset
 
 CONFIG = TaskConfig(max_steps=12)
 REPO = "somebody/suturing-grasp"
-
-
-class FakeHub:
-    """Keeps commits in a folder and notes what it is asked."""
-
-    def __init__(self, folder: Path, fail: Exception | None = None):
-        self.folder, self.fail, self.asked, self.tags = folder, fail, [], {}
-
-    def create_repo(self, repo, *, repo_type, private, exist_ok):
-        self.asked.append(("create_repo", repo, repo_type, private, exist_ok))
-        if self.fail:
-            raise self.fail
-
-    def create_commit(self, repo, operations, *, commit_message, repo_type):
-        for operation in operations:
-            target = self.folder / operation.path_in_repo
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with operation.as_file() as content:
-                target.write_bytes(content.read())
-        self.asked.append(("create_commit", repo, commit_message, repo_type))
-        return SimpleNamespace(oid=f"commit{len(self.asked)}", commit_url=f"https://hub/{repo}")
-
-    def list_repo_refs(self, repo, *, repo_type):
-        return SimpleNamespace(tags=[SimpleNamespace(name=name) for name in self.tags])
-
-    def delete_tag(self, repo, *, tag, repo_type):
-        del self.tags[tag]
-
-    def create_tag(self, repo, *, tag, revision, repo_type):
-        assert tag not in self.tags
-        self.tags[tag] = revision
-
-    def snapshot_download(self, repo, *, repo_type, revision, local_dir, allow_patterns):
-        self.asked.append(("snapshot_download", repo, repo_type, revision, tuple(allow_patterns)))
-        if self.fail:
-            raise self.fail
-        shutil.copytree(self.folder, local_dir, dirs_exist_ok=True)
-        (local_dir / ".cache/huggingface").mkdir(parents=True)
 
 
 @pytest.fixture
@@ -165,7 +125,7 @@ def test_a_hub_out_of_reach_is_said_in_one_line(monkeypatch):
     with pytest.raises(
         SurgicaiError, match=r"at hub.example cannot be reached \(Network is unreachable\)"
     ):
-        hub._reach("https://hub.example")
+        hub.reach("https://hub.example")
 
 
 def test_dry_run_shows_the_card(dataset, capsys):
