@@ -97,6 +97,7 @@ def main() -> int:
     os.environ.setdefault("MUJOCO_GL", "egl")
     from surgicai_vision.core import names
     from surgicai_vision.core.config import TaskConfig
+    from surgicai_vision.core.executor import RunContext
     from surgicai_vision.dataset import render_demos
     from surgicai_vision.demos.record import record
     from surgicai_vision.demos.store import list_demos, read_demo
@@ -119,11 +120,21 @@ def main() -> int:
         while steps < wanted:
             shutil.rmtree(demos, ignore_errors=True)
             episodes = max(episodes + 1, -(-episodes * wanted // steps)) if steps else 1
-            record(TaskConfig(task), episodes=episodes, out=demos, workers=arguments.workers)
+            record(
+                TaskConfig(task),
+                episodes=episodes,
+                out=demos,
+                context=RunContext(arguments.workers),
+            )
             steps = sum(len(read_demo(path)) for path in list_demos(demos))
         out = root / f"{task}-set"
         render_demos(
-            demos, out, views=VIEWS, size=arguments.size, depth=True, workers=arguments.workers
+            demos,
+            out,
+            views=VIEWS,
+            size=arguments.size,
+            depth=True,
+            context=RunContext(arguments.workers),
         )
         found = compare(demos, out, arguments.size, arguments.frame_stride)
         print(f"{task}: {episodes} episodes, {len(VIEWS) * steps} frames, {found}", flush=True)

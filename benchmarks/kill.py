@@ -26,11 +26,11 @@ RENDER = """
 import json, sys
 from pathlib import Path
 from surgicai_vision.dataset import open_dataset, render_demos
-from surgicai_vision.core.executor import open_engine
+from surgicai_vision.core.executor import RunContext, open_engine
 if __name__ == "__main__":
     demos, out, workers, size, address = sys.argv[1:]
     engine = open_engine(f"ray,address={address}" if address else "local")
-    options = {"size": int(size), "depth": True, "workers": int(workers), "engine": engine}
+    options = {"size": int(size), "depth": True, "context": RunContext(int(workers), engine)}
     summary = render_demos(Path(demos), Path(out), **options)
     dataset = open_dataset(Path(out))
     print(json.dumps([summary.digest, dataset.fingerprint, summary.frames, summary.episodes]))
@@ -42,9 +42,10 @@ SIZE = 64
 def make_demos(folder: Path, episodes: int) -> None:
     """Record short demonstrations of the expert."""
     from surgicai_vision.core.config import TaskConfig
+    from surgicai_vision.core.executor import RunContext
     from surgicai_vision.demos.record import record
 
-    record(TaskConfig("grasp"), episodes=episodes, out=folder, workers=0)
+    record(TaskConfig("grasp"), episodes=episodes, out=folder, context=RunContext(0))
 
 
 def start(

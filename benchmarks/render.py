@@ -23,10 +23,11 @@ from pathlib import Path
 OURS = """
 import json, sys
 from pathlib import Path
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import render_demos
 if __name__ == "__main__":
     demos, out, workers, size = sys.argv[1:]
-    summary = render_demos(Path(demos), Path(out), size=int(size), workers=int(workers))
+    summary = render_demos(Path(demos), Path(out), size=int(size), context=RunContext(int(workers)))
     print(json.dumps([summary.frames, summary.seconds]))
 """
 
@@ -108,10 +109,16 @@ def main() -> None:
     arguments = parser.parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
     from surgicai_vision.core.config import TaskConfig
+    from surgicai_vision.core.executor import RunContext
     from surgicai_vision.demos.record import record
 
     root = Path(tempfile.mkdtemp(prefix="surgicai-vision-render-"))
-    record(TaskConfig(arguments.task), episodes=arguments.episodes, out=root / "demos", workers=0)
+    record(
+        TaskConfig(arguments.task),
+        episodes=arguments.episodes,
+        out=root / "demos",
+        context=RunContext(0),
+    )
     rates: dict[str, list[float]] = {name: [] for name in WAYS}
     for _ in range(arguments.repeats):
         for name in WAYS:

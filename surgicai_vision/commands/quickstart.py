@@ -48,9 +48,11 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Run the quickstart and print its table and where the page is."""
+    from surgicai_vision.core.executor import RunContext
     from surgicai_vision.experiments.quickstart import run_quickstart
 
-    result = run_quickstart(plan_of(options), options.out, console.stage, options.workers)
+    context = RunContext(options.workers, stage=console.stage)
+    result = run_quickstart(plan_of(options), options.out, context)
     console.say()
     for line in table(result["results"]):
         console.say(line)

@@ -75,7 +75,7 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Record demonstrations and print where they are."""
-    from surgicai_vision.core.executor import open_engine
+    from surgicai_vision.core.executor import RunContext, open_engine
     from surgicai_vision.demos.record import record
     from surgicai_vision.demos.rollout import Disturbance
     from surgicai_vision.demos.store import MARKER, read_marker
@@ -87,29 +87,24 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             f"it must be at most --noise, {options.noise:g}."
         )
     # Everything that can be wrong is found before any work: the engine, the task, the folders.
-    engine = open_engine(options.executor)
+    context = RunContext(options.workers, open_engine(options.executor), console.stage)
     config = task_config(options.task, options.env)
     out = options.out or folders.demos_folder(options.task)
     folders.check_folder(out, "demos.json")
     taught = _taught(options.from_, options.demos_used) if options.from_ else []
     learner = _learner(options.learner, config) if options.learner else None
-    with console.stage(f"recording {options.task}", "episodes") as progress:
-        paths = record(
-            config,
-            episodes=options.episodes,
-            out=out,
-            demonstrator=options.demonstrator,
-            seed=options.seed,
-            disturbance=Disturbance(
-                options.noise, options.perturb_start_fraction, options.noise_from
-            ),
-            post_success_steps=options.post_success_steps,
-            workers=options.workers,
-            engine=engine,
-            demos=taught,
-            learner=learner,
-            progress=progress,
-        )
+    paths = record(
+        config,
+        episodes=options.episodes,
+        out=out,
+        demonstrator=options.demonstrator,
+        seed=options.seed,
+        disturbance=Disturbance(options.noise, options.perturb_start_fraction, options.noise_from),
+        post_success_steps=options.post_success_steps,
+        demos=taught,
+        learner=learner,
+        context=context,
+    )
     # A start that the demonstrator failed from is named in the marker and counts in the share.
     tried = len(paths) + len(read_marker(out)["skipped"])
     low, high = clopper_pearson(len(paths), tried)

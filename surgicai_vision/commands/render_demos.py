@@ -75,11 +75,11 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Record demonstrations if none are given, render them and print where the dataset is."""
-    from surgicai_vision.core.executor import open_engine
+    from surgicai_vision.core.executor import RunContext, open_engine
     from surgicai_vision.dataset import render_demos
 
     # Everything that can be wrong is found before any work.
-    engine = open_engine(options.executor)
+    context = RunContext(options.workers, open_engine(options.executor), console.stage)
     if options.demos and (options.task or options.episodes or options.env):
         raise InputError(
             "--task, --episodes and env say what to record; with --demos DIR nothing is recorded."
@@ -88,20 +88,17 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     out = options.out or folders.dataset_folder(task)
     folders.check_folder(out, names.META_FILE)
     demos = options.demos or [_record(options, task, console)]
-    with console.stage(f"rendering {', '.join(options.view)}", "frames") as progress:
-        summary = render_demos(
-            demos,
-            out,
-            views=options.view,
-            size=options.size,
-            depth=options.depth,
-            segmentation=options.segmentation,
-            frame_stride=options.frame_stride,
-            video=options.video,
-            workers=options.workers,
-            engine=engine,
-            progress=progress,
-        )
+    summary = render_demos(
+        demos,
+        out,
+        views=options.view,
+        size=options.size,
+        depth=options.depth,
+        segmentation=options.segmentation,
+        frame_stride=options.frame_stride,
+        video=options.video,
+        context=context,
+    )
     console.say(
         f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}"
     )

@@ -57,17 +57,17 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Run the sweep, or list its cells."""
-    from surgicai_vision.core.executor import open_engine
+    from surgicai_vision.core.executor import RunContext, open_engine
     from surgicai_vision.experiments.sweep import read_choice, run_sweep
 
     path = grid_file(options.grid)
     grid = read_grid(path)
     choice = read_choice(options.only, grid.cells)
     out = options.out or folders.OUTPUTS / "sweeps" / path.stem
-    engine = open_engine(options.executor)
+    context = RunContext(options.workers, open_engine(options.executor), console.stage)
     if options.dry_run:
         return _list(grid, out, choice, options.workers, console)
-    result = run_sweep(grid, out, console.stage, options.workers, engine, options.attempts, choice)
+    result = run_sweep(grid, out, context, options.attempts, choice)
     for line in result.pop("problems"):
         console.say(line)
     told = ", ".join(f"{result[name]} {name.replace('_', ' ')}" for name in COUNTS)

@@ -68,7 +68,8 @@ def raise_on_terminate() -> None:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         raise Terminated
 
-    signal.signal(signal.SIGTERM, terminate)
+    if threading.current_thread() is threading.main_thread():  # Python allows no other
+        signal.signal(signal.SIGTERM, terminate)
 
 
 def end_with_parent(parent: int) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, check_name
-from surgicai_vision.core.executor import LOCAL, Engine, building, work_folder
+from surgicai_vision.core.executor import RunContext, building, work_folder
 from surgicai_vision.core.files import check_output, read_json, whole_folder, write_json
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset import schema
@@ -63,9 +63,7 @@ def convert_dataset(
     *,
     views: Sequence[str] | None = None,
     video: str | None = None,
-    workers: int = 1,
-    engine: Engine = LOCAL,
-    progress: Progress | None = None,
+    context: RunContext = RunContext(),
 ) -> DatasetSummary:
     """Write `out`: the views `views` of the dataset `path`, as videos where `video` says so.
 
@@ -74,7 +72,7 @@ def convert_dataset(
         out: dataset folder to make; the same request finds it finished.
         views: some of its views, in the order of the new dataset's columns; all by default.
         video: codec, a key of `video.CODECS`; by default images stay as they are.
-        progress: called with (frames done, frames, "frames").
+        context: workers, engine and display.
 
     Raises:
         UnknownName: a view that the dataset does not have, an unknown codec.
@@ -100,9 +98,10 @@ def convert_dataset(
     }
     check_output(out, may_resume=names.META_FILE)
     if not (out / names.META_FILE).exists():
-        with building(out) as (store, result):
-            more: dict[str, Any] = {"store": store, "workers": workers, "engine": engine}
-            write_converted(dataset, result, views, video, {"request": request}, progress, **more)
+        title = f"dataset: {', '.join(views)} of {path.name}"
+        with building(out) as (store, result), context.stage(title, "frames") as progress:
+            changes = {"request": request}
+            write_converted(dataset, result, views, video, changes, store, context, progress)
     return finished(out, request, started)
 
 
@@ -136,11 +135,9 @@ def write_converted(
     views: Sequence[str],
     video: str | None,
     changes: Mapping[str, Any],
-    progress: Progress | None = None,
-    *,
     store: Path,
-    workers: int = 1,
-    engine: Engine = LOCAL,
+    context: RunContext,
+    progress: Progress,
 ) -> None:
     """Write the folder `out`, whole; `changes` go into its `meta/surgicai.json`, jobs in `store`
     make videos.
@@ -161,8 +158,7 @@ def write_converted(
                 views,
                 video,
                 store=store,
-                workers=workers,
-                engine=engine,
+                context=context,
                 progress=progress,
             )
             places = [{key: item.place for key, item in episode.items()} for episode in encoded]
@@ -249,7 +245,7 @@ def _look(
     keys: Sequence[str],
     rows: Sequence[EpisodeRow],
     encoded: Sequence[Mapping[str, Encoded]],
-    progress: Progress | None,
+    progress: Progress,
 ) -> tuple[str, dict[str, float]]:
     """Return the digest of the content, and each new video's mean absolute error."""
     columns = dataset.columns()
@@ -265,7 +261,7 @@ def _look(
         digests.append(
             digest.hexdigest({key: columns[key][row.start : row.stop] for key in schema.COLUMNS})
         )
-        if progress and not encoded:
+        if not encoded:
             progress(row.stop, dataset.length, "frames")
     errors = {}
     for view in dataset.views if encoded else ():

@@ -26,7 +26,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.cameras import check_camera
 from surgicai_vision.core.config import TaskConfig, check_frame_stride, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError
-from surgicai_vision.core.executor import LOCAL, Engine, Job, RunContext, building, job, run
+from surgicai_vision.core.executor import Job, RunContext, building, job, run
 from surgicai_vision.core.files import (
     check_output,
     code_version,
@@ -34,7 +34,6 @@ from surgicai_vision.core.files import (
     sha256_file,
     write_json,
 )
-from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.convert import DatasetSummary, check_video, finished, write_converted
@@ -66,9 +65,7 @@ def render_demos(
     segmentation: bool = False,
     frame_stride: int = 1,
     video: str | None = None,
-    workers: int = 1,
-    engine: Engine = LOCAL,
-    progress: Progress | None = None,
+    context: RunContext = RunContext(),
 ) -> DatasetSummary:
     """Render demonstrations into a LeRobot dataset.
 
@@ -84,9 +81,7 @@ def render_demos(
             of `names.FPS`, so that the dataset has `names.FPS / every` frames a second of simulated
             time. Actions stay those of one step.
         video: codec of the RGB views, a key of `video.CODECS`; lossless images by default.
-        workers: number of processes.
-        engine: what runs them.
-        progress: called with (frames done, frames, "frames").
+        context: workers, engine and display.
 
     Raises:
         UnknownName: a view or codec that does not exist.
@@ -116,10 +111,9 @@ def render_demos(
         _job(path, options, len(range(0, row.length, frame_stride)))
         for path, row in zip(paths, origins, strict=True)
     ]
-    with building(out) as (store, result):
-        shards = run(
-            jobs, store, RunContext(workers, engine), progress=progress or silent, unit="frames"
-        )
+    title = f"dataset: {', '.join(views)} at {size} px"
+    with building(out) as (store, result), context.stage(title, "frames") as progress:
+        shards = run(jobs, store, context, progress=progress, unit="frames")
         meta = _meta(
             sources, request, config, [read_json(shard / SUMMARY_FILE) for shard in shards], origins
         )
@@ -128,8 +122,8 @@ def render_demos(
         shutil.rmtree(lossless, ignore_errors=True)
         assemble(shards, lossless, table, task_text(config.task), meta)
         if video:
-            more: dict[str, Any] = {"store": store, "workers": workers, "engine": engine}
-            write_converted(open_dataset(lossless), result, views, video, {}, progress, **more)
+            whole = open_dataset(lossless)
+            write_converted(whole, result, views, video, {}, store, context, progress)
     return finished(out, request, started)
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from surgicai_vision.core import names
-from surgicai_vision.core.executor import LOCAL, Engine, Job, RunContext, job, run
+from surgicai_vision.core.executor import Job, RunContext, job, run
 from surgicai_vision.core.files import read_json, write_json
-from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.metadata import video_path
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
@@ -52,9 +52,8 @@ def encode_views(
     video: str,
     *,
     store: Path,
-    workers: int = 1,
-    engine: Engine = LOCAL,
-    progress: Progress | None = None,
+    context: RunContext,
+    progress: Progress,
 ) -> list[dict[str, Encoded]]:
     """Encode `views` into the videos of the LeRobot folder `folder`; return every episode's by
     their keys.
@@ -65,9 +64,8 @@ def encode_views(
         views: cameras.
         video: codec, a key of `video.CODECS`.
         store: folder of the jobs' results.
-        workers: processes.
-        engine: what runs them.
-        progress: called with (frames done, frames, "frames"), of all views.
+        context: workers and engine.
+        progress: counts the frames of all views.
     """
     blocks, bounds = _blocks(dataset.bounds()), dataset.bounds()
     same = {"dataset": str(dataset.path.resolve()), "video": video}
@@ -82,9 +80,7 @@ def encode_views(
         for view in views
         for first, stop in blocks
     ]
-    results = iter(
-        run(jobs, store, RunContext(workers, engine), unit="frames", progress=progress or silent)
-    )
+    results = iter(run(jobs, store, context, unit="frames", progress=progress))
     episodes: list[dict[str, Encoded]] = [{} for _ in bounds]
     for view in views:
         key = names.image_key(view)

@@ -1,6 +1,6 @@
 """Record demonstrations: run a demonstrator from seeded starts and keep what succeeds.
 
-    record(TaskConfig("grasp"), episodes=50, seed=0, out=Path("demos"), workers=2)
+    record(TaskConfig("grasp"), episodes=50, seed=0, out=Path("demos"))
 
 Seeds are taken in order from the first one; a seed at which the demonstrator fails is noted as
 skipped in `demos.json` and the next one is taken, so what is kept depends on the seeds alone. The
@@ -22,8 +22,6 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, check_name
 from surgicai_vision.core.executor import (
-    LOCAL,
-    Engine,
     Job,
     RunContext,
     building,
@@ -39,7 +37,7 @@ from surgicai_vision.core.files import (
     whole_folder,
     write_json,
 )
-from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.core.progress import Progress
 from surgicai_vision.demos.demonstrator import (
     DEMONSTRATORS,
     LEARNING_DEMONSTRATORS,
@@ -130,11 +128,9 @@ def record(
     seed: int = names.TRAIN_SEED,
     disturbance: Disturbance = UNDISTURBED,
     post_success_steps: int = 0,
-    workers: int = 1,
-    engine: Engine = LOCAL,
     demos: Sequence[Path] = (),
     learner: Learner | None = None,
-    progress: Progress | None = None,
+    context: RunContext = RunContext(),
 ) -> list[Path]:
     """Record `episodes` successful demonstrations into the folder `out`; return their files.
 
@@ -146,12 +142,10 @@ def record(
         seed: first seed; the following ones are taken in order.
         disturbance: noise and perturbed starts.
         post_success_steps: control steps recorded after an episode's success.
-        workers: number of processes.
-        engine: what runs them.
         demos: files of the demonstrations that a demonstrator in `LEARNING_DEMONSTRATORS` learns
             from; their seeds are left out.
         learner: acts until a step drawn by chance, while the labels stay the demonstrator's.
-        progress: called with (episodes kept, episodes wanted, "episodes").
+        context: workers, engine and display.
 
     Raises:
         InputError: fewer than one episode, a negative seed or post_success_steps, an unknown
@@ -183,9 +177,10 @@ def record(
     check_output(out, may_resume=MARKER)
     if finished(out, request):
         return list_demos(out)
-    with building(out) as (store, result):
-        run_jobs = functools.partial(run, store=store, context=RunContext(workers, engine))
-        kept, skipped = _run_seeds(request, demos, learner, run_jobs, progress or silent)
+    title = f"demos: {episodes} of {config.task}"
+    with building(out) as (store, result), context.stage(title, "episodes") as progress:
+        run_jobs = functools.partial(run, store=store, context=context)
+        kept, skipped = _run_seeds(request, demos, learner, run_jobs, progress)
         with whole_folder(result) as folder:
             for index, path in enumerate(kept):
                 shutil.copyfile(path, folder / f"episode_{index:06d}.safetensors")

@@ -6,6 +6,7 @@ One folder holds everything: `demos/`, `dataset/`, `policies/<name>/`, `evaluati
 a broken-off run.
 """
 
+import dataclasses
 import functools
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ from typing import Any
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists
-from surgicai_vision.core.progress import Stage, timed
+from surgicai_vision.core.executor import RunContext
+from surgicai_vision.core.progress import timed
 from surgicai_vision.evaluation.policy_spec import baseline_subject, checkpoint_subject
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.run import evaluate_once
@@ -23,14 +25,13 @@ from surgicai_vision.features import encoders
 from surgicai_vision.report import RUN_FILE, write_report
 
 
-def run_quickstart(plan: Quickstart, out: Path, stage: Stage, workers: int) -> dict[str, Any]:
+def run_quickstart(plan: Quickstart, out: Path, context: RunContext) -> dict[str, Any]:
     """Do everything that is not done yet and write the report.
 
     Args:
         plan: what to do.
         out: the folder; one of another plan is refused.
-        stage: shows progress.
-        workers: processes.
+        context: workers, engine and display.
 
     Returns:
         {"report", "results" (summaries, expert last), "seconds"}.
@@ -44,13 +45,18 @@ def run_quickstart(plan: Quickstart, out: Path, stage: Stage, workers: int) -> d
             encoders.find_weights(cell.encoder)
     run = _open_run(plan, out)
     config, seeds = TaskConfig(plan.task), range(names.TEST_SEED, names.TEST_SEED + plan.episodes)
-    with timed(stage, run["seconds"]) as measured:
+    with timed(context.stage, run["seconds"]) as measured:
         from surgicai_vision.experiments.prepare import prepare_dataset
 
         dataset_folder = prepare_dataset(
-            config, out, measured, demonstrations=plan.demonstrations, views=plan.view, size=plan.size,
-            depth=plan.depth, workers=workers,
-        )  # fmt: skip
+            config,
+            out,
+            dataclasses.replace(context, stage=measured),
+            demonstrations=plan.demonstrations,
+            views=plan.view,
+            size=plan.size,
+            depth=plan.depth,
+        )
         from surgicai_vision.dataset import open_dataset
         from surgicai_vision.training.checkpoint import CARD
 
@@ -62,12 +68,14 @@ def run_quickstart(plan: Quickstart, out: Path, stage: Stage, workers: int) -> d
                 train_cell(cell, dataset, policy, measured)
             make = functools.partial(checkpoint_subject, policy)
             results.append(
-                evaluate_once(out / "evaluations" / cell.name, make, seeds, measured, workers)
+                evaluate_once(
+                    out / "evaluations" / cell.name, make, seeds, measured, context.workers
+                )
             )
             _store_run(out, run)
         make = functools.partial(baseline_subject, "expert", config)
         results.append(
-            evaluate_once(out / "evaluations" / "expert", make, seeds, measured, workers)
+            evaluate_once(out / "evaluations" / "expert", make, seeds, measured, context.workers)
         )
     run["provenance"] = provenance()
     run["data"] = (
@@ -76,7 +84,7 @@ def run_quickstart(plan: Quickstart, out: Path, stage: Stage, workers: int) -> d
         f"behaviour cloning, recipe '{plan.recipe}', training seed {plan.seed}"
     )
     _store_run(out, run)
-    with stage("report", "parts") as progress:
+    with context.stage("report", "parts") as progress:
         page = write_report(out, progress=progress)
     return {"report": str(page), "results": results, "seconds": sum(run["seconds"].values())}
 

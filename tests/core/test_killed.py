@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import render_demos
 from surgicai_vision.demos.record import record
 
@@ -51,8 +52,10 @@ VERBS = {
 def given(tmp_path_factory):
     """What the verbs read."""
     folder = tmp_path_factory.mktemp("given")
-    record(TaskConfig("grasp"), episodes=2, out=folder / "demos", workers=0)
-    render_demos(folder / "demos", folder / "dataset", views=("front",), size=256, workers=0)
+    record(TaskConfig("grasp"), episodes=2, out=folder / "demos", context=RunContext(0))
+    render_demos(
+        folder / "demos", folder / "dataset", views=("front",), size=256, context=RunContext(0)
+    )
     (folder / "grid.yaml").write_text(GRID)
     (folder / "some.pkl").write_bytes(b"\x80\x04]" + 10**7 * b"\x94.")
     (folder / "envs.py").write_text(VECTOR_ENV)

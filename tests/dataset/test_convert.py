@@ -12,6 +12,7 @@ from surgicai_vision.commands.options import VIDEO
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import (
     check_dataset,
     convert_dataset,
@@ -40,7 +41,9 @@ def demos(tmp_path, monkeypatch):
 
 
 def render(demos, out, **more):
-    return render_demos(demos, out, **{"size": SIZE, "depth": True, "workers": 0, **more})
+    return render_demos(
+        demos, out, **{"size": SIZE, "depth": True, "context": RunContext(0), **more}
+    )
 
 
 def test_a_subset_of_views_is_what_rendering_them_gives(tmp_path, demos):
@@ -100,9 +103,11 @@ def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(
 ):
     render(demos, tmp_path / "set")
     monkeypatch.setattr(video_jobs, "BLOCK_FRAMES", 8)
-    alone = convert_dataset(tmp_path / "set", tmp_path / "alone", video="h264", workers=0)
+    alone = convert_dataset(tmp_path / "set", tmp_path / "alone", video="h264", context=RunContext(0))
     monkeypatch.setattr(video_jobs, "_dataset", None)  # not in this process
-    together = convert_dataset(tmp_path / "set", tmp_path / "together", video="h264", workers=2)
+    together = convert_dataset(
+        tmp_path / "set", tmp_path / "together", video="h264", context=RunContext(2)
+    )
     assert (alone.digest, alone.video_error) == (together.digest, together.video_error)
     assert (
         open_dataset(tmp_path / "alone").fingerprint

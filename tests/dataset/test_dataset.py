@@ -11,11 +11,13 @@ import pyarrow.parquet as pq
 import pytest
 from fake_demos import write_demos
 from fake_env import FakeEnv
+from shown import showing
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import (
     check_dataset,
     codecs,
@@ -56,7 +58,7 @@ def demos(tmp_path):
 
 
 def render(demos, out, **more):
-    options = {"size": SIZE, "depth": True, "workers": 0, **more}
+    options = {"size": SIZE, "depth": True, "context": RunContext(0), **more}
     return render_demos(demos, out, **options)
 
 
@@ -165,7 +167,7 @@ def test_interrupted_rendering_continues_to_the_same_bytes(tmp_path, fake, demos
 
     whole = render(demos, tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
-        render(demos, tmp_path / "set", progress=stop)
+        render(demos, tmp_path / "set", context=RunContext(0, stage=showing(stop)))
     assert not (tmp_path / "set").exists()
     assert render(demos, tmp_path / "set").digest == whole.digest
     assert (
@@ -502,12 +504,12 @@ def test_check_finds_damaged_metadata(tmp_path, fake, demos):
 def recorded(tmp_path_factory):
     """Two demonstrations of the expert, recorded by two worker processes."""
     out = tmp_path_factory.mktemp("real") / "demos"
-    record(TaskConfig("place"), episodes=2, out=out, workers=2)
+    record(TaskConfig("place"), episodes=2, out=out, context=RunContext(2))
     return out
 
 
 def test_recording_does_not_depend_on_the_workers(tmp_path, recorded):
-    again = record(TaskConfig("place"), episodes=2, out=tmp_path / "demos", workers=0)
+    again = record(TaskConfig("place"), episodes=2, out=tmp_path / "demos", context=RunContext(0))
     assert [path.read_bytes() for path in again] == [
         path.read_bytes() for path in list_demos(recorded)
     ]
@@ -517,8 +519,8 @@ def test_rendering_does_not_depend_on_the_workers_and_equals_what_was_seen_live(
     import surgicai_vision.envs as envs
 
     options = {"size": 64, "depth": True, "segmentation": True}
-    spawned = render_demos(recorded, tmp_path / "spawned", workers=2, **options)
-    inline = render_demos(recorded, tmp_path / "inline", workers=0, **options)
+    spawned = render_demos(recorded, tmp_path / "spawned", context=RunContext(2), **options)
+    inline = render_demos(recorded, tmp_path / "inline", context=RunContext(0), **options)
     dataset = open_dataset(tmp_path / "spawned")
     assert (spawned.frames, spawned.digest) == (inline.frames, inline.digest)
     assert dataset.fingerprint == open_dataset(tmp_path / "inline").fingerprint
@@ -549,7 +551,9 @@ def test_rendering_does_not_depend_on_the_workers_and_equals_what_was_seen_live(
 
 
 def test_cameras_stand_in_the_metadata(tmp_path, recorded):
-    render_demos(recorded, tmp_path / "set", views=("back", "wrist_psm2"), size=32, workers=0)
+    render_demos(
+        recorded, tmp_path / "set", views=("back", "wrist_psm2"), size=32, context=RunContext(0)
+    )
     dataset = open_dataset(tmp_path / "set")
     cameras = dataset.meta["cameras"]
     assert list(cameras) == ["back", "wrist_psm2"] == list(dataset.views)
@@ -565,10 +569,17 @@ def test_cameras_stand_in_the_metadata(tmp_path, recorded):
 KILLED = """
 import sys
 from pathlib import Path
+from contextlib import contextmanager
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import render_demos
+
+@contextmanager
+def stage(title, unit):
+    yield lambda *row: print(*row, flush=True)
+
 if __name__ == "__main__":
     demos, out = map(Path, sys.argv[1:])
-    render_demos(demos, out, size=64, workers=1, progress=lambda *row: print(*row, flush=True))
+    render_demos(demos, out, size=64, context=RunContext(1, stage=stage))
 """
 
 
@@ -587,10 +598,14 @@ def test_killed_rendering_continues_to_the_same_dataset(tmp_path, recorded, mome
     process.wait(10)
     assert not (tmp_path / "set").exists()
     seen = []
-    options = {"size": 64, "workers": 0, "progress": lambda *row: seen.append(row[0])}
+    shown = showing(lambda *row: seen.append(row[0]))
+    options = {"size": 64, "context": RunContext(0, stage=shown)}
     again = render_demos(recorded, tmp_path / "set", **options)
     assert bool(seen[0]) == (lines > 1), "what was finished is not done again"
-    assert again.digest == render_demos(recorded, tmp_path / "whole", size=64, workers=0).digest
+    assert (
+        again.digest
+        == render_demos(recorded, tmp_path / "whole", size=64, context=RunContext(0)).digest
+    )
     assert (
         open_dataset(tmp_path / "set").fingerprint == open_dataset(tmp_path / "whole").fingerprint
     )

@@ -11,6 +11,7 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import hub, names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 from surgicai_vision.dataset.hub import dataset_card, pull_dataset, push_dataset
 
@@ -22,7 +23,7 @@ REPO = "somebody/suturing-grasp"
 def dataset(tmp_path, monkeypatch):
     render_with_fake_env(monkeypatch, CONFIG)
     folder = write_demos(tmp_path / "demos", CONFIG, (1, 2))
-    render_demos(folder, tmp_path / "set", size=32, depth=True, workers=0)
+    render_demos(folder, tmp_path / "set", size=32, depth=True, context=RunContext(0))
     return tmp_path / "set"
 
 

@@ -12,6 +12,7 @@ from fake_demos import render_with_fake_env, write_demos
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, OutputExists
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import check_dataset, codecs, render_demos, repair_dataset
 from surgicai_vision.dataset.validate import thrift
 from surgicai_vision.dataset.validate.recovery import LEROBOT, Writing, salvage
@@ -253,7 +254,9 @@ def test_nothing_whole_is_one_line_and_changes_nothing(tmp_path, foreign):
 def ours(tmp_path, monkeypatch):
     render_with_fake_env(monkeypatch, CONFIG)
     folder = write_demos(tmp_path / "demos", CONFIG, (1, 2, 4))
-    render_demos(folder, tmp_path / "set", size=32, depth=True, segmentation=True, workers=0)
+    render_demos(
+        folder, tmp_path / "set", size=32, depth=True, segmentation=True, context=RunContext(0)
+    )
     return tmp_path / "set"
 
 
@@ -277,7 +280,9 @@ def test_a_dataset_of_ours_is_repaired(tmp_path, ours, spoil, kept):
     assert (report.ok, report.episodes) == (True, kept)
     assert opened(ours).num_episodes == kept
     with pytest.raises(OutputExists):  # it is no longer what the command made
-        render_demos(tmp_path / "demos", ours, size=32, depth=True, segmentation=True, workers=0)
+        render_demos(
+            tmp_path / "demos", ours, size=32, depth=True, segmentation=True, context=RunContext(0)
+        )
 
 
 def test_two_folders_swap_names(tmp_path):

@@ -6,9 +6,11 @@ import json
 import numpy as np
 import pytest
 from fake_env import FakeEnv, FakeExpert
+from shown import showing
 
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.files import write_json
 from surgicai_vision.demos import record as recording
 from surgicai_vision.demos import store
@@ -156,17 +158,22 @@ def test_a_senseless_disturbance_is_refused(wrong):
 
 
 def test_disturbed_recordings_are_another_request(tmp_path, fake):
-    calm = record(CONFIG, episodes=2, out=tmp_path / "calm", seed=1, workers=0)
+    calm = record(CONFIG, episodes=2, out=tmp_path / "calm", seed=1, context=RunContext(0))
     disturbed = Disturbance(noise=0.1)
     noisy = record(
-        CONFIG, episodes=2, out=tmp_path / "noisy", seed=1, workers=0, disturbance=disturbed
+        CONFIG,
+        episodes=2,
+        out=tmp_path / "noisy",
+        seed=1,
+        context=RunContext(0),
+        disturbance=disturbed,
     )
     assert read_demo(calm[0]).executed is None
     assert read_demo(noisy[0]).executed is not None
     assert "noise" not in read_marker(tmp_path / "calm")["request"]
     assert read_marker(tmp_path / "noisy")["request"]["noise"] == 0.1
     with pytest.raises(OutputExists):
-        record(CONFIG, episodes=2, out=tmp_path / "noisy", seed=1, workers=0)
+        record(CONFIG, episodes=2, out=tmp_path / "noisy", seed=1, context=RunContext(0))
 
 
 def test_demo_refuses_bad_lengths_quoting_both(demo):
@@ -234,8 +241,7 @@ def test_record_skips_failed_seeds_and_writes_them_down(tmp_path, fake):
         episodes=6,
         seed=0,
         out=tmp_path / "demos",
-        workers=0,
-        progress=lambda *row: seen.append(row),
+        context=RunContext(0, stage=showing(lambda *row: seen.append(row))),
     )
     demos = [read_demo(path) for path in paths]
     skipped = [row["seed"] for row in read_marker(tmp_path / "demos")["skipped"]]
@@ -249,17 +255,17 @@ def test_record_skips_failed_seeds_and_writes_them_down(tmp_path, fake):
 
 def test_record_again_does_nothing_and_another_request_is_refused(tmp_path, fake, monkeypatch):
     out = tmp_path / "demos"
-    first = record(CONFIG, episodes=2, out=out, workers=0)
+    first = record(CONFIG, episodes=2, out=out, context=RunContext(0))
     before = [path.stat().st_mtime_ns for path in first]
     monkeypatch.setattr(recording, "_env", None)
-    assert record(CONFIG, episodes=2, out=out, workers=0) == first
+    assert record(CONFIG, episodes=2, out=out, context=RunContext(0)) == first
     assert [path.stat().st_mtime_ns for path in first] == before
     with pytest.raises(OutputExists, match="another command"):
-        record(CONFIG, episodes=3, out=out, workers=0)
+        record(CONFIG, episodes=3, out=out, context=RunContext(0))
 
 
 def test_record_continues_where_it_was_stopped(tmp_path, fake, monkeypatch):
-    record(CONFIG, episodes=4, out=tmp_path / "whole", workers=0)
+    record(CONFIG, episodes=4, out=tmp_path / "whole", context=RunContext(0))
     calls = []
 
     def stop(done, total, unit):
@@ -268,9 +274,11 @@ def test_record_continues_where_it_was_stopped(tmp_path, fake, monkeypatch):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        record(CONFIG, episodes=4, out=tmp_path / "demos", workers=0, progress=stop)
+        record(
+            CONFIG, episodes=4, out=tmp_path / "demos", context=RunContext(0, stage=showing(stop))
+        )
     assert not (tmp_path / "demos").exists()
-    paths = record(CONFIG, episodes=4, out=tmp_path / "demos", workers=0)
+    paths = record(CONFIG, episodes=4, out=tmp_path / "demos", context=RunContext(0))
     for one, two in zip(list_demos(tmp_path / "whole"), paths, strict=True):
         assert one.read_bytes() == two.read_bytes()
 
@@ -280,7 +288,7 @@ def test_record_gives_up_on_an_expert_that_fails(tmp_path, fake, monkeypatch):
     with pytest.raises(
         SurgicaiError, match=r"succeeded at 0 of \d+ starts of grasp; 2 were wanted \(seed 0: no"
     ):
-        record(CONFIG, episodes=2, out=tmp_path / "demos", workers=0)
+        record(CONFIG, episodes=2, out=tmp_path / "demos", context=RunContext(0))
 
 
 @pytest.mark.parametrize(("episodes", "seed"), [(0, 0), (-3, 0), (1, -1)])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from surgicai_vision import envs
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.demos.dmp import fit
 from surgicai_vision.demos.dmp.controller import DmpController
 from surgicai_vision.demos.dmp.primitive import (
@@ -284,7 +285,7 @@ def test_records_what_it_generates(demonstrated, tmp_path):
     seed = read_demo(demonstrated["insert"]).seed
     out, given = (
         tmp_path / "demos",
-        {"demonstrator": "dmp", "demos": [demonstrated["insert"]], "workers": 0},
+        {"demonstrator": "dmp", "demos": [demonstrated["insert"]], "context": RunContext(0)},
     )
     paths = record(TaskConfig("insert"), episodes=3, seed=seed, out=out, **given)
     demos = [read_demo(path) for path in paths]

@@ -34,6 +34,7 @@ from surgicai_vision.commands.options import COUNT, FILE_ONLY
 from surgicai_vision.core import names
 from surgicai_vision.core.config import SceneConfig, TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 from surgicai_vision.demos.imports import surgicai_pickle
 from surgicai_vision.demos.imports.rosbag import reader
@@ -333,7 +334,7 @@ def test_safetensors(tmp_path):
 def dataset(tmp_path, monkeypatch):
     render_with_fake_env(monkeypatch, CONFIG)
     folder = write_demos(tmp_path / "demos", CONFIG, (1, 2))
-    render_demos(folder, tmp_path / "set", size=32, depth=True, workers=0)
+    render_demos(folder, tmp_path / "set", size=32, depth=True, context=RunContext(0))
     assert len(list_demos(folder)) == 2
     return tmp_path / "set"
 

@@ -21,6 +21,7 @@ import torch
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import open_dataset, render_demos
 from surgicai_vision.dataset.feature_export import export_features
 from surgicai_vision.demos.record import record
@@ -44,14 +45,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def dataset(folder: Path) -> Path:
     """Three demonstrations in two views with depth, which only some policies can take."""
-    record(TaskConfig(TASK), episodes=3, out=folder / "demos", workers=0)
+    record(TaskConfig(TASK), episodes=3, out=folder / "demos", context=RunContext(0))
     render_demos(
         folder / "demos",
         folder / "dataset",
         views=("front", "back"),
         size=SIZE,
         depth=True,
-        workers=0,
+        context=RunContext(0),
     )
     return folder / "dataset"
 

@@ -13,6 +13,7 @@ from fake_env import FakeEnv, FakeExpert
 from surgicai_vision import envs
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists
+from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import open_dataset, render_demos
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.record import record
@@ -80,7 +81,12 @@ def test_labels_are_the_experts_at_the_learners_states(driven, learner):
 
 def test_workers_and_repetition_change_nothing(driven, learner, tmp_path):
     again = record(
-        CONFIG, episodes=3, seed=1000, out=tmp_path / "again", learner=learner, workers=2
+        CONFIG,
+        episodes=3,
+        seed=1000,
+        out=tmp_path / "again",
+        learner=learner,
+        context=RunContext(2),
     )
     assert [path.read_bytes() for path in again] == [path.read_bytes() for path in driven]
     request = read_marker(tmp_path / "again")["request"]

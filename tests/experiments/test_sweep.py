@@ -19,7 +19,7 @@ from surgicai_vision.commands.console import QuietConsole
 from surgicai_vision.commands.sweep import read_grid
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnknownName
-from surgicai_vision.core.executor import JOBS
+from surgicai_vision.core.executor import JOBS, RunContext
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.codecs import DEPTH_FAR, DEPTH_NEAR, grey
 from surgicai_vision.dataset.subset import first_episodes, with_frame_stride
@@ -46,7 +46,8 @@ BLIND = Grid(
 
 
 def sweep(grid, out, workers=0, stage=QUIET, only=()):
-    return run_sweep(grid, out, stage, workers, choice=read_choice(only, grid.cells))
+    context = RunContext(workers, stage=stage)
+    return run_sweep(grid, out, context, choice=read_choice(only, grid.cells))
 
 
 def counts(result):

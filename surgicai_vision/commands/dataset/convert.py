@@ -47,6 +47,7 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Make the dataset and print where it is."""
+    from surgicai_vision.core.executor import RunContext
     from surgicai_vision.dataset import convert_dataset
 
     path = options.dataset
@@ -54,15 +55,13 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     if not ending:
         raise InputError("There is nothing to do: give --view VIEW[,VIEW], --video CODEC or both.")
     out = options.out or path.with_name(f"{path.name}-{ending}")
-    with console.stage("writing", "frames") as progress:
-        summary = convert_dataset(
-            path,
-            out,
-            views=options.view,
-            video=options.video,
-            workers=options.workers,
-            progress=progress,
-        )
+    summary = convert_dataset(
+        path,
+        out,
+        views=options.view,
+        video=options.video,
+        context=RunContext(options.workers, stage=console.stage),
+    )
     console.say(
         f"{summary.episodes} episodes, {summary.frames} frames in {summary.seconds:.0f} s: {out}"
     )

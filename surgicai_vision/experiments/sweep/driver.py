@@ -16,8 +16,7 @@ from typing import Any, final
 from surgicai_vision.core import files
 from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
-from surgicai_vision.core.executor import LOCAL, Engine, Job, RunContext, claim, run
-from surgicai_vision.core.progress import Stage
+from surgicai_vision.core.executor import Job, RunContext, claim, run
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.storage import (
     CELL_FILE,
@@ -51,9 +50,7 @@ ATTEMPTS = 3
 def run_sweep(
     grid: Grid,
     out: Path,
-    stage: Stage,
-    workers: int,
-    engine: Engine = LOCAL,
+    context: RunContext,
     attempts: int = ATTEMPTS,
     choice: Choice = EVERYTHING,
 ) -> dict[str, Any]:
@@ -62,9 +59,7 @@ def run_sweep(
     Args:
         grid: the cells.
         out: folder to make or to continue.
-        stage: shows progress.
-        workers: processes; the result does not depend on it.
-        engine: what runs them.
+        context: workers, engine and display; the result does not depend on them.
         attempts: how often a cell is started whose worker dies.
         choice: the cells to work on; others that are not there yet are left for another call.
 
@@ -84,10 +79,10 @@ def run_sweep(
             for task in grid.task
             if any(s.cell.task == task and s.state != LEFT for s in states)
         ]
-        do = functools.partial(run, context=RunContext(workers, engine), attempts=attempts)
-        sweep = _Sweep(grid, out, stage, do, tuple(tasks))
+        do = functools.partial(run, context=context, attempts=attempts)
+        sweep = _Sweep(grid, out, context, do, tuple(tasks))
         to_do = [state for state in states if state.state == TO_DO]
-        sweep.prepare(to_do, workers, engine)
+        sweep.prepare(to_do)
         sweep.do(to_do)
         here = [
             state
@@ -142,8 +137,8 @@ class _Sweep:
     """One run of a sweep.
 
     Attributes:
-        grid, out, stage: as `run_sweep`'s.
-        run: `executor.run` with workers and engine.
+        grid, out, context: as `run_sweep`'s.
+        run: `executor.run` with the context.
         tasks: those whose references are wanted.
         errors: cell's key → what went wrong, in one line.
         problems: what went wrong beside the cells.
@@ -151,7 +146,7 @@ class _Sweep:
 
     grid: Grid
     out: Path
-    stage: Stage
+    context: RunContext
     run: Any
     tasks: tuple[str, ...]
     errors: dict[str, str] = field(default_factory=dict)
@@ -168,7 +163,7 @@ class _Sweep:
         }
         self.jobs = Jobs(self.grid, self.out, command_line(), ours)
 
-    def prepare(self, to_do: Sequence[CellState], workers: int, engine: Engine) -> None:
+    def prepare(self, to_do: Sequence[CellState]) -> None:
         """Make the datasets, features and policies that cells share; a task whose dataset fails
         fails its cells.
         """
@@ -183,7 +178,7 @@ class _Sweep:
         for task in [*needed, *(task for task in replayed if task not in needed)]:
             try:
                 prepare_dataset(
-                    self.grid.config(task), self.jobs.data_folder(task), self.stage, engine=engine, workers=workers,
+                    self.grid.config(task), self.jobs.data_folder(task), self.context,
                     demonstrations=self.grid.recorded, views=self.grid.cameras or ("front",), size=self.grid.size,
                     depth=self.grid.has_depth, demonstrator=self.grid.demonstrator, disturbance=self.grid.disturbance,
                     frame_stride=self.grid.frame_stride, post_success_steps=self.grid.post_success_steps,
@@ -211,7 +206,7 @@ class _Sweep:
                 errors[job.key()] = error
 
         if once:
-            with self.stage(title, title) as progress:
+            with self.context.stage(title, title) as progress:
                 self.run(
                     list(once.values()), self.out / WORK, unit=title, progress=progress, ended=ended
                 )
@@ -274,7 +269,7 @@ class _Sweep:
                 self.problems.append(f"failed: {place.name}: {' '.join(str(error).split())}")
 
         if left:
-            with self.stage("cells", "cells") as progress:
+            with self.context.stage("cells", "cells") as progress:
                 self.run(left, self.out / WORK, unit="cells", progress=progress, ended=ended)
 
     def probe(self, cells: Sequence[Cell]) -> None:
