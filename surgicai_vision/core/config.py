@@ -37,13 +37,15 @@ image evaluation, the RL training script, the trajectories shipped with the rele
 
 DWELL = 15
 """Control steps a subtask's success must hold, in a whole procedure, before the next one begins."""
-CLOCK_PERIOD, CLOCK_SIZE = 25, 3
-"""Control steps in which the hand of `clock` goes round, and how many numbers `clock` tells."""
+CLOCK_PERIOD = 25
+"""Period of the sine and cosine of `clock` [control steps]."""
+CLOCK_SIZE = 3
+"""Length of what `clock` returns."""
 
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """What stands in the scene. Its digest, with the geometry's version, is the scene hash.
+    """What the scene consists of; its digest with the geometry's version is the scene hash.
 
     Attributes:
         layout: phantom layout, one of `names.LAYOUTS`.
@@ -86,15 +88,14 @@ RANDOMISATION_LIMITS: Mapping[str, float] = types.MappingProxyType(
         "latency": LATENCY_LIMIT,
     }
 )
-"""Axis → largest magnitude: beyond it cameras lose the scene, or the procedure is no longer
-possible.
-"""
+"""Axis → largest magnitude: beyond it the scene is out of view or the procedure impossible."""
 
 
 @dataclass(frozen=True)
 class RandomisationConfig:
-    """How much of each thing differs from episode to episode; 0 is off. Each axis is drawn
-    uniformly from ± its value.
+    """Domain randomisation: each axis is drawn uniformly from ± its value for every episode.
+
+    The default of every axis is 0, which is off.
 
     Attributes:
         light: brightness of each light, as a fraction of it.
@@ -198,7 +199,8 @@ def from_mapping(cls: type[T], mapping: Mapping[str, object], where: str = "conf
 
 def convert(hint: object, value: object, where: str) -> object:
     """Return `value` as the type `hint` says, or raise `InputError`."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    arguments = typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
@@ -247,7 +249,7 @@ def read_changes(texts: Iterable[str]) -> dict[str, JSON]:
 
 
 def digest(value: object) -> str:
-    """sha256 (hex) of the canonical JSON of a dataclass or of plain data."""
+    """Return the sha256 (hex) of the canonical JSON of a dataclass or of plain data."""
     plain = (
         dataclasses.asdict(value)
         if dataclasses.is_dataclass(value) and not isinstance(value, type)
@@ -259,9 +261,7 @@ def digest(value: object) -> str:
 
 
 def check_frame_stride(frame_stride: int) -> None:
-    """Raise `InputError` unless a frame every so many steps makes a whole number of frames a
-    second.
-    """
+    """Raise `InputError` unless `frame_stride` divides the frames a second."""
     if frame_stride < 1 or names.FPS % frame_stride:
         allowed = ", ".join(
             str(number) for number in range(1, names.FPS + 1) if names.FPS % number == 0
@@ -273,8 +273,7 @@ def check_frame_stride(frame_stride: int) -> None:
 
 
 def clock(steps: "np.ndarray") -> "np.ndarray":
-    """Return what a policy with a clock is told of the control steps (N,) since its subtask began,
-    (N, 3) float32.
+    """Encode the control steps (N,) since a subtask began for a policy, as (N, 3) float32.
 
     The share of `SUBTASK_STEPS`, and sine and cosine of a hand that goes round once in
     `CLOCK_PERIOD` steps: the share alone changes too little in a few steps to act by.

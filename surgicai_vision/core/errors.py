@@ -1,5 +1,4 @@
-"""Errors: one base class, and every message says what was given, what is allowed and what to do
-next.
+"""Errors: a message says what was given, what is allowed and what to do next.
 
 The command line maps them to exit codes: `InputError` (wrong input) ends with 2, every other
 `SurgicaiError` (the work failed) with 1; both print one line and no traceback.
@@ -10,13 +9,13 @@ from collections.abc import Iterable
 
 
 class SurgicaiError(Exception):
-    """Base of all errors this package raises on purpose. One line, no traceback, exit code 1."""
+    """Base of all errors that this package raises: one line, no traceback, exit code 1."""
 
     exit_code = 1
 
 
 class InputError(SurgicaiError):
-    """The caller gave something that cannot be used. Exit code 2."""
+    """Input that cannot be used. Exit code 2."""
 
     exit_code = 2
 
@@ -46,9 +45,7 @@ class OutputExists(InputError):
 
 
 class MissingWeights(InputError):
-    """Pretrained weights that are neither at hand nor downloadable; names the file and the
-    alternatives.
-    """
+    """Pretrained weights that are neither on this machine nor downloadable."""
 
 
 class UnreachablePose(SurgicaiError):

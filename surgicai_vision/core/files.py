@@ -56,9 +56,7 @@ def read_json(path: Path) -> Any:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`; rename it to `path` at the end, or remove it on an
-    error.
-    """
+    """Yield a temporary folder beside `path`, renamed to `path` at the end; removed on an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}-{path.name}")
     temporary.mkdir()
@@ -111,11 +109,11 @@ def sync_folder(folder: Path) -> None:
 
 
 def check_output(path: Path, *, may_resume: str | None = None) -> None:
-    """Refuse an output folder that cannot be written or holds foreign things, before any work.
+    """Refuse an output folder that cannot be written or holds other files, before any work.
 
     Args:
         path: the folder to be made.
-        may_resume: name of a file whose presence in `path` marks it as ours, to be continued.
+        may_resume: name of a file that marks the folder as one to be continued.
     """
     if path.exists():
         if not path.is_dir():
@@ -135,11 +133,11 @@ def check_output(path: Path, *, may_resume: str | None = None) -> None:
 
 
 def claim(path: Path, owner: Mapping[str, object], what: str) -> None:
-    """Write whose folder this is into the file `path` in it; refuse a folder of somebody else.
+    """Record in the file `path` what its folder belongs to; refuse a folder of something else.
 
     Args:
         path: a file in the folder, which is made.
-        owner: plain data: everything the folder's content depends on.
+        owner: everything that the folder's content depends on, as plain data.
         what: what the folder holds, for the message.
 
     Raises:
@@ -154,7 +152,7 @@ def claim(path: Path, owner: Mapping[str, object], what: str) -> None:
 
 
 def sha256_file(path: Path) -> str:
-    """sha256 (hex) of a file's bytes."""
+    """Return the sha256 (hex) of a file's bytes."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -196,8 +194,6 @@ def cache_root() -> Path:
 
 
 def configs_folder() -> Path:
-    """Return the folder of the configurations that ship with the package (in a checkout:
-    `configs/`).
-    """
+    """Return the folder of the shipped configurations; in a checkout `configs/`."""
     shipped = PACKAGE / "configs"
     return shipped if shipped.is_dir() else PACKAGE.parent / "configs"

@@ -28,23 +28,25 @@ TASK_TEXTS = MappingProxyType(
 )
 """Task name → the sentence stored as LeRobot's `task`."""
 
-PSM1, PSM2 = "psm1", "psm2"
+PSM1 = "psm1"
+PSM2 = "psm2"
 ARMS = (PSM1, PSM2)
 ACTIVE_ARM = MappingProxyType(
     {"grasp": PSM2, "place": PSM2, "insert": PSM2, "handoff": PSM1, "pullout": PSM1}
 )
 """Subtask → the arm its action moves."""
 
-FIXED_CAMERAS, WRIST_CAMERAS = ("front", "front_right", "back"), ("wrist_psm1", "wrist_psm2")
+FIXED_CAMERAS = ("front", "front_right", "back")
+WRIST_CAMERAS = ("wrist_psm1", "wrist_psm2")
 FOLLOWING_CAMERAS = ("front_psm1", "front_psm2", "back_psm1", "back_psm2")
-"""What a fixed camera sees about an arm's jaws, larger (`scene.cameras`)."""
+"""Crops of a fixed camera around an arm's jaws, enlarged (`scene.cameras`)."""
 CAMERAS = (*FIXED_CAMERAS, *WRIST_CAMERAS, *FOLLOWING_CAMERAS)
 DEPTH_VIEWS = tuple(f"{camera}_depth" for camera in CAMERAS)
-"""What a policy may see of a camera in the place of colours: its depth as a grey image
-(`dataset.images.grey`).
-"""
+"""Depth of a camera as a grey image, which a policy may see instead of colours."""
 VIEWS = (*CAMERAS, *DEPTH_VIEWS)
-RGB, DEPTH, SEGMENTATION = "rgb", "depth", "segmentation"
+RGB = "rgb"
+DEPTH = "depth"
+SEGMENTATION = "segmentation"
 MODALITIES = (RGB, DEPTH, SEGMENTATION)
 PARTS = ("background", "phantom", "needle", "thread", "psm1", "psm2")
 """Named parts; a part's index is its value in a segmentation image."""
@@ -74,9 +76,7 @@ NEEDLE_POSE = "needle_pose"
 BOTH_ARMS = "both_arms"
 """Measured tip pose and jaw of psm1, then of psm2, each in its own base."""
 PRIVILEGED_STATE = "privileged_state"
-"""The 21 values of obs_type "state", goal included. No LeRobot key, so that no policy is fed it by
-default.
-"""
+"""The 21 values of obs_type "state" with the goal; no LeRobot key, lest a policy be fed it."""
 
 CLOCKED_STATE = "clocked_state"
 """STATE and, last, the time since the subtask began as `config.clock` tells it."""
@@ -87,7 +87,9 @@ META_FILE = "meta/surgicai.json"
 FPS = 50
 """Control steps and frames per second of simulated time."""
 
-TRAIN_SEED, VALIDATION_SEED, TEST_SEED = 0, 500_000, 900_000
+TRAIN_SEED = 0
+VALIDATION_SEED = 500_000
+TEST_SEED = 900_000
 """First seed of each bank of start states; the banks never meet (fewer than 400,000 seeds each)."""
 
 
@@ -107,15 +109,15 @@ def frame_key(camera: str, modality: str) -> str:
 
 
 def image_key(view: str) -> str:
-    """LeRobot feature key of a view's RGB image."""
+    """Return the LeRobot feature key of a view's RGB image."""
     return f"observation.images.{view}"
 
 
 def depth_key(view: str) -> str:
-    """LeRobot feature key of a view's depth image [m]."""
+    """Return the LeRobot feature key of a view's depth image [m]."""
     return f"observation.images.{view}_depth"
 
 
 def segmentation_key(view: str) -> str:
-    """LeRobot feature key of a view's segmentation image (part index)."""
+    """Return the LeRobot feature key of a view's segmentation image (part index)."""
     return f"observation.images.{view}_segmentation"

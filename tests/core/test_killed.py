@@ -18,9 +18,9 @@ GONE_S = 5.0
 """Longest that anything may be alive after the kill [s]."""
 
 VECTOR_ENV = """
-import gymnasium
-import surgicai_vision.envs
 if __name__ == "__main__":
+    import gymnasium
+    import surgicai_vision.envs
     envs = gymnasium.make_vec("surgicai_vision/Grasp-v0", 2, workers=2)
     envs.reset(seed=0)
     while True:
