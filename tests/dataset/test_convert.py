@@ -103,7 +103,9 @@ def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(
 ):
     render(demos, tmp_path / "set")
     monkeypatch.setattr(video_jobs, "BLOCK_FRAMES", 8)
-    alone = convert_dataset(tmp_path / "set", tmp_path / "alone", video="h264", context=RunContext(0))
+    alone = convert_dataset(
+        tmp_path / "set", tmp_path / "alone", video="h264", context=RunContext(0)
+    )
     monkeypatch.setattr(video_jobs, "_dataset", None)  # not in this process
     together = convert_dataset(
         tmp_path / "set", tmp_path / "together", video="h264", context=RunContext(2)
