@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal, TypedDict, cast
 from urllib.parse import unquote, urlparse
 
 from surgicai_vision.core.processes import OFFLINE, start_module
@@ -34,7 +34,28 @@ FRAMES = 30
 FRAME_SIZE = 224
 
 Status = Literal["ok", "warning", "fail"]
-Finding = dict[str, Any]
+
+
+class FoundWeights(TypedDict):
+    """What a probe found of one encoder's weights.
+
+    Attributes:
+        here: the file is on this machine.
+        detail: where it is, or what is missing.
+    """
+
+    here: bool
+    detail: str
+
+
+class Finding(TypedDict, total=False):
+    """What a probe found; each fills its own keys, or `error`."""
+
+    error: str
+    renderer: str
+    frames_per_second: float
+    devices: list[str]
+    encoders: dict[str, FoundWeights]
 
 
 @dataclass(frozen=True)
@@ -188,16 +209,16 @@ def check_gpu(finding: Finding) -> Check:
 
 
 def check_encoders(finding: Finding) -> Iterator[Check]:
-    """Report, for every registered encoder, whether its weights are at hand."""
+    """Report, for every registered encoder, whether its weights are on this machine."""
     if "error" in finding:
         yield Check("encoders", "fail", finding["error"], "make setup")
         return
-    for name, found in finding.items():
+    for name, found in finding["encoders"].items():
         advice = (
-            "" if found["at_hand"] else "needed only for this encoder: a network, or --weights FILE"
+            "" if found["here"] else "needed only for this encoder: a network, or --weights FILE"
         )
         yield Check(
-            f"encoder {name}", "ok" if found["at_hand"] else "warning", found["detail"], advice
+            f"encoder {name}", "ok" if found["here"] else "warning", found["detail"], advice
         )
 
 
@@ -231,7 +252,7 @@ def finish_probe(process: subprocess.Popen[str]) -> Finding:
         return {"error": f"no answer within {PROBE_SECONDS} s"}
     lines = output.strip().splitlines()
     if process.returncode == 0 and lines:
-        return json.loads(lines[-1])
+        return cast(Finding, json.loads(lines[-1]))
     reasons = complaint.strip().splitlines()
     return {"error": reasons[-1] if reasons else f"ended with code {process.returncode}"}
 
@@ -277,22 +298,22 @@ def probe_encoders() -> Finding:
     from surgicai_vision.core.errors import MissingWeights, SurgicaiError
     from surgicai_vision.features import encoders
 
-    found: Finding = {}
+    found: dict[str, FoundWeights] = {}
     for name in encoders.encoder_names():
         card = encoders.encoder_card(name)
         unpinned = "" if card.sha256 else " (unpinned: the hub's own hash is taken)"
         try:
             path = encoders.find_weights(name, encoders.WeightsSource(accept_licence=True))
-            detail = str(path) if path else f"{card.source} {card.revision}, always at hand"
-            found[name] = {"at_hand": True, "detail": f"{detail}{unpinned if path else ''}"}
+            detail = str(path) if path else f"{card.source} {card.revision}, always here"
+            found[name] = {"here": True, "detail": f"{detail}{unpinned if path else ''}"}
         except MissingWeights:
             found[name] = {
-                "at_hand": False,
+                "here": False,
                 "detail": f"{card.filename} of {card.source} is not here{unpinned}",
             }
         except SurgicaiError as error:
-            found[name] = {"at_hand": False, "detail": str(error)}
-    return found
+            found[name] = {"here": False, "detail": str(error)}
+    return {"encoders": found}
 
 
 PROBES: MappingProxyType[str, Callable[[], Finding]] = MappingProxyType(

@@ -102,7 +102,7 @@ def subject_of(options: Any) -> Any:
     """Say who acts in which task: a baseline, or a checkpoint in the task it was trained for.
 
     Args:
-        options: of this verb, or another's with the same fields (`swap` is this one's alone).
+        options: of `evaluate`, or of a command with the same fields but `swap`.
     """
     from surgicai_vision.evaluation import agents, lerobot_agent, policy_spec
 
