@@ -53,7 +53,7 @@ COMMANDS = MappingProxyType(
         "teleoperate": "Record demonstrations by keyboard or gamepad.",
         "import-demos": "Read demonstrations of the original SurgicAI, or bags of ROS 1 and 2.",
         "render-demos": "Render demonstrations into a LeRobot dataset.",
-        "dataset": "Check, convert, repair or share a dataset.",
+        "dataset": "Check, convert or share a dataset.",
         "encode": "Compute a dataset's frozen features.",
         "probe": "Read the needle's pose from frozen features by a linear probe.",
         "cache": "List, measure or prune the cached features.",

@@ -8,22 +8,19 @@ LeRobot's own metadata writer, `reading` opens a dataset without torch, `checkin
 of videos.
 """
 
+from surgicai_vision.dataset.check import CheckReport, check_dataset
 from surgicai_vision.dataset.convert import DatasetSummary, convert_dataset
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.render import render_demos
-from surgicai_vision.dataset.validate.check import CheckReport, check_dataset
-from surgicai_vision.dataset.validate.repair import Repair, repair_dataset
 
 __all__ = [
     "CheckReport",
     "Dataset",
     "DatasetSummary",
     "RenderedDataset",
-    "Repair",
     "check_dataset",
     "open_dataset",
     "render_demos",
-    "repair_dataset",
     "convert_dataset",
 ]

@@ -23,6 +23,7 @@ from surgicai_vision.core.executor import RunContext, building, work_folder
 from surgicai_vision.core.files import check_output, read_json, whole_folder, write_json
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset import schema
+from surgicai_vision.dataset.lerobot_files import LeRobotFiles
 from surgicai_vision.dataset.metadata import (
     FILES_PER_CHUNK,
     INDEX_FEATURES,
@@ -31,7 +32,6 @@ from surgicai_vision.dataset.metadata import (
     write_metadata,
 )
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
-from surgicai_vision.dataset.validate.lerobot_files import LeRobotFiles
 from surgicai_vision.dataset.video import CODECS, PIXELS
 from surgicai_vision.dataset.video_jobs import Encoded, Place, encode_views
 from surgicai_vision.dataset.writer import DataFiles
@@ -214,7 +214,7 @@ def _write_data(
     """Write the data files; return the episodes' rows."""
     data = DataFiles(folder, features, files.fps)
     rows = []
-    for number, table in enumerate(files.episodes(folder)):
+    for number, table in enumerate(files.episodes()):
         statistics = row_statistics(files.rows[number])
         kept = {key: value for key, value in statistics.items() if key in features}
         row = data.append(number, table, kept)

@@ -23,9 +23,9 @@ from surgicai_vision.core.hub import connect, refusals_in_one_line
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import schema
+from surgicai_vision.dataset.check import CheckReport, check_dataset
 from surgicai_vision.dataset.metadata import CODEBASE_VERSION
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
-from surgicai_vision.dataset.validate.check import CheckReport, check_dataset
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi

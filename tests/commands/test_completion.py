@@ -42,7 +42,7 @@ def completed(script, *words):
     [
         (["tr"], ["train"]),
         (["re"], ["record-demos", "render-demos", "report"]),
-        (["dataset", ""], ["check", "convert", "repair", "push", "pull"]),
+        (["dataset", ""], ["check", "convert", "push", "pull"]),
         (["dataset", "check", "--j"], ["--json"]),
         (["evaluate", "expert", "--task", "p"], ["place", "pullout"]),
         (["render-demos", "--no-d"], ["--no-depth"]),

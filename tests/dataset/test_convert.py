@@ -4,7 +4,6 @@ import json
 import shutil
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from fake_demos import render_with_fake_env, write_demos
 
@@ -18,7 +17,6 @@ from surgicai_vision.dataset import (
     convert_dataset,
     open_dataset,
     render_demos,
-    repair_dataset,
     video_jobs,
 )
 from surgicai_vision.dataset.video import CODECS
@@ -121,7 +119,7 @@ def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(
     assert check_dataset(tmp_path / "together").problems == ()
 
 
-def test_views_of_a_video_dataset_and_its_repair(tmp_path, demos):
+def test_views_of_a_video_dataset(tmp_path, demos):
     render(demos, tmp_path / "video", video="h264")
     convert_dataset(tmp_path / "video", tmp_path / "back", views=("back",))
     assert check_dataset(tmp_path / "back").problems == ()
@@ -131,10 +129,6 @@ def test_views_of_a_video_dataset_and_its_repair(tmp_path, demos):
     )
     with pytest.raises(InputError, match="holds videos already"):
         convert_dataset(tmp_path / "video", tmp_path / "again", video="av1")
-    row = tmp_path / "back/meta/episodes/chunk-000/file-000.parquet"
-    pq.write_table(pq.read_table(row).slice(0, 1), row)
-    assert repair_dataset(tmp_path / "back").episodes == 3
-    assert check_dataset(tmp_path / "back").problems == ()
 
 
 def test_the_same_command_again_does_nothing_and_wrong_ones_are_refused(tmp_path, demos):

@@ -10,7 +10,6 @@ COMMANDS = MappingProxyType(
     {
         "check": "Read all of a dataset and say what is wrong with it.",
         "convert": "Take some views of a dataset, or store them as video, without rendering.",
-        "repair": "Keep the longest whole prefix of a broken LeRobot dataset.",
         "push": "Share a dataset on the Hugging Face Hub, with a card.",
         "pull": "Fetch a dataset from the Hugging Face Hub and check it.",
     }

@@ -22,7 +22,7 @@ class Options:
     """Options of `dataset check`.
 
     Attributes:
-        dataset: A dataset of ours, or any LeRobot v3 dataset.
+        dataset: A dataset that render-demos made; for any other LeRobot dataset see lerobot-salvage.
     """
 
     dataset: Annotated[Path, DIRECTORY] = field(kw_only=False)
@@ -40,7 +40,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     verdict = (
         "whole"
         if report.ok
-        else f"{len(report.problems)} problems; see `surgicai-vision dataset repair --help`"
+        else f"{len(report.problems)} problems; `lerobot-salvage repair` keeps what is whole"
     )
     console.say(f"{report.episodes} episodes, {report.frames} frames: {verdict}")
     return {**dataclasses.asdict(report), "ok": report.ok, "exit_code": 0 if report.ok else 1}

@@ -1,13 +1,12 @@
-"""Repair a broken LeRobot dataset, anyone's or ours: keep its longest verified prefix.
+"""Repair a broken LeRobot dataset: keep its longest verified prefix.
 
-    repair = repair_dataset(Path("dataset"))                       # the original stays beside it as
-    dataset.broken repair = repair_dataset(Path("dataset"), Path("mended"))       # the original
-    stays as it is
+    repair_dataset(Path("dataset"))                     # the original becomes dataset.broken
+    repair_dataset(Path("dataset"), Path("mended"))     # the original stays as it is
 
-LeRobot's writer leaves data files without footers, no `meta/episodes` and an `info.json` that
-counts what is not there when it is killed. The episodes that can be verified from the first on
-(`verifying`) are written into a new folder with fresh metadata and statistics, which appears whole
-and is checked before it takes the old one's place.
+A killed LeRobot writer leaves data files without footers, no `meta/episodes` and an `info.json`
+that counts what is not there. The episodes that can be verified from the first on (`verify`) are
+written into a new folder with new metadata and statistics, which appears whole and is checked
+before it takes the old one's place.
 """
 
 import ctypes
@@ -19,16 +18,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lerobot_salvage.check import check_dataset
+from lerobot_salvage.verify import Verified, Verifier
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, SurgicaiError
 from surgicai_vision.core.executor import claim, work_folder
 from surgicai_vision.core.files import check_output, sync_folder, whole_folder, write_json
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import schema
+from surgicai_vision.dataset.check import CheckReport
+from surgicai_vision.dataset.lerobot_files import LeRobotFiles
 from surgicai_vision.dataset.metadata import INDEX_FEATURES, EpisodeRow, video_path, write_metadata
-from surgicai_vision.dataset.validate.check import CheckReport, check_dataset
-from surgicai_vision.dataset.validate.lerobot_files import LeRobotFiles
-from surgicai_vision.dataset.validate.verify import Verified, Verifier
 from surgicai_vision.dataset.writer import DataFiles
 
 EXCHANGE = 2

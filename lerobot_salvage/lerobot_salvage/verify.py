@@ -1,14 +1,15 @@
-"""Verify a LeRobot dataset episode by episode, anyone's or ours, and say where it stops being
-whole.
+"""Verify a LeRobot dataset episode by episode, up to the first that is not whole.
 
     verifier = Verifier(LeRobotFiles(path))
-    for episode in verifier.episodes(scratch): …        # verified ones; ends at the first that is
-    not verifier.files.problems                             # why
+    for episode in verifier.episodes(scratch): …        # whole ones, in order
+    verifier.files.problems                             # why it ended
 
-An episode is whole when its rows are in order and finite, every image decodes to the size its
-feature says, and every video has its frames; an episode of ours also when it passes `judging`.
+An episode is whole if its rows are in order and finite, every image decodes to the size its feature
+says, and every video has its frames; an episode that surgicai-vision rendered must also pass the
+rules of that package (`surgicai_vision.dataset.rules`).
 """
 
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +19,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from lerobot_salvage.recovery import open_or_recover
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import read_json
 from surgicai_vision.dataset import codecs, schema
+from surgicai_vision.dataset.lerobot_files import LeRobotFiles
 from surgicai_vision.dataset.metadata import row_statistics
+from surgicai_vision.dataset.rules import ImageWatch, episode_problems, number_problems
 from surgicai_vision.dataset.stats import ImageStatistics, Statistics, column_statistics
-from surgicai_vision.dataset.validate.lerobot_files import LeRobotFiles, contents
-from surgicai_vision.dataset.validate.rules import ImageWatch, episode_problems, number_problems
 from surgicai_vision.dataset.video import count_frames, read_frames
 
 
@@ -65,8 +67,9 @@ class Verifier:
         """Yield the verified episodes from the first on; what ends them is added to
         `files.problems`.
         """
+        open_file = functools.partial(open_or_recover, files=self.files, scratch=scratch)
         start = 0
-        for number, table in enumerate(self.files.episodes(scratch)):
+        for number, table in enumerate(self.files.episodes(open_file)):
             try:
                 yield self._verify(number, start, table)
             except (_Unfit, BadFile, pa.ArrowException, ValueError, TypeError) as error:
@@ -155,7 +158,7 @@ class Verifier:
     ) -> tuple[pa.Table, Statistics]:
         """Verify one image column; return the table with the bytes of images that lay beside it."""
         watch, statistics, found = self._watch(key, columns, True), ImageStatistics(), []
-        for index, (content, name) in enumerate(contents(table.column(key))):
+        for index, (content, name) in enumerate(_contents(table.column(key))):
             content = self._beside(name) if content is None else content
             frame = codecs.decode(content, f"frame {index} of {key}")
             self._check_shape(key, index, frame)
@@ -250,6 +253,13 @@ def _ours(path: Path) -> dict[str, Any]:
         return meta if {"views", "depth", "segmentation", "image_size"} <= set(meta) else {}
     except (BadFile, TypeError):
         return {}
+
+
+def _contents(column: pa.ChunkedArray) -> list[tuple[bytes | None, str | None]]:
+    """Return (bytes, path) of every image in a column."""
+    whole = column.combine_chunks()
+    content = pc.struct_field(whole, "bytes").to_pylist()
+    return list(zip(content, pc.struct_field(whole, "path").to_pylist(), strict=True))
 
 
 def _array(column: pa.ChunkedArray, features: Mapping[str, Any], key: str) -> np.ndarray:

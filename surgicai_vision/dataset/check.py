@@ -12,7 +12,6 @@ is the one recorded when it was rendered. Of another LeRobot dataset, everything
 alone; its digest is that over its files.
 """
 
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,16 +22,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import digest as digest_of
 from surgicai_vision.core.errors import BadFile
-from surgicai_vision.core.files import read_json, sha256_file
-from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.core.files import read_json
+from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset import schema
+from surgicai_vision.dataset.lerobot_files import INFO
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
+from surgicai_vision.dataset.rules import ImageWatch, episode_problems, number_problems
 from surgicai_vision.dataset.stats import column_statistics
-from surgicai_vision.dataset.validate.lerobot_files import INFO, LeRobotFiles
-from surgicai_vision.dataset.validate.rules import ImageWatch, episode_problems, number_problems
-from surgicai_vision.dataset.validate.verify import Verifier
 
 MOST_PROBLEMS = 50
 """Problems listed; the rest is counted."""
@@ -70,7 +67,10 @@ def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
         BadFile: it cannot be opened at all.
     """
     if (path / INFO).is_file() and not (path / names.META_FILE).exists():
-        return _check_foreign(LeRobotFiles(path), progress or silent)
+        raise BadFile(
+            f"{path} is a LeRobot dataset that surgicai-vision did not render; check it with "
+            f"'lerobot-salvage check {path}' (the distribution lerobot_salvage)."
+        )
     dataset = open_dataset(path)
     problems: list[str] = []
     columns = dataset.columns()
@@ -95,48 +95,13 @@ def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
         problems.append(
             f"digest: the content has {digest[:16]}…, its {names.META_FILE} says otherwise."
         )
-    return CheckReport(dataset.length, len(bounds), digest, _listed(problems))
+    return CheckReport(dataset.length, len(bounds), digest, first_problems(problems))
 
 
-def _listed(problems: list[str]) -> tuple[str, ...]:
-    """Return the problems, the last ones counted where there are many."""
+def first_problems(problems: list[str]) -> tuple[str, ...]:
+    """Return the first `MOST_PROBLEMS` problems and, where there are more, how many."""
     more = len(problems) - MOST_PROBLEMS
     return (*problems[:MOST_PROBLEMS], *([f"… and {more} more."] if more > 0 else []))
-
-
-def _check_foreign(files: LeRobotFiles, progress: Progress) -> CheckReport:
-    """Check a LeRobot dataset that is not ours."""
-    rows: list[tuple[int, int, int]] = []
-    start, claimed = 0, int(files.info.get("total_episodes") or 0)
-    with tempfile.TemporaryDirectory(prefix="surgicai-vision-") as scratch:
-        for number, episode in enumerate(Verifier(files).episodes(Path(scratch))):
-            count = len(episode.table)
-            rows.append((count, start, start + count))
-            start += count
-            progress(number + 1, max(claimed, number + 1), "episodes")
-    problems = list(files.problems)
-    if (files.info.get("total_frames"), files.info.get("total_episodes")) != (start, len(rows)):
-        problems.append(
-            f"{INFO}: it counts {files.info.get('total_episodes')} episodes and {files.info.get('total_frames')} "
-            f"frames; {len(rows)} and {start} are whole."
-        )
-    written = [
-        tuple(row.get(key) for key in ("length", "dataset_from_index", "dataset_to_index"))
-        for row in files.rows
-    ]
-    if written != rows:
-        problems.append("meta/episodes: its rows are not the episodes of the data.")
-    missing = [
-        key
-        for key, row in files.features.items()
-        if row["dtype"] != "string" and key not in files.statistics
-    ]
-    if missing:
-        problems.append(f"meta/stats.json: no statistics of {', '.join(missing)}.")
-    data = [*files.data_files(), *sorted(files.path.glob("videos/*/chunk-*/file-*.mp4"))]
-    return CheckReport(
-        start, len(rows), digest_of([sha256_file(file) for file in data]), _listed(problems)
-    )
 
 
 def _check_order(

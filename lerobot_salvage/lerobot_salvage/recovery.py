@@ -1,7 +1,6 @@
 """Read a parquet file whose writer was killed before it wrote the footer.
 
-    kept = salvage(Path("data/chunk-000/file-000.parquet"), schema, Path("mended.parquet"))   # row
-    groups
+    groups = recover(Path("data/chunk-000/file-000.parquet"), sample, Path("mended.parquet"))
 
 The row groups of such a file are whole: pyarrow writes each as it is closed, and only the table of
 where they lie is missing. That table is rebuilt by walking the pages' own headers, with the schema
@@ -22,8 +21,10 @@ from typing import Any, NamedTuple
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from surgicai_vision.dataset.validate import thrift
-from surgicai_vision.dataset.validate.thrift import Fields, read_struct, write_struct
+from lerobot_salvage import thrift
+from lerobot_salvage.thrift import Fields, read_struct, write_struct
+from surgicai_vision.dataset.lerobot_files import LeRobotFiles
+from surgicai_vision.dataset.writer import compression
 
 MAGIC = b"PAR1"
 DATA_PAGE, DICTIONARY_PAGE, DATA_PAGE_V2 = 0, 2, 3
@@ -75,7 +76,7 @@ class _Chunk(NamedTuple):
         return sum(page.values for page in self.pages if page.kind != DICTIONARY_PAGE)
 
 
-def salvage(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) -> int:
+def recover(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) -> int:
     """Write the whole row groups of the footerless file `path` as the parquet file `to`; return
     their number.
 
@@ -117,6 +118,47 @@ def salvage(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) 
         target.seek(end)
         target.write(tail + len(tail).to_bytes(4, "little") + MAGIC)
     return len(groups)
+
+
+def open_or_recover(file: Path, files: LeRobotFiles, scratch: Path) -> pq.ParquetFile:
+    """Open a data file of a dataset, or what can be recovered of it, written into `scratch`.
+
+    Raises:
+        ValueError: not one row group can be recovered.
+    """
+    try:
+        return pq.ParquetFile(file)
+    except (OSError, pa.ArrowException):
+        name = file.relative_to(files.path)
+        files.problems.append(f"{name} has no footer: its writer was killed.")
+    mended = scratch / "-".join(name.parts)
+    depth = [
+        key for key, row in files.features.items() if (row.get("info") or {}).get("is_depth_map")
+    ]
+    for writing in (LEROBOT, Writing(compression(files.schema, depth), False)):
+        if recover(file, _sample(files), mended, writing):
+            return pq.ParquetFile(mended)
+    raise ValueError("no whole row group in it")
+
+
+def _sample(files: LeRobotFiles) -> pa.Table:
+    """Return a table of one row in the schema of a dataset's data files."""
+    columns = {}
+    for field in files.schema:
+        shape = files.features.get(field.name, {"shape": (1,)})["shape"]
+        columns[field.name] = pa.array([_example(field.type, shape)], field.type)
+    return pa.table(columns, schema=files.schema)
+
+
+def _example(kind: pa.DataType, shape: tuple[int, ...]) -> object:
+    """Return a value of an Arrow type, lists of the feature's length."""
+    if pa.types.is_struct(kind):
+        return {"bytes": b"x", "path": "x"}
+    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        return [_example(kind.value_type, shape[1:])] * shape[0]
+    if pa.types.is_string(kind):
+        return "x"
+    return pa.types.is_boolean(kind) or 0
 
 
 def _footer(content: bytes) -> Fields:

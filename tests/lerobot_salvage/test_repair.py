@@ -8,15 +8,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from fake_demos import render_with_fake_env, write_demos
+from lerobot_salvage.recovery import LEROBOT, Writing, recover
+from lerobot_salvage.repair import _exchange
 
+import surgicai_vision.dataset
+from lerobot_salvage import check_dataset, repair_dataset, thrift
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, OutputExists
 from surgicai_vision.core.executor import RunContext
-from surgicai_vision.dataset import check_dataset, codecs, render_demos, repair_dataset
-from surgicai_vision.dataset.validate import thrift
-from surgicai_vision.dataset.validate.recovery import LEROBOT, Writing, salvage
-from surgicai_vision.dataset.validate.repair import _exchange
+from surgicai_vision.dataset import codecs, render_demos
 
 CAMERA, DATA = "observation.images.cam", "data/chunk-000/file-000.parquet"
 LENGTHS = (6, 4, 5)
@@ -285,6 +286,36 @@ def test_a_dataset_of_ours_is_repaired(tmp_path, ours, spoil, kept):
         )
 
 
+def test_a_video_dataset_of_ours_is_repaired(tmp_path, monkeypatch):
+    render_with_fake_env(monkeypatch, CONFIG)
+    folder = write_demos(tmp_path / "demos", CONFIG, (1, 2, 4))
+    options = {"size": 32, "video": "h264", "context": RunContext(0)}
+    render_demos(folder, tmp_path / "set", views=("back",), **options)
+    row = tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(row).slice(0, 1), row)
+    assert repair_dataset(tmp_path / "set").episodes == 3
+    assert check_dataset(tmp_path / "set").problems == ()
+
+
+def test_the_command_line_checks_and_repairs(tmp_path, foreign, capsys):
+    folder = shutil.copytree(foreign / "killed", tmp_path / "set")
+    assert main(["check", str(folder)]) == 1
+    assert "`lerobot-salvage repair` keeps what is whole" in capsys.readouterr().out
+    assert main(["repair", str(folder), "--out", str(tmp_path / "mended"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (result["episodes"], result["path"]) == (3, str(tmp_path / "mended"))
+    assert main(["check", str(tmp_path / "mended"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["ok"]
+    for wrong in (["check"], ["mend", str(folder)], ["check", str(tmp_path / "none")]):
+        assert main(wrong) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_our_own_check_names_the_command_for_other_datasets(foreign):
+    with pytest.raises(BadFile, match="lerobot-salvage check"):
+        surgicai_vision.dataset.check_dataset(foreign / "whole")
+
+
 def test_two_folders_swap_names(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
@@ -334,7 +365,7 @@ def test_footerless_parquet_is_read_up_to_the_last_whole_row_group(tmp_path, wri
     ):
         (tmp_path / "cut").write_bytes(content[:size])
         assert (
-            salvage(tmp_path / "cut", parts[0].slice(0, 1), tmp_path / "mended", writing) == groups
+            recover(tmp_path / "cut", parts[0].slice(0, 1), tmp_path / "mended", writing) == groups
         )
         if groups:
             assert pq.read_table(tmp_path / "mended").equals(pa.concat_tables(parts[:groups]))

@@ -1,31 +1,30 @@
-"""The files of anyone's LeRobot v3 dataset, read one episode at a time and without trust.
+"""Read the files of any LeRobot v3 dataset one episode at a time, without trust.
 
     files = LeRobotFiles(Path("dataset"))
     files.features, files.fps, files.tasks, files.rows      # what its metadata says
-    for table in files.episodes(scratch): …                 # one pyarrow table an episode, in order
+    for table in files.episodes(): …                        # one pyarrow table an episode, in order
 
-Nothing is needed but `meta/info.json`: what else is missing or damaged is listed in `problems`, a
-data file without a footer is salvaged into `scratch`, and reading ends where the data does.
+Nothing is needed but `meta/info.json`: what else is missing or damaged is listed in `problems`, and
+reading ends where the data does.
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import read_json
 from surgicai_vision.dataset.metadata import INDEX_FEATURES, arrow_schema
-from surgicai_vision.dataset.validate.recovery import LEROBOT, Writing, salvage
-from surgicai_vision.dataset.writer import compression
 
 INFO, STATISTICS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
 DATA, EPISODES = "data/chunk-*/file-*.parquet", "meta/episodes/chunk-*/file-*.parquet"
 VERSIONS = ("v3.0", "v3.1")
+type OpenFile = Callable[[Path], pq.ParquetFile]
+"""Opens a data file; lerobot_salvage gives one that recovers a file without a footer."""
 UNREADABLE = (OSError, KeyError, ValueError, TypeError, pa.ArrowException)
 
 
@@ -60,10 +59,8 @@ class LeRobotFiles:
                 for key, row in self.info["features"].items()
             }
             self.fps = float(self.info["fps"])
-            self._own = {
-                key: row for key, row in self.features.items() if key not in INDEX_FEATURES
-            }
-            self.schema = arrow_schema(self._own)
+            own = {key: row for key, row in self.features.items() if key not in INDEX_FEATURES}
+            self.schema = arrow_schema(own)
             version = self.info["codebase_version"]
         except (KeyError, TypeError, ValueError, AttributeError, pa.ArrowException) as error:
             raise BadFile(
@@ -133,10 +130,10 @@ class LeRobotFiles:
             self.problems.append(line(error))
             return {}
 
-    def episodes(self, scratch: Path) -> Iterator[pa.Table]:
-        """Yield the episodes' rows in order; salvaged files are written into `scratch`."""
+    def episodes(self, open_file: OpenFile = pq.ParquetFile) -> Iterator[pa.Table]:
+        """Yield the episodes' rows in order; data files are opened with `open_file`."""
         waiting: pa.Table | None = None
-        for group in self._groups(scratch):
+        for group in self._groups(open_file):
             for part in _split(group):
                 if waiting is not None and _number(waiting) == _number(part):
                     waiting = pa.concat_tables([waiting, part])
@@ -147,12 +144,12 @@ class LeRobotFiles:
         if waiting is not None:
             yield waiting
 
-    def _groups(self, scratch: Path) -> Iterator[pa.Table]:
+    def _groups(self, open_file: OpenFile) -> Iterator[pa.Table]:
         """Yield row groups with the columns of the schema, until one cannot be read."""
         for file in self.data_files():
             name = file.relative_to(self.path)
             try:
-                reader = self._open(file, scratch)
+                reader = open_file(file)
                 for number in range(reader.num_row_groups):
                     yield (
                         reader.read_row_group(number, self.schema.names)
@@ -162,42 +159,6 @@ class LeRobotFiles:
             except UNREADABLE as error:
                 self.problems.append(f"{name} cannot be read further ({line(error)}).")
                 return
-
-    def _open(self, file: Path, scratch: Path) -> pq.ParquetFile:
-        """Open a data file, or what can be salvaged of it."""
-        try:
-            return pq.ParquetFile(file)
-        except (OSError, pa.ArrowException):
-            self.problems.append(
-                f"{file.relative_to(self.path)} has no footer: its writer was killed."
-            )
-        mended = scratch / "-".join(file.relative_to(self.path).parts)
-        depth = [
-            key for key, row in self._own.items() if (row.get("info") or {}).get("is_depth_map")
-        ]
-        for writing in (LEROBOT, Writing(compression(self.schema, depth), False)):
-            if salvage(file, self.sample(), mended, writing):
-                return pq.ParquetFile(mended)
-        raise ValueError("no whole row group in it")
-
-    def sample(self) -> pa.Table:
-        """Return a table of one row in the schema."""
-        columns = {}
-        for field in self.schema:
-            shape = self.features.get(field.name, {"shape": (1,)})["shape"]
-            columns[field.name] = pa.array([_example(field.type, shape)], field.type)
-        return pa.table(columns, schema=self.schema)
-
-
-def _example(kind: Any, shape: tuple[int, ...]) -> Any:
-    """Return a value of an Arrow type, lists of the feature's length."""
-    if pa.types.is_struct(kind):
-        return {"bytes": b"x", "path": "x"}
-    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
-        return [_example(kind.value_type, shape[1:])] * shape[0]
-    if pa.types.is_string(kind):
-        return "x"
-    return pa.types.is_boolean(kind) or 0
 
 
 def _number(table: pa.Table) -> int:
@@ -212,18 +173,6 @@ def _split(table: pa.Table) -> Iterator[pa.Table]:
     starts = [0, *((numbers[1:] != numbers[:-1]).nonzero()[0] + 1).tolist(), len(table)]
     for start, stop in itertools.pairwise(starts):
         yield table.slice(start, stop - start)
-
-
-def contents(column: pa.ChunkedArray) -> list[tuple[bytes | None, str | None]]:
-    """Return the (bytes, path) of a column of images."""
-    whole = column.combine_chunks()
-    return list(
-        zip(
-            pc.struct_field(whole, "bytes").to_pylist(),
-            pc.struct_field(whole, "path").to_pylist(),
-            strict=True,
-        )
-    )
 
 
 def line(error: Exception) -> str:

@@ -1,1 +1,0 @@
-"""Validate: check a dataset, and repair a broken one."""
