@@ -130,7 +130,6 @@ def test_version(capsys):
         (["dataset", "check"], "DIR is missing; see `surgicai-vision dataset check --help`"),
         (["dataset", "check", "missing"], "missing is not a dataset"),
         (["dataset", "check", "missing", "--jsn"], "Did you mean '--json'?"),
-        (["dataset", "repair", "missing"], "missing is no LeRobot dataset"),
         (["--vresion"], "Did you mean '--version'?"),
         (["evaluate", "expert", "--episods", "5"], "Did you mean '--episodes'?"),
         (["evaluate", "--episods=5"], "Did you mean '--episodes'?"),

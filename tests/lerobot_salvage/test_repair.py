@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from fake_demos import render_with_fake_env, write_demos
+from lerobot_salvage.main import main
 from lerobot_salvage.recovery import LEROBOT, Writing, recover
 from lerobot_salvage.repair import _exchange
 
