@@ -18,7 +18,7 @@ example:
   surgicai-vision completion bash > ~/.local/share/bash-completion/completions/surgicai-vision
 
 zsh and fish:
-  surgicai-vision completion zsh > ~/.zfunc/_surgicai-vision    (with ~/.zfunc in fpath)
+  surgicai-vision completion zsh > ~/.zfunc/_cyclopts_surgicai-vision  (~/.zfunc in fpath)
   surgicai-vision completion fish > ~/.config/fish/completions/surgicai-vision.fish""",
 )
 
