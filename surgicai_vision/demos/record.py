@@ -211,7 +211,7 @@ def _disturbance_fields(disturbance: Disturbance) -> dict[str, float]:
     return {name: value for name, value in fields.items() if value != undisturbed[name]}
 
 
-def finished(out: Path, request: Mapping[str, Any]) -> bool:
+def finished(out: Path, request: Mapping[str, object]) -> bool:
     """Return True if `out` is the finished result of `request`.
 
     Raises:

@@ -13,7 +13,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.imports.rosbag import reader, segments
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
 from surgicai_vision.demos.imports.rosbag.importer import import_bags
-from surgicai_vision.demos.imports.rosbag.resample import recording_of
+from surgicai_vision.demos.imports.rosbag.resample import resample
 from surgicai_vision.demos.store import read_demo
 from surgicai_vision.scene.holes import PAIRS
 
@@ -22,7 +22,7 @@ PAIR = PAIRS["simple"][0]
 
 
 def recorded(path, config=WHOLE):
-    return recording_of(reader.read(path, config.all_topics), config, "400006")
+    return resample(reader.read(path, config.all_topics), config, "400006")
 
 
 def test_events_find_the_five_subtasks_of_a_stitch(tmp_path):

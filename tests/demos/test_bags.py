@@ -16,7 +16,7 @@ from surgicai_vision.demos.dmp.fit import fit_subtask
 from surgicai_vision.demos.imports.rosbag import reader, segments
 from surgicai_vision.demos.imports.rosbag.config import BagConfig, Frames, Topics
 from surgicai_vision.demos.imports.rosbag.importer import import_bags
-from surgicai_vision.demos.imports.rosbag.resample import recording_of
+from surgicai_vision.demos.imports.rosbag.resample import resample
 from surgicai_vision.demos.store import read_demo
 from surgicai_vision.envs import poses
 from surgicai_vision.scene import kinematics
@@ -28,7 +28,7 @@ PAIR = PAIRS["simple"][0]
 
 
 def recorded(path, config=WHOLE):
-    return recording_of(reader.read(path, config.all_topics), config, "400006")
+    return resample(reader.read(path, config.all_topics), config, "400006")
 
 
 # -- the round trip --------------------------------------------------------------------------------
@@ -215,7 +215,7 @@ def test_labels_without_stamps_agree_with_poses_that_have_them(tmp_path):
     for key in arrays:
         if key.endswith(".time"):
             arrays[key] = arrays[key] + 70_000_000
-    delayed = recording_of(arrays, WHOLE, "400006")
+    delayed = resample(arrays, WHOLE, "400006")
     assert (delayed.label == recorded(bag).label).all()
 
 
@@ -228,7 +228,7 @@ def test_messages_out_of_order_and_repeated_are_put_right(tmp_path):
         key: array[order] if array.ndim and key != "topics" else array
         for key, array in arrays.items()
     }
-    one, other = (recording_of(some, WHOLE, "400006").arms["psm2"].tip for some in (arrays, mixed))
+    one, other = (resample(some, WHOLE, "400006").arms["psm2"].tip for some in (arrays, mixed))
     np.testing.assert_array_equal(one, other)
 
 

@@ -20,10 +20,9 @@ from surgicai_vision.demos.imports.surgicai import (
     check_task,
     import_demos,
     infer_step,
-    is_wound,
-    roomy,
+    is_yaw_wrapped,
     split,
-    unwound,
+    unwrap_yaw,
 )
 from surgicai_vision.demos.store import read_demo, read_marker
 from surgicai_vision.scene import kinematics, needle
@@ -120,7 +119,7 @@ def test_actions_move_our_arm_along_the_recorded_path(tmp_path, recording):
     from surgicai_vision.envs.poses import flat, square
 
     episode = split(surgicai_pickle.read(recording))[0]
-    action, clipped = replay.actions(episode, "shipped")
+    action, clipped = replay.motion_actions(episode.motion, "shipped")
     pose = flat(replay.pose_matrix(episode.pose[0]))
     for row, wanted in zip(action, episode.pose[1:], strict=True):
         pose = moved(pose, row.astype(float).tolist(), StepSize.of("shipped"))
@@ -185,23 +184,23 @@ def test_a_step_that_is_no_preset_gets_the_smallest_larger_one():
 def test_the_yaw_goes_the_short_way():
     episode = split(as_arrays(transitions(1)))[0]
     yaw = np.linspace(3.0, 3.0 - 4.2, len(episode.pose))
-    wound = dataclasses.replace(
+    wrapped = dataclasses.replace(
         episode, pose=np.column_stack([episode.pose[:, :5], yaw, episode.pose[:, 6]])
     )
-    short = unwound(wound)
-    assert (is_wound(wound), is_wound(short)) == (True, False)
-    assert is_wound(episode) is False
+    short = unwrap_yaw(wrapped)
+    assert (is_yaw_wrapped(wrapped), is_yaw_wrapped(short)) == (True, False)
+    assert is_yaw_wrapped(episode) is False
     for row in (0, -1):
-        same, wanted = (replay.pose_matrix(some.pose[row]) for some in (short, wound))
+        same, wanted = (replay.pose_matrix(some.pose[row]) for some in (short, wrapped))
         np.testing.assert_allclose(same, wanted, atol=1e-12)
-    np.testing.assert_array_equal(short.pose[:, :5], wound.pose[:, :5])
+    np.testing.assert_array_equal(short.pose[:, :5], wrapped.pose[:, :5])
     assert np.abs(np.diff(short.pose[:, 5])).sum() == pytest.approx(2 * np.pi - 4.2)
 
 
 def test_actions_that_do_not_fit_the_inferred_step_get_a_larger_one():
     """Roll, pitch and yaw at once make a rotation vector longer than each."""
     episode = split(as_arrays(transitions(1, "paper")))[0]
-    assert roomy([episode], "paper") == "paper"
+    assert replay.fitting_step([episode.motion], "paper") == "paper"
     count = len(episode.pose)
     turning = episode.pose.copy()
     turning[:, 4] = 0.9
@@ -209,7 +208,10 @@ def test_actions_that_do_not_fit_the_inferred_step_get_a_larger_one():
         np.radians(1.5) * np.arange(count),
         -np.radians(1.5) * np.arange(count),
     )
-    assert roomy([dataclasses.replace(episode, pose=turning)], "paper") == "released"
+    assert (
+        replay.fitting_step([dataclasses.replace(episode, pose=turning).motion], "paper")
+        == "released"
+    )
 
 
 def as_arrays(rows):
@@ -396,4 +398,4 @@ def test_insertions_that_turn_the_long_way_are_imported_too(tmp_path, shared):
         shared / "surgicai/surgicai_insert_v2.npz", task="insert", out=tmp_path / "demos"
     )
     assert (len(summary.paths), summary.skipped, summary.clipped) == (50, (), 0)
-    assert summary.unwound == 25
+    assert summary.unwrapped == 25

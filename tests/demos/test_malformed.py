@@ -39,7 +39,7 @@ from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 from surgicai_vision.demos.imports import surgicai_pickle
 from surgicai_vision.demos.imports.rosbag import reader
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
-from surgicai_vision.demos.imports.rosbag.resample import recording_of
+from surgicai_vision.demos.imports.rosbag.resample import resample
 from surgicai_vision.demos.imports.rosbag.segments import segments
 from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import demo_bytes, list_demos, read_demo
@@ -507,7 +507,7 @@ def test_bags(tmp_path):
     sys.modules.pop("rosbags.usertypes", None)
 
     def read(path):
-        recording = recording_of(reader.read(path, BagConfig().all_topics), BagConfig(), "400006")
+        recording = resample(reader.read(path, BagConfig().all_topics), BagConfig(), "400006")
         segments(recording, PAIRS["simple"][0], BagConfig(), "grasp")
 
     for form in FORMATS:

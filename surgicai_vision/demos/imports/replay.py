@@ -1,15 +1,15 @@
-"""Replay recorded arm motions in our scene: kinematics, no physics.
+"""Replay: recorded arm motions posed in our scene, without physics.
 
     demo, clipped = Replay(config).demo(episode)
 
 A recording of SurgicAI holds the commanded tip pose of one arm and nothing of the needle. In every
-state the arm stands at the recorded pose, the other one at its start or, in handoff, holding the
-needle, and the needle lies where the task's definition puts it:
+state the arm is at the recorded pose, the other one at its start or, in handoff, holding the
+needle, and the needle is where the task's definition puts it:
 
 * handoff: still; its 105° point is where the goal grasps it.
 * grasp: still; its 17.5° point is where the goal grasps it. (The angle was drawn from 5°–20° and
   not recorded; the shipped set has the needle's tip on the entry, which gives 15°–20°.)
-* place, insert: rigid in the jaws as it is when they stand at the goal, that is with the tip on the
+* place, insert: rigid in the jaws as it is when they are at the goal, that is with the tip on the
   entry and perpendicular to it, or with the 100° point 2 mm beyond the exit.
 * pullout: rigid in PSM1's jaws, grasped as the handoff's goal grasps it.
 
@@ -22,17 +22,21 @@ recorder.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import STEPS, TaskConfig
 from surgicai_vision.core.errors import UnreachablePose
 from surgicai_vision.core.files import code_version
 from surgicai_vision.demos.store import Demo
+from surgicai_vision.envs.geometry import grasp_in_needle
+from surgicai_vision.envs.starts import CLOSED_JAW
+from surgicai_vision.envs.teleport import pose_scene
 from surgicai_vision.scene import kinematics, needle
 from surgicai_vision.scene.holes import PAIRS
 from surgicai_vision.scene.rotations import matrix_to_rotvec, rpy_to_matrix
@@ -49,7 +53,8 @@ MOST_CLIPPED = 0.01
 HOLD_ANGLES = np.radians([15.0, 20.0, 25.0, 30.0, 10.0, 35.0, 40.0, 5.0])
 """Points of the needle at which PSM2 may hold it during the handoff, tried in this order: SurgicAI
 draws its grasps from 10°–50° after the approach's 5°–20°."""
-RADIAL_SLACK, DEPTHS = 0.004, (0.004, 0.014)
+RADIAL_SLACK = 0.004
+DEPTHS = (0.004, 0.014)
 """A held needle's arc lies within this of the jaws' axis, and its plane within these distances of
 the tip frame [m]; place and insert recordings have 1.5 mm and 8–10 mm."""
 
@@ -72,6 +77,15 @@ class Episode:
     reward: np.ndarray
     success: np.ndarray
 
+    @property
+    def motion(self) -> "Motion":
+        """Return the poses as matrices, and the jaw."""
+        return np.stack([pose_matrix(row) for row in self.pose]), self.pose[:, 6]
+
+
+Motion = tuple[np.ndarray, np.ndarray]
+"""T_base_tip (T + 1, 4, 4) of an arm and its jaw (T + 1,) [rad]."""
+
 
 def trimmed(episode: Episode, task: str) -> Episode:
     """Return the episode without the jump that opens every pullout recording."""
@@ -91,12 +105,10 @@ def pose_matrix(seven: np.ndarray) -> np.ndarray:
 
 
 def needle_path(episode: Episode, task: str) -> np.ndarray:
-    """Return T_world_needle (T + 1, 4, 4) of a recorded episode; see the module's docstring for the
-    rules.
-    """
+    """Return T_world_needle (T + 1, 4, 4) of an episode, by the rules in the module's docstring."""
     base = kinematics.base_in_world(names.ACTIVE_ARM[task])
     goal = base @ pose_matrix(episode.goal)
-    tips = base @ np.stack([pose_matrix(row) for row in episode.pose])
+    tips = base @ episode.motion[0]
     if task in ("grasp", "handoff"):
         return np.broadcast_to(goal @ np.linalg.inv(_grasp(task)), tips.shape)
     if task == "pullout":
@@ -112,16 +124,15 @@ def _grasp(task: str) -> np.ndarray:
     """
     angle, sign = (GRASP_ANGLE, 1.0) if task == "grasp" else (HANDOFF_ANGLE, -1.0)
     pose = np.eye(4)
-    y, z = sign * needle.radial(angle), np.array([0.0, 0.0, -1.0])
+    y = sign * needle.radial(angle)
+    z = np.array([0.0, 0.0, -1.0])
     pose[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
     pose[:3, 3] = needle.point(angle) - LIFT * z
     return pose
 
 
 def _needle_at_goal(task: str) -> np.ndarray:
-    """Return T_world_needle (4, 4) when place or insert is done, at the first pair of holes of
-    layout "simple".
-    """
+    """Return T_world_needle (4, 4) at the goal of place or insert, at hole pair 1 of `simple`."""
     pair = PAIRS["simple"][0]
     # Columns: radial, tangent and normal of the needle's point, in the hole's frame.
     if task == "place":
@@ -131,18 +142,14 @@ def _needle_at_goal(task: str) -> np.ndarray:
         hole, angle = pair.exit.pose, INSERT_ANGLE
         target = np.array([[-1.0, 0, 0, INSERT_DEPTH], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     point = np.eye(4)
-    point[:3, 0], point[:3, 1], point[:3, 3] = (
-        -needle.radial(angle),
-        needle.tangent(angle),
-        needle.point(angle),
-    )
+    point[:3, 0] = -needle.radial(angle)
+    point[:3, 1] = needle.tangent(angle)
+    point[:3, 3] = needle.point(angle)
     return hole @ target @ np.linalg.inv(point)
 
 
 def grip_error(episode: Episode, task: str) -> float:
-    """Return how far the needle would lie outside the jaws that hold it [m]; 0 where it is inside
-    or not held.
-    """
+    """Return how far the needle would be outside the jaws that should hold it [m], at least 0."""
     if task not in ("place", "insert"):
         return 0.0
     base = kinematics.base_in_world(names.ACTIVE_ARM[task])
@@ -153,21 +160,14 @@ def grip_error(episode: Episode, task: str) -> float:
     return float(max(radial, DEPTHS[0] - z, z - DEPTHS[1], 0.0))
 
 
-def actions(episode: Episode, step: str) -> tuple[np.ndarray, int]:
-    """Return the motion as actions of our envs, (T, 7) float32, and how many had to be clipped to
-    [-1, 1].
-    """
-    return moves(np.stack([pose_matrix(row) for row in episode.pose]), episode.pose[:, 6], step)
-
-
-def moves(tip: np.ndarray, jaw: np.ndarray, step: str) -> tuple[np.ndarray, int]:
-    """Return a motion as actions, (T, 7) float32, and how many had to be clipped to [-1, 1].
+def motion_actions(motion: Motion, step: str) -> tuple[np.ndarray, int]:
+    """Return a motion as actions of our envs, (T, 7) float32, and how many had to be clipped.
 
     Args:
-        tip: T_base_tip (T + 1, 4, 4).
-        jaw: (T + 1,) [rad].
+        motion: of one arm.
         step: a key of `STEPS`.
     """
+    tip, jaw = motion
     metres, degrees, opening = STEPS[step]
     turns = [
         matrix_to_rotvec(after[:3, :3] @ before[:3, :3].T)
@@ -181,18 +181,34 @@ def moves(tip: np.ndarray, jaw: np.ndarray, step: str) -> tuple[np.ndarray, int]
     return inside.astype(np.float32), int((np.abs(values - inside) > 1e-4).any(axis=1).sum())
 
 
+def fitting_step(motions: Sequence[Motion], smallest: str = next(iter(STEPS))) -> str:
+    """Return the smallest step preset that nearly all steps fit into, or the best one.
+
+    Args:
+        motions: of one arm in several episodes.
+        smallest: the preset from which on they are tried.
+    """
+    steps = sum(len(jaw) - 1 for _, jaw in motions)
+    sizes = list(STEPS)[list(STEPS).index(smallest) :]
+    clipped = {size: sum(motion_actions(motion, size)[1] for motion in motions) for size in sizes}
+    for size in sizes:
+        if clipped[size] <= MOST_CLIPPED * steps:
+            return size
+    return min(sizes, key=lambda size: clipped[size])
+
+
 @dataclass(frozen=True)
 class Track:
     """Where everything is in each of T + 1 states.
 
     Attributes:
-        arms: arm → T_base_tip (T + 1, 4, 4) and jaw (T + 1,) [rad]; others stand at their start.
+        arms: arm → its motion; other arms are at their start.
         needle: T_world_needle (T + 1, 4, 4).
         grasp_angle: the needle's point that is grasped [rad], where the task has one.
         passed: `Memory.passed` in each state, (T + 1,), or None: as the task's start has it.
     """
 
-    arms: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    arms: Mapping[str, Motion]
     needle: np.ndarray
     grasp_angle: float
     passed: np.ndarray | None = None
@@ -202,10 +218,8 @@ class Replay:
     """Replays episodes of one task."""
 
     def __init__(self, config: TaskConfig):
-        import surgicai_vision.envs as envs
-
         self.config = config
-        self._env: Any = envs.make(config)
+        self._env = envs.make(config)
 
     def demo(self, episode: Episode) -> tuple[Demo, int]:
         """Return the episode as a demonstration, and how many actions were clipped.
@@ -214,14 +228,13 @@ class Replay:
             UnreachablePose: a pose outside the arms' joint limits.
         """
         task = self.config.task
-        tips = np.stack([pose_matrix(row) for row in episode.pose])
         track = Track(
-            {names.ACTIVE_ARM[task]: (tips, episode.pose[:, 6])},
+            {names.ACTIVE_ARM[task]: episode.motion},
             needle_path(episode, task),
             GRASP_ANGLE if task == "grasp" else 0.0,
         )
         states, infos = self.play(track)
-        action, clipped = actions(episode, self.config.step)
+        action, clipped = motion_actions(episode.motion, self.config.step)
         demo = self.as_demo(
             "surgicai",
             states,
@@ -233,13 +246,11 @@ class Replay:
         return demo, clipped
 
     def play(self, track: Track) -> tuple[np.ndarray, list[dict[str, Any]]]:
-        """Pose the scene state by state; return the states (T + 1, n) and what is measured in each.
+        """Pose the scene state by state; return the states (T + 1, n) and each one's info.
 
         Raises:
             UnreachablePose: a pose outside the arms' joint limits.
         """
-        from surgicai_vision.envs.teleport import pose_scene
-
         env = self._env
         env.reset(seed=0)
         arms = dict(track.arms)
@@ -262,24 +273,24 @@ class Replay:
         return np.stack(states), infos
 
     def reward(self, success: bool, info: Mapping[str, Any]) -> float:
-        """Return the env's reward of a state that is judged a success or none."""
+        """Return the env's reward of a state, given whether it counts as a success."""
         return self._env.reward({**info, "is_success": success})
 
     def as_demo(self, demonstrator: str, states: np.ndarray, **columns: np.ndarray) -> Demo:
-        """Return states and the columns `action`, `reward`, `success`, `contact` as a
-        demonstration.
-        """
-        phase = np.full(len(states) - 1, names.SUBTASKS.index(self.config.task), np.int8)
-        scene = self._env.scene.hash
+        """Return states and the columns action, reward, success and contact as a demonstration."""
         return Demo(
-            self.config, -1, demonstrator, scene, code_version(), states, phase=phase, **columns
+            config=self.config,
+            seed=-1,
+            demonstrator=demonstrator,
+            scene_hash=self._env.scene.hash,
+            code_version=code_version(),
+            state=states,
+            phase=np.full(len(states) - 1, names.SUBTASKS.index(self.config.task), np.int8),
+            **columns,
         )
 
     def _hold(self, needle_pose: np.ndarray) -> tuple[np.ndarray, float]:
         """Return PSM2's pose (T_base_tip, jaw) that holds the needle near its base."""
-        from surgicai_vision.envs.geometry import grasp_in_needle
-        from surgicai_vision.envs.starts import CLOSED_JAW
-
         base = np.linalg.inv(kinematics.base_in_world(names.PSM2))
         for angle in HOLD_ANGLES:
             tip = base @ needle_pose @ grasp_in_needle(names.PSM2, float(angle))

@@ -1,4 +1,4 @@
-"""Open a pickle without trusting it: numpy arrays, dtypes and plain containers, nothing else.
+"""Safe pickles: numpy arrays, dtypes and plain containers, nothing else.
 
     tree = unpickle(content, "demos.pkl")     # dict, list, tuple, str, bytes, numbers, numpy arrays
 
@@ -6,7 +6,7 @@ A pickle is a program. Here it is read twice: first its instructions are listed 
 and a global outside `ADMITTED`, an instruction that could make other objects, or a memo made to eat
 memory is refused by name; then it is run by an unpickler whose globals are not numpy's functions
 but the small stand-ins below, which check every argument and build arrays from bytes themselves.
-Numpy's own state setters never see foreign data, and object arrays (arrays of further pickled
+Numpy's own state setters never see untrusted data, and object arrays (arrays of further pickled
 objects) are refused.
 
 Every refusal is a `BadFile` of one line.
@@ -79,9 +79,7 @@ persistent objects are not among them."""
 
 
 class _Ndarray:
-    """Stands for the class numpy.ndarray, which a pickle names only to hand it to
-    `_reconstruct`.
-    """
+    """Stands for the class numpy.ndarray, which a pickle passes to `_reconstruct`."""
 
     __slots__ = ()
 
@@ -207,7 +205,8 @@ def unpickle(content: bytes, where: str) -> Any:
         raise BadFile(f"{where} is empty.")
     if len(content) > MAX_BYTES:
         raise BadFile(
-            f"{where} has {len(content) / 2**20:.0f} MB; pickles above {MAX_BYTES >> 20} MB are not read."
+            f"{where} has {len(content) / 2**20:.0f} MB; "
+            f"pickles above {MAX_BYTES >> 20} MB are not read."
         )
     try:
         _inspect(content)

@@ -1,13 +1,13 @@
-"""Read foreign recordings at arm's length: in a process of its own, with limits, without a network.
+"""Sandbox: reads untrusted recordings in a process of its own, with limits, without a network.
 
     arrays = read_sandboxed(Path("regrasp_all_episodes_merged.pkl"))
     arrays = read_sandboxed(Path("trial.bag"), "bag", topics={"psm2_pose": "/PSM2/measured_cp"})
 
 The child sets its limits before it opens the file: memory, processor time, size of what it writes,
-and, where the kernel lets it, a network namespace of its own with nothing in it; an audit hook that
-cannot be removed then ends every attempt to start a process, to open a socket, to change or to
-write any file (its one result is open by then). It hands back plain arrays (npz without pickles).
-Whatever goes wrong in it is a `BadFile`, or the `InputError` of its reader.
+and, where the kernel allows it, an empty network namespace of its own. An audit hook that cannot be
+removed then ends every attempt to start a process, to open a socket, or to write any file (its one
+result is open by then). It returns plain arrays (npz without pickles). Whatever fails in it is a
+`BadFile`, or the `InputError` of its reader.
 """
 
 import contextlib
@@ -21,10 +21,10 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
+from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
 from surgicai_vision.core.processes import ONE_THREAD, run_module
 
@@ -36,8 +36,12 @@ READERS: Mapping[str, str] = MappingProxyType(
 )
 """Kind of file → the module whose `read(path, …)` returns its arrays."""
 
-MEMORY, PROCESSOR_SECONDS, WALL_SECONDS, WRITTEN = 2 * 2**30, 60, 120, 2**30
-"""Limits of the child: bytes of address space, seconds, bytes of one file."""
+MEMORY = 2 * 2**30
+"""Limit of the child's address space [byte]."""
+PROCESSOR_SECONDS = 60
+WALL_SECONDS = 120
+MAX_WRITTEN = 2**30
+"""Limit of the child's one file [byte]."""
 
 REFUSED = (
     "socket.",
@@ -64,17 +68,17 @@ REFUSED = (
 """Audit events (by their beginning) that end the child."""
 
 
-def read_sandboxed(path: Path, kind: str = "surgicai", **options: Any) -> dict[str, np.ndarray]:
+def read_sandboxed(path: Path, kind: str = "surgicai", **options: JSON) -> dict[str, np.ndarray]:
     """Read a recording in a limited child process.
 
     Args:
         path: the file, or a bag's folder.
         kind: a key of `READERS`; see its `read` for what comes back.
-        options: further arguments of it, plain data.
+        options: further arguments of its `read`.
 
     Raises:
         BadFile: what the reader refuses, and what exceeds the limits.
-        InputError: what the reader says the caller asked wrongly for.
+        InputError: arguments that do not match the recording.
     """
     if not path.is_file() and not (path.is_dir() and kind == "bag"):
         raise BadFile(
@@ -95,8 +99,8 @@ def read_sandboxed(path: Path, kind: str = "surgicai", **options: Any) -> dict[s
         except subprocess.TimeoutExpired:
             raise BadFile(f"{path} was not read within {WALL_SECONDS} s.") from None
         if child.returncode == InputError.exit_code:
-            told = json.loads(child.stderr.splitlines()[-1])
-            raise (BadFile if told["bad"] else InputError)(told["line"])
+            error = json.loads(child.stderr.splitlines()[-1])
+            raise (BadFile if error["is_bad_file"] else InputError)(error["message"])
         if child.returncode:
             raise BadFile(
                 f"{path} could not be read within the limits ({MEMORY >> 30} GB of memory, "
@@ -112,17 +116,17 @@ def _search_path() -> str:
 
 
 def _limit() -> None:
-    """Take from this process what reading a file does not need."""
+    """Take from this process the rights that reading a file does not need."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (PROCESSOR_SECONDS, PROCESSOR_SECONDS))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (WRITTEN, WRITTEN))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_WRITTEN, MAX_WRITTEN))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     for namespaces in (os.CLONE_NEWNET, os.CLONE_NEWUSER | os.CLONE_NEWNET):
         with contextlib.suppress(OSError):  # not every kernel and container lets us
             os.unshare(namespaces)
             break
 
-    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+    def hook(event: str, arguments: tuple[object, ...]) -> None:
         flags = arguments[2] if event == "open" else None
         writes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
         if writes or event.startswith(REFUSED):
@@ -139,9 +143,8 @@ def main(path: str, result: str, kind: str, options: str) -> int:
         try:
             arrays = read(Path(path), **json.loads(options))
         except SurgicaiError as error:
-            print(
-                json.dumps({"bad": isinstance(error, BadFile), "line": str(error)}), file=sys.stderr
-            )
+            report = {"is_bad_file": isinstance(error, BadFile), "message": str(error)}
+            print(json.dumps(report), file=sys.stderr)
             return InputError.exit_code
         np.savez(file, **arrays)
     return 0

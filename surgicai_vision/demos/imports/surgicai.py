@@ -1,36 +1,33 @@
-"""Import SurgicAI's recordings: its arm motions, replayed state by state in our scene.
+"""Import of SurgicAI's recordings: its arm motions, replayed state by state in our scene.
 
-    summary = import_demos(Path("regrasp_all_episodes_merged.pkl"), task="handoff",
-    out=Path("demos"))
+    summary = import_demos(Path("pickup.pkl"), task="handoff", out=Path("demos"))
 
-Read (`foreign`), cut into episodes, check that the motion can be the task's, infer the step preset,
-replay (`replay`), write. Half of the released insertions, and a few placements, turn the long way
-round, because the released code compares yaw angles without unwrapping them; our arm's roll joint
-cannot follow, so they are `unwound`: the same path, with the yaw going the short way at the same
-times. The recorded rotation increments are roll, pitch and yaw; ours are rotation vectors in the
-base's axes, so actions are recomputed from the poses and the recorded ones only tell the step size.
-Where more than one in a hundred would not fit into it, the next larger preset is taken.
+A recording is read (`sandbox`), split into episodes, checked against the task, replayed (`replay`)
+and written. Half of the released insertions, and a few placements, turn the long way round, because
+the released code compares yaw angles without unwrapping them; our arm's roll joint cannot follow,
+so their yaw is unwrapped: the same path, with the yaw going the short way at the same times. The
+recorded rotation increments are roll, pitch and yaw; ours are rotation vectors in the base's axes,
+so actions are recomputed from the poses and the recorded ones only determine the step preset. Where
+more than one in a hundred would not fit into it, the next larger preset is taken.
 """
 
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import STEPS, TaskConfig
+from surgicai_vision.core.config import JSON, STEPS, TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnreachablePose, check_name
 from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output, code_version, sha256_file, whole_folder
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.demos.imports.replay import (
-    MOST_CLIPPED,
     Episode,
     Replay,
-    actions,
+    fitting_step,
     grip_error,
     trimmed,
 )
@@ -39,13 +36,10 @@ from surgicai_vision.demos.record import finished
 from surgicai_vision.demos.store import MARKER, list_demos, read_marker, write_demo, write_marker
 
 OPEN_JAW = 0.4
-"""A jaw wider than this [rad] after the first step belongs to a grasp; the recordings have 0.8 or
-0.
-"""
+"""A jaw wider than this after the first step belongs to a grasp; the recordings have 0.8 or 0
+[rad]."""
 AGREEMENT = 0.02
-"""A step agrees with a preset when it is within this of action × step size, in units of the step
-size.
-"""
+"""A step agrees with a preset when it differs from action × step size by less, in step sizes."""
 STEP_LIMIT = 200
 """Episode limit of the image evaluation (facts of SurgicAI); longer recordings raise it."""
 
@@ -61,7 +55,7 @@ class ImportSummary:
         disagreeing: steps that differ from action × step size by more than `AGREEMENT`.
         clipped: steps whose action left [-1, 1] on conversion and was clipped.
         skipped: episodes that could not be replayed, {"episode", "reason"}.
-        unwound: episodes whose yaw was sent the short way.
+        unwrapped: episodes whose yaw turned the long way round and was unwrapped.
     """
 
     paths: tuple[Path, ...]
@@ -69,8 +63,8 @@ class ImportSummary:
     steps: int
     disagreeing: int
     clipped: int
-    skipped: tuple[Mapping[str, Any], ...]
-    unwound: int = 0
+    skipped: tuple[Mapping[str, JSON], ...]
+    unwrapped: int = 0
 
 
 def import_demos(
@@ -99,19 +93,20 @@ def import_demos(
         check_task(episodes, task)
         episodes = [trimmed(episode, task) for episode in episodes]
         step, disagreeing = infer_step(episodes)
-        wound = sum(is_wound(episode) for episode in episodes)
-        episodes = [unwound(episode) for episode in episodes]
-        step = roomy(episodes, step)
+        wrapped = sum(is_yaw_wrapped(episode) for episode in episodes)
+        episodes = [unwrap_yaw(episode) for episode in episodes]
+        step = fitting_step([episode.motion for episode in episodes], step)
         limit = max(STEP_LIMIT, *(len(episode.action) for episode in episodes))
         config = TaskConfig(task, step=step, tolerance="released", reward="dense", max_steps=limit)
         with building(out) as (_, result), whole_folder(result) as folder:
-            notes, skipped = _write(folder, episodes, config, progress or silent)
-            notes.update(
-                step=step,
-                steps=sum(len(e.action) for e in episodes),
-                disagreeing=disagreeing,
-                unwound=wound,
-            )
+            clipped, skipped = _write(folder, episodes, config, progress or silent)
+            notes = {
+                "clipped": clipped,
+                "step": step,
+                "steps": sum(len(episode.action) for episode in episodes),
+                "disagreeing": disagreeing,
+                "unwrapped": wrapped,
+            }
             kept = len(episodes) - len(skipped)
             details = {"request": request, "skipped": skipped, "episodes": kept, "notes": notes}
             write_marker(folder, task, "surgicai", code=code_version(), **details)
@@ -123,27 +118,29 @@ def import_demos(
 
 def _write(
     folder: Path, episodes: list[Episode], config: TaskConfig, progress: Progress
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Replay and write the episodes; return notes and the skipped ones."""
+) -> tuple[int, list[dict[str, JSON]]]:
+    """Replay and write the episodes; return the number of clipped actions and what was skipped."""
     replay = Replay(config)
-    skipped: list[dict[str, Any]] = []
-    clipped = count = 0
+    skipped: list[dict[str, JSON]] = []
+    clipped = 0
+    count = 0
     for index, episode in enumerate(episodes):
         try:
-            demo, beyond = replay.demo(episode)
+            demo, clipped_here = replay.demo(episode)
         except UnreachablePose as error:
             skipped.append({"episode": index, "reason": str(error)})
         else:
             write_demo(folder, count, demo)
-            count, clipped = count + 1, clipped + beyond
+            count += 1
+            clipped += clipped_here
         progress(index + 1, len(episodes), "episodes")
     if not count:
         raise InputError(f"No episode can be replayed in our scene: {skipped[0]['reason']}")
-    return {"clipped": clipped}, skipped
+    return clipped, skipped
 
 
 def split(arrays: Mapping[str, np.ndarray]) -> list[Episode]:
-    """Cut transitions into episodes at `done`; metres instead of centimetres.
+    """Split transitions into episodes at `done`, with metres in place of centimetres.
 
     Raises:
         BadFile: the last episode is not done, or a transition does not continue the one before.
@@ -154,13 +151,15 @@ def split(arrays: Mapping[str, np.ndarray]) -> list[Episode]:
             "The recording does not end with a transition that is done; it seems cut off."
         )
     metres = np.array([0.01, 0.01, 0.01, 1.0, 1.0, 1.0, 1.0])
-    episodes, start = [], 0
+    episodes = []
+    start = 0
     for number, end in enumerate(ends):
         rows = slice(start, end + 1)
         before, after = arrays["observation"][rows], arrays["next_observation"][rows]
         if not np.allclose(after[:-1, :7], before[1:, :7], atol=1e-4):
             raise BadFile(
-                f"The recording jumps inside episode {number}: a next observation is not the next one."
+                f"The recording jumps inside episode {number}: "
+                "a next observation is not the next one."
             )
         if not np.allclose(before[:, 7:14] - before[:, :7], before[:, 14:], atol=1e-3):
             raise BadFile(
@@ -178,8 +177,9 @@ def split(arrays: Mapping[str, np.ndarray]) -> list[Episode]:
 
 
 def check_task(episodes: list[Episode], task: str) -> None:
-    """Refuse a task that the motion contradicts: another arm, open jaws on a held needle, a needle
-    beside them.
+    """Refuse a task that the motion contradicts.
+
+    The contradictions are another arm, open jaws on a held needle, and a needle beside the jaws.
 
     Raises:
         InputError: the contradiction, and the tasks that would fit.
@@ -201,33 +201,21 @@ def check_task(episodes: list[Episode], task: str) -> None:
         )
     errors = [grip_error(trimmed(episode, task), task) for episode in episodes]
     if np.median(errors) > 0.0:
+        others = " or ".join(name for name in fits if name != task) or "no task"
         raise InputError(
-            f"The recording is no {task}: with its goal the needle would lie {np.median(errors) * 1e3:.0f} mm outside "
-            f"the jaws; that fits {' or '.join(name for name in fits if name != task) or 'no task'}."
+            f"The recording is no {task}: with its goal the needle would lie "
+            f"{np.median(errors) * 1e3:.0f} mm outside the jaws; that fits {others}."
         )
 
 
-def roomy(episodes: list[Episode], step: str) -> str:
-    """Return the smallest preset from `step` on that nearly all actions fit into, or the one that
-    most fit into.
-    """
-    total = sum(len(episode.action) for episode in episodes)
-    sizes = list(STEPS)[list(STEPS).index(step) :]
-    clipped = {size: sum(actions(episode, size)[1] for episode in episodes) for size in sizes}
-    return next(
-        (size for size in sizes if clipped[size] <= MOST_CLIPPED * total),
-        min(sizes, key=lambda s: clipped[s]),
-    )
-
-
-def is_wound(episode: Episode) -> bool:
-    """Say whether an episode turns further than half a turn in yaw."""
+def is_yaw_wrapped(episode: Episode) -> bool:
+    """Return True if an episode turns further than half a turn in yaw."""
     return bool(abs(episode.pose[-1, 5] - episode.pose[0, 5]) > np.pi)
 
 
-def unwound(episode: Episode) -> Episode:
+def unwrap_yaw(episode: Episode) -> Episode:
     """Return an episode whose yaw ends where it ended, but goes there the short way."""
-    if not is_wound(episode):
+    if not is_yaw_wrapped(episode):
         return episode
     travel = episode.pose[-1, 5] - episode.pose[0, 5]
     short = travel - 2 * np.pi * np.round(travel / (2 * np.pi))
@@ -237,7 +225,7 @@ def unwound(episode: Episode) -> Episode:
 
 
 def infer_step(episodes: list[Episode]) -> tuple[str, int]:
-    """Return the step preset that explains the motion best, and the steps it does not explain.
+    """Return the step preset that explains the motion best, and how many steps it does not.
 
     The first release's insertions have a step of 0.25 mm, which is no preset of ours: a motion that
     any other constant step explains gets the smallest preset that is as large.
@@ -246,43 +234,38 @@ def infer_step(episodes: list[Episode]) -> tuple[str, int]:
         InputError: no constant step explains the motion.
     """
     moves = np.concatenate([np.diff(episode.pose, axis=0) for episode in episodes])
-    told = np.concatenate([episode.action for episode in episodes])
+    recorded = np.concatenate([episode.action for episode in episodes])
     sizes = {
         name: np.array([metres] * 3 + [np.radians(degrees)] * 3 + [jaw])
         for name, (metres, degrees, jaw) in STEPS.items()
     }
-    wrong = {name: _unexplained(moves, told, size) for name, size in sizes.items()}
+    wrong = {name: _unexplained(moves, recorded, size) for name, size in sizes.items()}
     best = min(wrong, key=lambda name: wrong[name])
-    if wrong[best] <= len(told) // 2:
+    if wrong[best] <= len(recorded) // 2:
         return best, wrong[best]
-    own = _fitted(moves, told)
-    disagreeing = _unexplained(moves, told, own)
+    own = _fitted(moves, recorded)
+    disagreeing = _unexplained(moves, recorded, own)
     larger = [
         name for name, size in sizes.items() if (own[:6] <= size[:6] * (1.0 + AGREEMENT)).all()
     ]
-    if disagreeing > len(told) // 2 or not larger:
+    if disagreeing > len(recorded) // 2 or not larger:
         raise InputError(
-            f"No step size explains the motion: {wrong[best]} of {len(told)} steps differ from action × step "
-            f"even for '{best}'; is this a recording of SurgicAI?"
+            f"No step size explains the motion: {wrong[best]} of {len(recorded)} steps differ from "
+            f"action × step even for '{best}'; is this a recording of SurgicAI?"
         )
     return larger[0], disagreeing
 
 
 def _unexplained(moves: np.ndarray, actions: np.ndarray, size: np.ndarray) -> int:
-    """Return how many moves (N, 7) are not action × size (7,)."""
+    """Return how many moves (N, 7) differ from actions (N, 7) × size (7,)."""
     return int((np.abs(moves / size - actions) > AGREEMENT).any(axis=1).sum())
 
 
 def _fitted(moves: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Return the step size (7,) of a motion: the median of move over action, for translation and
-    for rotation.
-    """
+    """Return a motion's step size (7,), the median of move over action, also for rotation."""
     size = np.full(7, STEPS["paper"][2])
-    for part in (slice(0, 3), slice(3, 6)):
-        told = np.abs(actions[:, part]) > AGREEMENT
-        size[part] = (
-            np.median((moves[:, part] / np.where(told, actions[:, part], 1.0))[told])
-            if told.any()
-            else np.inf
-        )
+    for axes in (slice(0, 3), slice(3, 6)):
+        moved = np.abs(actions[:, axes]) > AGREEMENT
+        ratios = moves[:, axes] / np.where(moved, actions[:, axes], 1.0)
+        size[axes] = np.median(ratios[moved]) if moved.any() else np.inf
     return np.maximum(size, 1e-9)

@@ -1,4 +1,4 @@
-"""SurgicAI's recordings as arrays: what its pickles hold, before anything is believed about it.
+"""SurgicAI's recordings as arrays: what its pickles hold, before it is checked for sense.
 
 The layout (read from the released files; the observation's from the released code): a list of
 transitions, each {"obs": {"observation": (21,), …}, "next_obs": likewise, "action": (7,), "reward":
@@ -9,11 +9,11 @@ read too.
 
 `read(path)` returns {"observation": (N, 21), "next_observation": (N, 21), "action": (N, 7),
 "reward": (N,), "done": (N,), "success": (N,)}, float64, or raises `BadFile`. It imports nothing but
-numpy and runs where `foreign` puts it.
+numpy and runs in the process of `sandbox`.
 """
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,30 +45,32 @@ def read(path: Path) -> dict[str, np.ndarray]:
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise BadFile(
-                f"{path} has {size / 2**20:.0f} MB; recordings above {MAX_BYTES >> 20} MB are not read."
+                f"{path} has {size / 2**20:.0f} MB; "
+                f"recordings above {MAX_BYTES >> 20} MB are not read."
             )
         content = path.read_bytes()
     except OSError as error:
         raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
-    rows = (
-        _npz(path)
-        if content[:4] == b"PK\x03\x04"
-        else _transitions(unpickle(content, str(path)), path)
-    )
+    rows: Mapping[str, Sequence[np.ndarray] | np.ndarray]
+    if content[:4] == b"PK\x03\x04":
+        rows = _npz(path)
+    else:
+        rows = _transitions(unpickle(content, str(path)), path)
     arrays = {}
     for name, width in FIELDS.items():
         array = np.asarray(rows[name], dtype=np.float64)
         arrays[name] = array.reshape(len(array), -1)
         if arrays[name].shape != (len(rows["action"]), width):
             raise BadFile(
-                f"{path}: {name} has shape {array.shape}; expected {len(rows['action'])} rows of {width}."
+                f"{path}: {name} has shape {array.shape}; "
+                f"expected {len(rows['action'])} rows of {width}."
             )
         if not np.isfinite(array).all():
             raise BadFile(f"{path}: {name} holds numbers that are not finite.")
     return {name: array[:, 0] if FIELDS[name] == 1 else array for name, array in arrays.items()}
 
 
-def _transitions(tree: Any, path: Path) -> dict[str, list[np.ndarray]]:
+def _transitions(tree: object, path: Path) -> dict[str, list[np.ndarray]]:
     """Return the rows of a list of transitions."""
     if not isinstance(tree, (list, tuple)) or not tree:
         raise BadFile(f"{path} holds {_kind(tree)}; expected a list of transitions.")
@@ -118,28 +120,25 @@ def _npz(path: Path) -> dict[str, np.ndarray]:
         missing = sorted(set(names.values()) - set(sizes))
         if missing:
             raise BadFile(
-                f"{path} has no array {', '.join(missing)}; it has {', '.join(sorted(sizes))[:200]}."
+                f"{path} has no array {', '.join(missing)}; "
+                f"it has {', '.join(sorted(sizes))[:200]}."
             )
         if any(sizes[name] > MAX_BYTES for name in names.values()):
             raise BadFile(f"{path}: an array unpacks to more than {MAX_BYTES >> 20} MB.")
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: np.asarray(archive[stored]) for name, stored in names.items()}
-        strange = [name for name, array in arrays.items() if array.dtype.kind not in "biuf"]
-        if strange:
-            raise BadFile(
-                f"{path}: {strange[0]} is of type {arrays[strange[0]].dtype}, no plain numbers."
-            )
+        for name, array in arrays.items():
+            if array.dtype.kind not in "biuf":
+                raise BadFile(f"{path}: {name} is of type {array.dtype}, no plain numbers.")
         return {name: np.asarray(array, np.float64) for name, array in arrays.items()}
     except BadFile:
         raise
-    except (
-        Exception
-    ) as error:  # a damaged archive can fail in any way, and ask for any amount of memory
+    except Exception as error:  # a damaged archive can fail in any way
         line = (str(error).splitlines() or [""])[0][:120]
         raise BadFile(f"{path} is not a readable npz ({type(error).__name__}: {line}).") from None
 
 
-def _kind(value: Any) -> str:
-    """Return what a value is, in two words."""
+def _kind(value: object) -> str:
+    """Return a value's type in two words."""
     empty = isinstance(value, (list, tuple, dict)) and not value
     return f"{'an empty' if empty else 'a'} {type(value).__name__}"

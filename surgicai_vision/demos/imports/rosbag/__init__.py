@@ -1,1 +1,1 @@
-"""ROS bags: read without ROS, resampled, segmented and replayed in this scene."""
+"""Import of bags of ROS 1 and ROS 2."""

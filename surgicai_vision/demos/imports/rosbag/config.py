@@ -1,8 +1,8 @@
-"""BagConfig: how a bag is read. Where the poses are, in which frames and units, and how it becomes
-episodes.
+"""BagConfig: how a bag is read.
 
-Two conventions set what is not given. Sources: `dvrk` is the da Vinci Research Kit's CRTK
-interface; its needle drivers' tip frame lies on the wrist's yaw axis and is turned like ours
+It says where the poses are, in which frames and units, and how a recording becomes episodes. Two
+conventions set what is not given. Sources: `dvrk` is the da Vinci Research Kit's CRTK
+interface; its needle drivers' tip frame is on the wrist's yaw axis and oriented like ours
 (`tooltip-offset` of its tool files 400006 and 420006), and its jaw is the angle between the
 fingers, twice ours. `ambf` is the CRTK interface of the surgical robotics challenge: the same tip,
 one finger's angle as the jaw, of which only the command is published.
@@ -43,39 +43,35 @@ LABELS: Mapping[str, str] = MappingProxyType(
 """Label, in lower case → subtask. Besides our names and indices those of SurgicAI."""
 
 
-def clean(text: object, longest: int = 80) -> str:
-    """Return what a bag says as something that can be shown: one line, printable, of limited
-    length.
-    """
-    whole = "".join(letter if letter.isprintable() else "?" for letter in str(text)[: longest + 1])
-    return whole if len(whole) <= longest else f"{whole[: longest - 1]}…"
+def printable(text: object, max_length: int = 80) -> str:
+    """Return text from a bag as one printable line of limited length."""
+    shown = "".join(char if char.isprintable() else "?" for char in str(text)[: max_length + 1])
+    return shown if len(shown) <= max_length else f"{shown[: max_length - 1]}…"
 
 
-def listed(topics: Collection[str], wanted: str) -> str:
-    """Return topics as one line, those like the wanted one first, as many as can be read."""
+def topic_list(topics: Collection[str], wanted: str, max_length: int = 450) -> str:
+    """Return topics as one line of limited length, those like the wanted one first."""
     shown: list[str] = []
-    room = 450
+    length = 0
 
-    def unlike(topic: str) -> tuple[float, str]:
+    def difference(topic: str) -> tuple[float, str]:
         return -difflib.SequenceMatcher(None, wanted, topic.split(" ")[0]).ratio(), topic
 
-    for topic in sorted(topics, key=unlike):
-        room -= len(topic) + 2
-        if room < 0:
+    for topic in sorted(topics, key=difference):
+        length += len(topic) + 2
+        if length > max_length:
             return f"{', '.join(shown)} and {len(topics) - len(shown)} more"
         shown.append(topic)
     return ", ".join(shown) or "none at all"
 
 
 def is_bag(path: Path) -> bool:
-    """Say whether a path names a bag, by its ending or, for a folder, by its `metadata.yaml`."""
+    """Return True for a path with a bag's ending, or a folder with a `metadata.yaml`."""
     return (path / METADATA).is_file() if path.is_dir() else path.suffix in ENDINGS
 
 
 def bags_in(path: Path) -> list[Path]:
-    """Return the bag at `path`, or the bags in the folder `path`, by name; none where there are
-    none.
-    """
+    """Return the bag at `path`, or the bags in the folder `path` by name."""
     if is_bag(path) or not path.is_dir():
         return [path] if is_bag(path) else []
     return sorted(child for child in path.iterdir() if is_bag(child))
@@ -106,7 +102,8 @@ class Topics:
         for role, topic in self.given().items():
             if not topic.startswith("/") or not topic.strip("/"):
                 raise InputError(
-                    f"topic of {role} is '{topic}'; a topic begins with '/', like /PSM1/measured_cp."
+                    f"topic of {role} is '{topic}'; "
+                    "a topic begins with '/', like /PSM1/measured_cp."
                 )
 
     def given(self) -> dict[str, str]:
@@ -118,8 +115,11 @@ class Topics:
 
 @dataclass(frozen=True)
 class Convention:
-    """What one kind of system publishes: its topics, and the jaw's angle as a multiple of one
-    finger's.
+    """What one kind of system publishes.
+
+    Attributes:
+        topics: role → topic.
+        jaw_scale: one finger's angle over the recorded jaw angle.
     """
 
     topics: Mapping[str, str]
@@ -127,7 +127,7 @@ class Convention:
 
 
 def _topics(arm: str, jaw: str, needle: str) -> Mapping[str, str]:
-    """Return a convention's topics; `arm` spells the arms' prefix with a digit to come."""
+    """Return a convention's topics; `arm` is the arms' prefix without its digit."""
     kinds = {"pose": "measured_cp", "joints": "measured_js", "jaw": jaw}
     arms = {f"psm{n}_{role}": f"{arm}{n}/{name}" for n in (1, 2) for role, name in kinds.items()}
     return MappingProxyType({**arms, "needle": needle, "label": "/subtask"})
@@ -143,8 +143,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Frames:
-    """Where the recording's frames lie, each x y z [m] and a quaternion w x y z; empty: where ours
-    do.
+    """Where the recording's frames are, each x y z [m] and a quaternion w x y z; () means as ours.
 
     Attributes:
         psm1, psm2: T_base_frame, the frame of the arm's poses in the arm's base.
@@ -205,7 +204,7 @@ class BagConfig:
     length_scale: float = 1.0
     needle_scale: float | None = None
     segmentation: str = "auto"
-    labels: dict = field(default_factory=dict)
+    labels: dict[str, str] = field(default_factory=dict)
     clock: str = "auto"
     max_gap: float = 0.2
     speed: float = 1.0
@@ -220,8 +219,13 @@ class BagConfig:
             check_name("step preset", self.step, STEPS)
         for label, subtask in self.labels.items():
             check_name(f"subtask of label '{label}'", subtask, (*names.SUBTASKS, NOTHING))
-        for name in ("jaw_scale", "length_scale", "needle_scale", "max_gap", "speed"):
-            value = getattr(self, name)
+        for name, value in {
+            "jaw_scale": self.jaw_scale,
+            "length_scale": self.length_scale,
+            "needle_scale": self.needle_scale,
+            "max_gap": self.max_gap,
+            "speed": self.speed,
+        }.items():
             if value is not None and not (0.0 < value < 1e6):
                 raise InputError(f"{name} is {value}; it must be above 0.")
 
@@ -239,12 +243,15 @@ class BagConfig:
         """Return the subtask a label means, or "none".
 
         Raises:
-            InputError: a label that nothing is said of.
+            InputError: an unknown label.
         """
         table = {**LABELS, **{str(key).lower(): value for key, value in self.labels.items()}}
-        if label.strip().lower() not in table:
+        key = label.strip().lower()
+        if key not in table:
+            shown = printable(label)
             raise InputError(
-                f"The recording has the label '{clean(label)}'; known are {', '.join(filter(None, table))}. "
-                f"Say what it means in the file of --config: `bag: {{labels: {{'{clean(label)}': grasp}}}}`, or none."
+                f"The recording has the label '{shown}'; "
+                f"known are {', '.join(filter(None, table))}. Say what it means in the file of "
+                f"--config: `bag: {{labels: {{'{shown}': grasp}}}}`, or none."
             )
-        return table[label.strip().lower()]
+        return table[key]

@@ -1,35 +1,35 @@
-"""Import bags: both arms' motion and the needle's from ROS, replayed state by state in our scene.
+"""Import of bags: both arms' motion and the needle's from ROS, replayed in our scene.
 
     summaries = import_bags([Path("trial.bag")], task=None, out=Path("demos"))
 
-Read (`foreign`, `bags`), put on the control rate (`recording`), cut into subtasks (`segments`),
-leave out the pauses (`bag_pieces`), replay (`replay`), write. What was measured there is where
-everything stands here; actions are the motions between. Success is judged as the envs do, with one
-leniency: the jaws' contact may be that of the geometry (`segments.held`), because a foreign needle
-never lies between our pads to a tenth of a millimetre.
+A bag is read (`sandbox`, `reader`), resampled to the control rate (`resample`), split into subtasks
+(`segments`), freed of pauses (`tracks`), replayed (`replay`) and written. Arms and needle are posed
+where they were measured; actions are the motions between. Success is judged as in the envs, with
+one exception: contact may also be that of the geometry (`segments.held`), because a recorded needle
+is never between our pads to a tenth of a millimetre.
 
-Without a needle in the bag it lies where the task's definition puts it, as in SurgicAI's recordings
+A needle that is not in the bag is where the task's definition puts it, as in SurgicAI's recordings
 (`replay`).
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import STEPS, TaskConfig, from_mapping, to_mapping
+from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, UnreachablePose, check_name
 from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output, code_version, sha256_file, whole_folder
-from surgicai_vision.core.progress import Progress
-from surgicai_vision.demos.imports.replay import MOST_CLIPPED, Replay, Track, moves
+from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.demos.imports.replay import Replay, Track, fitting_step, motion_actions
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
 from surgicai_vision.demos.imports.rosbag.segments import held
-from surgicai_vision.demos.imports.rosbag.tracks import Piece, take_apart
+from surgicai_vision.demos.imports.rosbag.tracks import SegmentTrack, extract_tracks
 from surgicai_vision.demos.record import finished
 from surgicai_vision.demos.store import (
     MARKER,
@@ -39,8 +39,9 @@ from surgicai_vision.demos.store import (
     write_demo,
     write_marker,
 )
+from surgicai_vision.envs import SUBTASKS
 
-Row = Mapping[str, Any]
+Row = Mapping[str, JSON]
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,8 @@ class BagSummary:
         clipped: steps faster than the preset allows, whose action was clipped to [-1, 1].
         pauses: samples left out because the arm rested.
         succeeded: demonstrations whose last state meets the task's tolerances in our scene.
-        skipped: parts that could not be replayed, {"bag", "task", "from", "to", "reason"}; times in
-            seconds.
+        skipped: segments that could not be replayed, {"bag", "task", "from", "to", "reason"};
+            times in seconds.
     """
 
     task: str
@@ -77,7 +78,7 @@ def import_bags(
     task: str | None,
     out: Path,
     config: BagConfig = BagConfig(),  # noqa: B008  # frozen
-    env: Mapping[str, Any] | None = None,
+    env: Mapping[str, object] | None = None,
     progress: Progress | None = None,
 ) -> list[BagSummary]:
     """Import bags into folders of demonstrations, one a subtask.
@@ -104,40 +105,41 @@ def import_bags(
     )
     if task:
         check_output(out, may_resume=MARKER)
-    pieces: list[Piece] = []
+    report = progress or silent
+    tracks: list[SegmentTrack] = []
     skipped: list[Row] = []
     for number, bag in enumerate(bags):
-        if progress:
-            progress(number, len(bags), "bags")
-        found, unusable = take_apart(bag, task, config, base)
-        pieces, skipped = pieces + found, [*skipped, *unusable]
-    if not pieces:
+        report(number, len(bags), "bags")
+        usable, unusable = extract_tracks(bag, task, config, base)
+        tracks += usable
+        skipped += unusable
+    if not tracks:
         raise InputError(f"Nothing can be imported: {skipped[0]['task']}: {skipped[0]['reason']}.")
-    request = {
+    request: dict[str, object] = {
         "bags": [_digests(bag) for bag in bags],
         "bag": to_mapping(config),
         "env": dict(env or {}),
     }
-    summaries, done = [], 0
+    summaries = []
+    done = 0
     for name in names.SUBTASKS:
-        some = [piece for piece in pieces if piece.task == name]
-        if not some:
+        of_subtask = [track for track in tracks if track.task == name]
+        if not of_subtask:
             continue
         folder = out if task else out / name
         asked = {**request, "task": name}
         check_output(folder, may_resume=MARKER)
         if not finished(folder, asked):
-            tell = _told(progress, done, len(pieces))
             _build(
                 folder,
-                some,
+                of_subtask,
                 [row for row in skipped if row["task"] == name],
                 base,
                 config,
                 asked,
-                tell,
+                functools.partial(_report_all, report, done, len(tracks)),
             )
-        done += len(some)
+        done += len(of_subtask)
         marker = read_marker(folder)
         notes = {**marker["notes"], "skipped": tuple(marker["skipped"])}
         summaries.append(BagSummary(name, folder, tuple(list_demos(folder)), **notes))
@@ -150,47 +152,49 @@ def _digests(bag: Path) -> dict[str, str]:
     return {path.name: sha256_file(path) for path in files}
 
 
-def _told(progress: Progress | None, before: int, total: int) -> Any:
-    """Return what tells that so many demonstrations of a subtask are done."""
-    return lambda done: progress(before + done, total, "demonstrations") if progress else None
+def _report_all(progress: Progress, before: int, total: int, done: int) -> None:
+    """Report the progress of one subtask as that of all."""
+    progress(before + done, total, "demonstrations")
 
 
 def _build(
     out: Path,
-    pieces: Sequence[Piece],
+    tracks: Sequence[SegmentTrack],
     skipped: Sequence[Row],
     base: TaskConfig,
     config: BagConfig,
-    request: Mapping[str, Any],
-    tell: Any,
+    request: Mapping[str, object],
+    report: Callable[[int], None],
 ) -> None:
-    """Replay the pieces of one subtask and write its folder."""
-    task = pieces[0].task
-    longest = max(len(piece.track.needle) - 1 for piece in pieces)
-    step = config.step or fastest(task, [piece.track for piece in pieces])
+    """Replay the tracks of one subtask and write its folder."""
+    task = tracks[0].task
+    arm = names.ACTIVE_ARM[task]
+    longest = max(len(track.track.needle) - 1 for track in tracks)
+    step = config.step or fitting_step([track.track.arms[arm] for track in tracks])
     task_config = dataclasses.replace(
         base, task=task, step=step, max_steps=max(base.max_steps, longest)
     )
-    replay, rows = Replay(task_config), list(skipped)
+    replay = Replay(task_config)
+    rows = list(skipped)
     counts = {"steps": 0, "clipped": 0, "pauses": 0, "succeeded": 0}
     count = 0
     with building(out) as (_, result), whole_folder(result) as folder:
-        for number, piece in enumerate(pieces, 1):
+        for number, track in enumerate(tracks, 1):
             try:
-                demo, clipped = demonstration(replay, piece.track)
+                demo, clipped = as_demonstration(replay, track.track)
             except UnreachablePose as error:
-                rows.append(piece.row(str(error)))
+                rows.append(track.row(str(error)))
             else:
                 write_demo(folder, count, demo)
                 count += 1
                 more = {
                     "steps": len(demo),
                     "clipped": clipped,
-                    "pauses": piece.pauses,
+                    "pauses": track.pauses,
                     "succeeded": demo.success[-1],
                 }
                 counts = {key: counts[key] + int(value) for key, value in more.items()}
-            tell(number)
+            report(number)
         if not count:
             raise InputError(f"No {task} can be replayed in our scene: {rows[-1]['reason']}")
         details = {
@@ -202,42 +206,28 @@ def _build(
         write_marker(folder, task, "bag", code=code_version(), **details)
 
 
-def fastest(task: str, tracks: Sequence[Track]) -> str:
-    """Return the smallest step preset that nearly all steps of some tracks fit into, or the one
-    that most fit into.
-    """
-    arm = names.ACTIVE_ARM[task]
-    total = sum(len(track.needle) - 1 for track in tracks)
-    clipped = {step: sum(moves(*track.arms[arm], step)[1] for track in tracks) for step in STEPS}
-    return next(
-        (step for step in STEPS if clipped[step] <= MOST_CLIPPED * total),
-        min(STEPS, key=lambda s: clipped[s]),
-    )
-
-
-def demonstration(replay: Replay, track: Track) -> tuple[Demo, int]:
+def as_demonstration(replay: Replay, track: Track) -> tuple[Demo, int]:
     """Return a track as a demonstration, and how many of its actions were clipped.
 
     Raises:
         UnreachablePose: a pose outside the arms' joint limits.
     """
-    from surgicai_vision.envs import SUBTASKS
-
     config = replay.config
-    subtask, arm = SUBTASKS[config.task], names.ACTIVE_ARM[config.task]
+    subtask = SUBTASKS[config.task]
+    arm = names.ACTIVE_ARM[config.task]
     tip, jaw = track.arms[arm]
     states, infos = replay.play(track)
-    action, clipped = moves(tip, jaw, config.step)
+    action, clipped = motion_actions((tip, jaw), config.step)
     contact = np.array([info["contact"] for info in infos]) | held(arm, tip, jaw, track.needle)
     success = np.array([info["is_success"] for info in infos])
     if subtask.demands[config.tolerance].contact:
-        distance, angle = (
-            np.array([info[key] for info in infos]) for key in ("d_trans", "d_angle")
-        )
-        near = subtask.tolerances[config.tolerance]
-        success |= (distance <= near.distance) & (angle <= near.angle) & contact
+        distance = np.array([info["d_trans"] for info in infos])
+        angle = np.array([info["d_angle"] for info in infos])
+        tolerance = subtask.tolerances[config.tolerance]
+        success |= (distance <= tolerance.distance) & (angle <= tolerance.angle) & contact
     reward = [
-        replay.reward(bool(good), info) for good, info in zip(success[1:], infos[1:], strict=True)
+        replay.reward(bool(succeeded), info)
+        for succeeded, info in zip(success[1:], infos[1:], strict=True)
     ]
     demo = replay.as_demo(
         "bag",

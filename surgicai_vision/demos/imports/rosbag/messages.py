@@ -1,10 +1,9 @@
-"""ROS messages: the few types that describe a demonstration, decoded from bytes without running a
-line of theirs.
+"""ROS messages: the few types that describe a demonstration, decoded without running their code.
 
 `rosbags` would turn a bag's message definitions into Python code and run it. Here a definition is
 data: a table of fields that a cursor follows. The tables below are the published ones
-(common_interfaces, ambf_msgs); only of AMBF's own types, which changed between its versions, is the
-bag's text read, and it may name nothing but what stands here.
+(common_interfaces, ambf_msgs); only for AMBF's own types, which changed between its versions, is
+the bag's definition read, and it may name only the types in these tables.
 
     layout = layout_of("geometry_msgs/PoseStamped", ros1=True)
     decode(data, layout, ros1=True)["pose.position.x"]
@@ -17,39 +16,40 @@ from types import MappingProxyType
 from typing import Any
 
 from surgicai_vision.core.errors import BadFile
-from surgicai_vision.demos.imports.rosbag.config import clean
+from surgicai_vision.demos.imports.rosbag.config import printable
 
 PRIMITIVES: Mapping[str, str] = MappingProxyType(
     {
-        "bool": "B", "byte": "b", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
-        "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+        "bool": "B", "byte": "b", "char": "B", "int8": "b", "uint8": "B", "int16": "h",
+        "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f",
+        "float64": "d",
     }
 )  # fmt: skip
 """ROS type → `struct` code."""
 STRING = "string"
 
-_WHOLE = ["int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"]
-_NAMES = {"int": "Int", "uint": "UInt"}
-
-
-def _spelled(whole: str) -> str:
-    kind = whole.rstrip("0123456789")
-    return _NAMES[kind] + whole[len(kind) :]
-
-
-WHOLE_NUMBERS = tuple(f"std_msgs/{_spelled(whole)}" for whole in _WHOLE)
+_INTEGERS = MappingProxyType(
+    {
+        f"std_msgs/{message}{bits}": f"{primitive}{bits}"
+        for bits in (8, 16, 32, 64)
+        for message, primitive in (("Int", "int"), ("UInt", "uint"))
+    }
+)
+INTEGER_MESSAGES = tuple(_INTEGERS)
 DEFINITIONS: Mapping[str, str] = MappingProxyType(
     {
         "std_msgs/Header": "uint32 sec\nuint32 nanosec\nstring frame_id",
         "std_msgs/String": "string data",
         "std_msgs/Float32": "float32 data",
         "std_msgs/Float64": "float64 data",
-        **{name: f"{whole} data" for name, whole in zip(WHOLE_NUMBERS, _WHOLE, strict=True)},
+        **{message: f"{primitive} data" for message, primitive in _INTEGERS.items()},
         "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
         "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
         "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
         "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-        "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
+        "geometry_msgs/Transform": (
+            "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation"
+        ),
         "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
         "geometry_msgs/Wrench": "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque",
         "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
@@ -57,33 +57,43 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
             "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
         ),
         "sensor_msgs/JointState": (
-            "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
+            "std_msgs/Header header\nstring[] name\n"
+            "float64[] position\nfloat64[] velocity\nfloat64[] effort"
         ),
         "ambf_msgs/RigidBodyState": (
-            "Header header\nuint32 sim_step\nstd_msgs/String identifier\nstd_msgs/String name\nfloat32 wall_time\n"
-            "float32 sim_time\nfloat32 mass\ngeometry_msgs/Point pInertia\ngeometry_msgs/Pose pose\n"
-            "geometry_msgs/Twist twist\ngeometry_msgs/Wrench wrench\nstring[] children_names\nstring[] joint_names\n"
-            "float32[] joint_positions\nfloat32[] joint_velocities\nfloat32[] joint_efforts"
+            "Header header\nuint32 sim_step\nstd_msgs/String identifier\nstd_msgs/String name\n"
+            "float32 wall_time\nfloat32 sim_time\nfloat32 mass\ngeometry_msgs/Point pInertia\n"
+            "geometry_msgs/Pose pose\ngeometry_msgs/Twist twist\ngeometry_msgs/Wrench wrench\n"
+            "string[] children_names\nstring[] joint_names\nfloat32[] joint_positions\n"
+            "float32[] joint_velocities\nfloat32[] joint_efforts"
         ),
         "ambf_msgs/ObjectState": (
-            "Header header\nuint32 sim_step\nstd_msgs/String name\nfloat32 wall_time\nfloat32 sim_time\nfloat32 mass\n"
-            "geometry_msgs/Point pInertia\ngeometry_msgs/Pose pose\ngeometry_msgs/Wrench wrench\n"
-            "string userdata_description\nstring[] children_names\nstring[] joint_names\nfloat32[] userdata\n"
+            "Header header\nuint32 sim_step\nstd_msgs/String name\nfloat32 wall_time\n"
+            "float32 sim_time\nfloat32 mass\ngeometry_msgs/Point pInertia\n"
+            "geometry_msgs/Pose pose\ngeometry_msgs/Wrench wrench\nstring userdata_description\n"
+            "string[] children_names\nstring[] joint_names\nfloat32[] userdata\n"
             "float32[] joint_positions"
         ),
     }
 )
-"""Message type → its fields, one "type name" a line. ROS 1 headers have a counter before the stamp:
-`_flatten`.
-"""
+"""Message type → its fields, one "type name" a line; `_flatten` adds the counter that headers of
+ROS 1 have before the stamp."""
 AMBF = ("ambf_msgs/RigidBodyState", "ambf_msgs/ObjectState")
-MAX_FIELDS, MAX_TEXT = 200, 20_000
-"""Fields of a definition, and characters of its text, that are read."""
+MAX_FIELDS = 200
+"""Fields of a definition that are read, at most."""
+MAX_TEXT = 20_000
+"""Characters of a definition that are read, at most."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """One number, text, or sequence of them."""
+    """One field of a message: a number, a text, or a sequence of them.
+
+    Attributes:
+        name: its name, nested ones with dots.
+        kind: a key of `PRIMITIVES`, or "string".
+        many: it is a sequence.
+    """
 
     name: str
     kind: str
@@ -107,7 +117,8 @@ def layout_of(kind: str, *, ros1: bool, text: str = "") -> Layout:
     """
     if kind not in DEFINITIONS:
         raise BadFile(
-            f"messages of type {clean(kind)} are not read; known are {', '.join(sorted(DEFINITIONS))}."
+            f"messages of type {printable(kind)} are not read; "
+            f"known are {', '.join(sorted(DEFINITIONS))}."
         )
     own = text.split("\n====", 1)[0] if kind in AMBF else ""
     return tuple(_flatten(own if own.strip() else DEFINITIONS[kind], "", ros1))
@@ -127,7 +138,7 @@ def _flatten(text: str, prefix: str, ros1: bool) -> list[Field]:
             fields += _flatten(DEFINITIONS[plain], f"{prefix}{name}.", ros1)
         else:
             raise BadFile(
-                f"a message definition has a field of type {clean(kind)}, which is not read."
+                f"a message definition has a field of type {printable(kind)}, which is not read."
             )
     if len(fields) > MAX_FIELDS:
         raise BadFile(
@@ -149,13 +160,18 @@ def _lines(text: str) -> list[tuple[str, str]]:
             continue
         if len(words) < 2 or not words[1].isidentifier():
             raise BadFile(
-                f"a message definition has the line '{clean(line.strip())}', which is no 'type name'."
+                f"a message definition has the line '{printable(line.strip())}', "
+                "which is no 'type name'."
             )
         pairs.append((words[0], words[1]))
     return pairs
 
 
-def decode(data: bytes | memoryview, layout: Layout, *, ros1: bool) -> dict[str, Any]:
+Message = Mapping[str, Any]
+"""Field → its value: a number, a text, or a tuple of them, as the bag's definition has it."""
+
+
+def decode(data: bytes | memoryview, layout: Layout, *, ros1: bool) -> Message:
     """Return a message's fields by name, nested ones with dots.
 
     Args:
@@ -173,15 +189,19 @@ def decode(data: bytes | memoryview, layout: Layout, *, ros1: bool) -> dict[str,
 
 
 class _Cursor:
-    """Goes through a message's bytes."""
+    """Reads a message's fields one after the other."""
 
     def __init__(self, data: bytes, ros1: bool):
-        self._order, self._start, self._aligned = "<", 0, not ros1
+        self._data = data
+        self._aligned = not ros1
+        self._order = "<"
+        self._start = 0
         if not ros1:
             if len(data) < 4 or data[:2] not in (b"\0\0", b"\0\1"):
                 raise ValueError("no plain CDR")
-            self._order, self._start = "<" if data[1] else ">", 4
-        self._data, self._place = data, self._start
+            self._order = "<" if data[1] else ">"
+            self._start = 4
+        self._offset = self._start
 
     def take(self, field: Field) -> Any:
         """Return the next field's value: a number, a text, or a tuple of them."""
@@ -191,35 +211,38 @@ class _Cursor:
                 if field.kind == STRING
                 else self._numbers(PRIMITIVES[field.kind], 1)[0]
             )
-        count = self._numbers("I", 1)[0]
-        if count > len(self._data) - self._place:
+        count = self._count()
+        if count > len(self._data) - self._offset:
             raise ValueError(f"a sequence of {count} in {len(self._data)} bytes")
         if field.kind == STRING:
             return tuple(self._text() for _ in range(count))
         return self._numbers(PRIMITIVES[field.kind], count) if count else ()
 
     def finish(self) -> None:
-        """Refuse bytes that are left over, other than CDR's padding."""
-        left = len(self._data) - self._place
+        """Raise ValueError for bytes that are left over, other than CDR's padding."""
+        left = len(self._data) - self._offset
         if left > (3 if self._aligned else 0):
             raise ValueError(f"{left} bytes too many")
 
     def _numbers(self, code: str, count: int) -> tuple[Any, ...]:
         size = struct.calcsize(f"={code}")
         if self._aligned:
-            self._place += -(self._place - self._start) % size
-        end = self._place + size * count
+            self._offset += -(self._offset - self._start) % size
+        end = self._offset + size * count
         if end > len(self._data):
             raise ValueError(f"{end - len(self._data)} bytes too few")
-        values = struct.unpack_from(f"{self._order}{count}{code}", self._data, self._place)
-        self._place = end
+        values = struct.unpack_from(f"{self._order}{count}{code}", self._data, self._offset)
+        self._offset = end
         return values
 
+    def _count(self) -> int:
+        return int(self._numbers("I", 1)[0])
+
     def _text(self) -> str:
-        count = self._numbers("I", 1)[0]
-        end = self._place + count
+        count = self._count()
+        end = self._offset + count
         if end > len(self._data):
             raise ValueError(f"a text of {count} in {len(self._data)} bytes")
-        text = self._data[self._place : end].decode()
-        self._place = end
+        text = self._data[self._offset : end].decode()
+        self._offset = end
         return text.removesuffix("\0")

@@ -1,18 +1,16 @@
-"""Bags as arrays: what ROS 1 and ROS 2 recorded on a few topics, before anything is believed about
-it.
+"""Reader: bags of ROS 1 and ROS 2 as arrays, before they are checked for sense.
 
-    arrays = read(Path("trial.bag"), {"psm2_pose": "/PSM2/measured_cp", "needle":
-    "/needle/measured_cp"})
+    arrays = read(Path("trial.bag"), {"psm2_pose": "/PSM2/measured_cp"})
 
 The library `rosbags` opens the containers: `.bag`, a ROS 2 folder (`metadata.yaml` with sqlite3 or
-mcap storage), a single `.db3` or `.mcap`. Messages are decoded by `ros_messages`, never by code
-made from the bag's own definitions. Runs where `foreign` puts it.
+mcap storage), a single `.db3` or `.mcap`. Messages are decoded by `messages`, never by code made
+from the bag's own definitions. It runs in the process of `sandbox`.
 
-Returned is `topics`, what there is, and per role whose topic is there, of N messages in the order
-of the bag: `<role>.time` when received and `<role>.stamp` in the header (0 where there is none),
-both (N,) int64 [ns]; `<role>.value`; `<role>.type` and `<role>.frame`, one text each. Values: poses
-(N, 7), x y z in the recording's unit and a unit quaternion w x y z; joints (N, 6); jaw (N,); label
-(N,) texts.
+The result holds `topics`, all topics of the bag, and for each role whose topic is there, of N
+messages in the order of the bag: `<role>.time` of reception and `<role>.stamp` of the header (0
+where there is none), both (N,) int64 [ns]; `<role>.value`; `<role>.type` and `<role>.frame`, one
+text each. Values: poses (N, 7), x y z in the recording's unit and a unit quaternion w x y z; joints
+(N, 6); jaw (N,); label (N,) texts.
 """
 
 import bz2
@@ -23,10 +21,10 @@ from array import array
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import lz4.frame
 import numpy as np
+from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import reader as ros1_reader
 from rosbags.rosbag2 import Reader as Reader2
@@ -34,11 +32,18 @@ from rosbags.rosbag2 import reader as ros2_reader
 from rosbags.rosbag2 import storage_mcap
 
 from surgicai_vision.core.errors import BadFile, InputError
-from surgicai_vision.demos.imports.rosbag.config import ENDINGS, METADATA, clean, is_bag, listed
+from surgicai_vision.demos.imports.rosbag.config import (
+    ENDINGS,
+    METADATA,
+    is_bag,
+    printable,
+    topic_list,
+)
 from surgicai_vision.demos.imports.rosbag.messages import (
     AMBF,
-    WHOLE_NUMBERS,
+    INTEGER_MESSAGES,
     Layout,
+    Message,
     decode,
     layout_of,
 )
@@ -55,10 +60,10 @@ KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "joints": ("sensor_msgs/JointState", *AMBF),
         "jaw": ("sensor_msgs/JointState", "std_msgs/Float64", "std_msgs/Float32", *AMBF),
         "needle": (*POSES, *AMBF),
-        "label": ("std_msgs/String", *WHOLE_NUMBERS),
+        "label": ("std_msgs/String", *INTEGER_MESSAGES),
     }
 )
-"""What a role's last word means → the message types that can say it."""
+"""Last word of a role → the message types that it is read from."""
 ROLES = (
     "psm1_pose",
     "psm1_jaw",
@@ -70,13 +75,19 @@ ROLES = (
     "label",
 )
 
-MAX_MESSAGES, MAX_MESSAGE, MAX_CHUNK, MAX_METADATA, MAX_DEPTH = 5_000_000, 2**20, 2**26, 2**18, 20
-"""What is read at most: messages of all roles, bytes of a message, of an unpacked chunk, of the
-text that describes a ROS 2 folder, and how deep its brackets go. ROS packs chunks of 768 KB; one
-image makes them larger."""
+MAX_MESSAGES = 5_000_000
+"""Messages of all roles, at most."""
+MAX_MESSAGE = 2**20
+"""Size of a message, at most [byte]."""
+MAX_CHUNK = 2**26
+"""Size of an unpacked chunk, at most [byte]; ROS packs 768 KB, and more where there are images."""
+MAX_METADATA = 2**18
+"""Size of the text that describes a ROS 2 folder, at most [byte]."""
+MAX_DEPTH = 20
+"""Nesting of brackets in that text, at most."""
 MAX_LISTED = 1000
-"""Topics of a bag that are looked at to be named."""
-UNIT = 0.01
+"""Topics of a bag that a message may name."""
+UNIT_TOLERANCE = 0.01
 """Furthest a quaternion's length may be from 1."""
 _POSE_FIELDS = (
     ("pose.position", "pose.orientation"),
@@ -107,26 +118,26 @@ def read(
             return _read(reader, path, topics, needed)
     except InputError as error:
         raise error if str(path) in str(error) else type(error)(f"{path}: {error}") from None
-    except (
-        Exception
-    ) as error:  # a damaged bag can fail in any way, and ask for any amount of memory
-        line = clean((str(error).splitlines() or ["it asks for too much"])[0], 160)
+    except Exception as error:  # a damaged bag can fail in any way
+        line = printable((str(error).splitlines() or ["it asks for too much"])[0], 160)
         raise BadFile(f"{path} is not a readable bag ({type(error).__name__}: {line}).") from None
 
 
 def _read(
-    reader: Any, path: Path, topics: Mapping[str, str], needed: Collection[str]
+    reader: Reader1 | Reader2, path: Path, topics: Mapping[str, str], needed: Collection[str]
 ) -> dict[str, np.ndarray]:
     ros1 = isinstance(reader, Reader1)
     there = {connection.topic: _plain(connection.msgtype) for connection in reader.connections}
     known = [
-        f"{clean(topic)} ({clean(kind)})" for topic, kind in sorted(there.items())[:MAX_LISTED]
+        f"{printable(topic)} ({printable(kind)})"
+        for topic, kind in sorted(there.items())[:MAX_LISTED]
     ]
     missing = [role for role in needed if topics[role] not in there]
     if missing:
         wanted_topic = topics[missing[0]]
         raise InputError(
-            f"{path} has no topic {wanted_topic} ({missing[0]}); it has {listed(known, wanted_topic)}."
+            f"{path} has no topic {wanted_topic} ({missing[0]}); "
+            f"it has {topic_list(known, wanted_topic)}."
         )
     wanted = [
         connection for connection in reader.connections if connection.topic in topics.values()
@@ -150,16 +161,16 @@ def _read(
 
 
 def _fill(
-    reader: Any,
-    wanted: list[Any],
+    reader: Reader1 | Reader2,
+    wanted: list[Connection],
     layouts: Mapping[str, Layout],
     columns: Mapping[str, "_Column"],
     ros1: bool,
 ) -> None:
     """Read the messages of the wanted connections into the columns of their roles."""
-    heard: dict[str, list[_Column]] = {}
+    columns_of: dict[str, list[_Column]] = {}
     for column in columns.values():
-        heard.setdefault(column.topic, []).append(column)
+        columns_of.setdefault(column.topic, []).append(column)
     for number, (connection, time, data) in enumerate(reader.messages(wanted)):
         if number >= MAX_MESSAGES or len(data) > MAX_MESSAGE:
             raise BadFile(
@@ -168,25 +179,26 @@ def _fill(
         try:
             message = decode(data, layouts[connection.topic], ros1=ros1)
         except ValueError as error:
-            kind = clean(_plain(connection.msgtype))
+            kind = printable(_plain(connection.msgtype))
             raise BadFile(f"a message on {connection.topic} is no {kind} ({error}).") from None
-        for column in heard[connection.topic]:
+        for column in columns_of[connection.topic]:
             column.add(time, message)
 
 
-def _check_kind(connection: Any, topics: Mapping[str, str]) -> None:
-    """Refuse a topic whose messages cannot say what its role needs."""
+def _check_kind(connection: Connection, topics: Mapping[str, str]) -> None:
+    """Refuse a topic whose messages do not hold what its role needs."""
     kind = _plain(connection.msgtype)
     for role, topic in topics.items():
         allowed = KINDS[role.rsplit("_", 1)[-1]]
         if topic == connection.topic and kind not in allowed:
             raise InputError(
-                f"{topic} ({role}) holds {clean(kind)}; {role} is read from {', '.join(allowed)}."
+                f"{topic} ({role}) holds {printable(kind)}; "
+                f"{role} is read from {', '.join(allowed)}."
             )
 
 
 class _Column:
-    """What one role's topic said: numbers by the hundred thousand, so kept as numbers.
+    """The messages of one role's topic, kept as numbers: there are hundreds of thousands.
 
     Args:
         role: one of `ROLES`.
@@ -195,15 +207,19 @@ class _Column:
     """
 
     def __init__(self, role: str, topic: str, path: Path):
-        self.topic, self.times = topic, array("q")
-        self._name, self._where = role, f"{path}: {topic} ({role})"
+        self.topic = topic
+        self.times = array("q")
+        self._name = role
+        self._where = f"{path}: {topic} ({role})"
         self._read = _VALUES[role.rsplit("_", 1)[-1]]
-        self._stamps, self._numbers, self._width = array("q"), array("d"), 0
+        self._stamps = array("q")
+        self._numbers = array("d")
+        self._width = 0
         self._texts: list[str] = []
         self._frames: set[str] = set()
 
-    def add(self, time: int, message: Mapping[str, Any]) -> None:
-        """Take a message that was received at `time` [ns]."""
+    def add(self, time: int, message: Message) -> None:
+        """Add a message that was received at `time` [ns]."""
         try:
             value = self._read(message)
         except (IndexError, KeyError):
@@ -214,9 +230,8 @@ class _Column:
         self._stamps.append(message.get("header.sec", 0) * 10**9 + message.get("header.nanosec", 0))
         self._frames.add(str(message.get("header.frame_id", "")))
         if len(self._frames) > 1:
-            raise InputError(
-                f"{self._where} changes its frame: {clean(', '.join(sorted(self._frames)), 160)}."
-            )
+            frames = printable(", ".join(sorted(self._frames)), 160)
+            raise InputError(f"{self._where} changes its frame: {frames}.")
         if isinstance(value, str):
             self._texts.append(value)
         else:
@@ -227,7 +242,7 @@ class _Column:
         """Return the role's arrays.
 
         Raises:
-            BadFile: numbers that are not finite, rotations that are none.
+            BadFile: numbers that are not finite, quaternions that are not unit.
         """
         value = (
             np.array(self._texts)
@@ -238,7 +253,7 @@ class _Column:
             raise BadFile(f"{self._where} holds numbers that are not finite.")
         if self._width == 7:
             lengths = np.linalg.norm(value[:, 3:], axis=1)
-            if np.abs(lengths - 1.0).max() > UNIT:
+            if np.abs(lengths - 1.0).max() > UNIT_TOLERANCE:
                 raise BadFile(f"{self._where} holds rotations that are no unit quaternions.")
             value[:, 3:] /= lengths[:, None]
         return {
@@ -250,7 +265,7 @@ class _Column:
         }
 
 
-def _pose(message: Mapping[str, Any]) -> list[float]:
+def _pose(message: Message) -> list[float]:
     for place, turn in _POSE_FIELDS:
         if f"{place}.x" in message:
             return [message[f"{place}.{axis}"] for axis in "xyz"] + [
@@ -259,14 +274,14 @@ def _pose(message: Mapping[str, Any]) -> list[float]:
     raise KeyError("pose")
 
 
-def _joints(message: Mapping[str, Any]) -> list[float]:
+def _joints(message: Message) -> list[float]:
     values = message["position"] if "position" in message else message["joint_positions"]
     if len(values) < 6:
         raise IndexError("six joints")
     return [float(value) for value in values[:6]]
 
 
-def _jaw(message: Mapping[str, Any]) -> list[float]:
+def _jaw(message: Message) -> list[float]:
     if "data" in message:
         return [float(message["data"])]
     # AMBF's state of a PSM has its two fingers behind the six joints.
@@ -275,7 +290,7 @@ def _jaw(message: Mapping[str, Any]) -> list[float]:
     ]
 
 
-_VALUES: Mapping[str, Callable[[Mapping[str, Any]], Any]] = MappingProxyType(
+_VALUES: Mapping[str, Callable[[Message], list[float] | str]] = MappingProxyType(
     {
         "pose": _pose,
         "needle": _pose,
@@ -291,31 +306,29 @@ def _plain(kind: str) -> str:
     return kind.replace("/msg/", "/")
 
 
-# -- before rosbags sees it ------------------------------------------------------------------------
+# -- before rosbags opens it -----------------------------------------------------------------------
 
 
 def _inspect(path: Path) -> None:
-    """Refuse what `rosbags` would follow too far: what is no bag, files of packed files, databases
-    with programs.
-    """
+    """Refuse what is no bag, and what `rosbags` would trust too far."""
     if not path.exists():
         raise BadFile(f"Cannot read {path}: no such file.")
     if not is_bag(path):
         raise BadFile(
-            f"{path} is no bag; a bag is a file ending in {', '.join(ENDINGS)} or a folder with {METADATA}."
+            f"{path} is no bag; a bag is a file ending in {', '.join(ENDINGS)} "
+            f"or a folder with {METADATA}."
         )
     if path.is_dir():
         _inspect_metadata(path / METADATA)
-    for database in (
-        [path] if path.suffix == ".db3" else sorted(path.glob("*.db3")) if path.is_dir() else []
-    ):
+        databases = sorted(path.glob("*.db3"))
+    else:
+        databases = [path] if path.suffix == ".db3" else []
+    for database in databases:
         _inspect_database(database)
 
 
 def _inspect_metadata(path: Path) -> None:
-    """Look at a folder's description before `rosbags` parses it: a YAML parser takes seconds over
-    deep brackets.
-    """
+    """Check a folder's description before `rosbags` parses it: deep brackets take YAML seconds."""
     size = path.stat().st_size
     if size > MAX_METADATA:
         raise BadFile(f"{path} has {size} bytes; above {MAX_METADATA} are not read.")
@@ -325,7 +338,8 @@ def _inspect_metadata(path: Path) -> None:
         raise BadFile(f"{path} is no description of a ROS 2 bag.")
     if re.search(r"compression_mode\W+file\b", text, re.IGNORECASE):
         raise BadFile(
-            f"{path.parent} is packed file by file; unpack it first (zstd -d, then `ros2 bag reindex`)."
+            f"{path.parent} is packed file by file; "
+            "unpack it first (zstd -d, then `ros2 bag reindex`)."
         )
 
 
@@ -343,11 +357,13 @@ def _inspect_database(path: Path) -> None:
             or "GENERATED" in str(sql).upper()
         ):
             raise BadFile(
-                f"{path} has a {clean(kind)} '{clean(name, 40)}', which no ROS 2 bag has; it is not read."
+                f"{path} has a {printable(kind)} '{printable(name, 40)}', "
+                "which no ROS 2 bag has; it is not read."
             )
 
 
 def _bounded(whole: bytes) -> bytes:
+    """Return an unpacked chunk that is not too large."""
     if len(whole) > MAX_CHUNK:
         raise BadFile(f"a chunk unpacks to more than {MAX_CHUNK >> 20} MB; it is not read.")
     return whole
@@ -362,10 +378,7 @@ def _lz4(data: bytes) -> bytes:
 
 
 def _zstd(data: bytes) -> bytes:
-    return _bounded(_unpacker().decompress(data, MAX_CHUNK + 1))
-
-
-_unpacker = storage_mcap.zstd.ZstdDecompressor
+    return _bounded(storage_mcap.zstd.ZstdDecompressor().decompress(data, MAX_CHUNK + 1))
 
 
 class _Zstd:

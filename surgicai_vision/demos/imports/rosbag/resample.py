@@ -1,12 +1,13 @@
-"""Recording: what a bag says of both arms and the needle, at the control rate and in our frames.
+"""Resampling: a bag's arms and needle at the control rate and in our frames.
 
-    recording = recording_of(read_sandboxed(path, "bag", topics=config.all_topics), config)
+    arrays = read_sandboxed(path, "bag", topics=config.all_topics)
+    recording = resample(arrays, config, instrument)
 
-Each topic has its own times, with jitter and messages lost. Times are those of the headers where
+Each topic has its own times, with jitter and lost messages. Times are those of the headers where
 there are headers (shifted by the median delay, so that they agree with topics that have none), or
 else those of reception. Positions, joints and jaws are interpolated linearly between the two
-messages around a sample, rotations by slerp; labels and commands (a jaw from `servo_jp`) are those
-last heard. A sample between two messages further apart than `max_gap` is not `valid`.
+messages around a sample, rotations by slerp; labels and commands (a jaw from `servo_jp`) hold until
+the next message. A sample between two messages further apart than `max_gap` is not `valid`.
 """
 
 from collections.abc import Mapping
@@ -17,28 +18,31 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.demos.imports.rosbag.config import BagConfig, clean, listed
+from surgicai_vision.demos.imports.rosbag.config import BagConfig, printable, topic_list
 from surgicai_vision.demos.imports.rosbag.messages import AMBF
 from surgicai_vision.scene import kinematics
 
 RATE = float(names.FPS)
 """Samples per second: the control rate."""
-LONGEST = 3600.0
+MAX_DURATION = 3600.0
 """Longest recording that is resampled [s]."""
 AMBF_UNIT = 0.1
 """Metres in a unit of length of the challenge's AMBF scenes (its `SimToSI`)."""
 COMMANDS = ("servo_jp", "move_jp")
-"""Last words of CRTK's topics that command joints."""
-ELSEWHERE = ("ecm", "cam")
-"""What the name of a frame that is no arm's base contains: poses relative to the endoscope."""
+"""Last parts of CRTK's topics that command joints."""
+ENDOSCOPE_FRAMES = ("ecm", "cam")
+"""Parts of the names of frames that are relative to the endoscope, not an arm's base."""
 
 Arrays = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm's motion: T_base_tip (N, 4, 4), and one finger's angle (N,) [rad] or None where
-    nothing says it.
+    """One arm's motion.
+
+    Attributes:
+        tip: T_base_tip, (N, 4, 4).
+        jaw: one finger's angle, (N,) [rad], or None where it was not recorded.
     """
 
     tip: np.ndarray
@@ -52,7 +56,7 @@ class Recording:
     Attributes:
         arms: arm → its motion; arms that were not recorded are missing.
         needle: T_world_needle (N, 4, 4), or None.
-        label: label last heard, (N,) texts, "" before the first; or None.
+        label: present label, (N,) texts, "" before the first; or None.
         valid: (N,) bool; False in a gap of any topic but labels and commands.
         time: since the first sample, as recorded, (N,) [s].
         topics: every topic of the bag with its type, for messages.
@@ -70,11 +74,11 @@ class Recording:
         return len(self.valid)
 
 
-def recording_of(arrays: Arrays, config: BagConfig, instrument: str) -> Recording:
-    """Return what was read from a bag at the control rate.
+def resample(arrays: Arrays, config: BagConfig, instrument: str) -> Recording:
+    """Return what was read from a bag, at the control rate.
 
     Args:
-        arrays: see `bags.read`.
+        arrays: see `reader.read`.
         config: how to read it.
         instrument: the instrument whose joints these are, where there are joints and no pose.
 
@@ -84,12 +88,13 @@ def recording_of(arrays: Arrays, config: BagConfig, instrument: str) -> Recordin
     """
     times = _times(arrays, config)
     roles = _roles(arrays, config)
-    steady = [role for role in roles if not _told(role, config)]
+    steady = [role for role in roles if not _is_command(role, config)]
     begin = max(times[role].min() for role in steady)
     end = min(times[role].max() for role in steady)
-    if not begin < end <= begin + LONGEST * 1e9 * config.speed:
+    if not begin < end <= begin + MAX_DURATION * 1e9 * config.speed:
         raise InputError(
-            f"The topics overlap in {(end - begin) / 1e9:.1f} s; that must be above 0 and at most {LONGEST:.0f} s."
+            f"The topics overlap in {(end - begin) / 1e9:.1f} s; "
+            f"that must be above 0 and at most {MAX_DURATION:.0f} s."
         )
     step = 1e9 / RATE * config.speed
     grid = np.arange(0.0, (end - begin) + 1e-6 * step, step)
@@ -106,20 +111,18 @@ def recording_of(arrays: Arrays, config: BagConfig, instrument: str) -> Recordin
     needle = _needle(tracks["needle"], grid, arrays, config) if "needle" in tracks else None
     label = None
     if "label.value" in arrays:
-        spoken = _distinct(times["label"], arrays["label.value"], begin)
-        label = np.where(spoken[0][0] <= grid, _last(spoken, grid), "")
+        labels = _distinct(times["label"], arrays["label.value"], begin)
+        label = np.where(labels[0][0] <= grid, _last(labels, grid), "")
     return Recording(arms, needle, label, valid, grid / 1e9, tuple(map(str, arrays["topics"])))
 
 
-def _told(role: str, config: BagConfig) -> bool:
-    """Say whether a role's topic has commands, which come when something changes and hold until the
-    next.
-    """
+def _is_command(role: str, config: BagConfig) -> bool:
+    """Return True if a role's topic has commands, which hold until the next one."""
     return role.endswith("_jaw") and config.all_topics[role].rsplit("/", 1)[-1] in COMMANDS
 
 
 def _last(track: "Track", grid: np.ndarray) -> np.ndarray:
-    """Return the value last heard at each sample, before the first one the first."""
+    """Return the last value at each sample, before the first one the first."""
     times, values = track
     return values[np.maximum(np.searchsorted(times, grid, side="right") - 1, 0)]
 
@@ -127,27 +130,30 @@ def _last(track: "Track", grid: np.ndarray) -> np.ndarray:
 def _jaw(
     role: str, tracks: Mapping[str, "Track"], grid: np.ndarray, config: BagConfig
 ) -> np.ndarray | None:
-    """Return one finger's angle (N,) [rad]; None where it is not on record."""
+    """Return one finger's angle (N,) [rad]; None where it was not recorded."""
     if role not in tracks:
         return None
     return config.jaw * (
-        _last(tracks[role], grid) if _told(role, config) else np.interp(grid, *tracks[role])
+        _last(tracks[role], grid) if _is_command(role, config) else np.interp(grid, *tracks[role])
     )
 
 
 def _roles(arrays: Arrays, config: BagConfig) -> list[str]:
-    """Return the roles that are interpolated: of each arm its pose or else its joints, its jaw, and
-    the needle.
-    """
+    """Return the roles to interpolate: each arm's pose or else joints, its jaw, and the needle."""
     roles: list[str] = []
     for arm in names.ARMS:
-        placed = [role for role in (f"{arm}_pose", f"{arm}_joints") if f"{role}.value" in arrays][
-            :1
+        recorded = [
+            role
+            for role in (f"{arm}_pose", f"{arm}_joints", f"{arm}_jaw")
+            if f"{role}.value" in arrays
         ]
-        roles += placed + [role for role in (f"{arm}_jaw",) if placed and f"{role}.value" in arrays]
+        if f"{arm}_pose" in recorded:
+            roles += [role for role in recorded if role != f"{arm}_joints"]
+        elif f"{arm}_joints" in recorded:
+            roles += recorded
     if not roles:
         wanted = ", ".join(config.all_topics[f"{arm}_pose"] for arm in names.ARMS)
-        there = listed(arrays["topics"].tolist(), wanted)
+        there = topic_list(arrays["topics"].tolist(), wanted)
         raise InputError(
             f"The recording has the pose of no arm: none of {wanted}. The topics are {there}."
         )
@@ -169,9 +175,7 @@ def _times(arrays: Arrays, config: BagConfig) -> dict[str, np.ndarray]:
 
 
 def _distinct(times: np.ndarray, values: np.ndarray, begin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return times since `begin` [ns] in order and once each, with their values; of a repeated time
-    the last.
-    """
+    """Return increasing times since `begin` [ns] and their values, of a repeated time the last."""
     order = np.argsort(times, kind="stable")
     since, values = (times[order] - begin).astype(np.float64), values[order]
     last = np.append(np.diff(since) > 0, True)
@@ -179,7 +183,7 @@ def _distinct(times: np.ndarray, values: np.ndarray, begin: int) -> tuple[np.nda
 
 
 def _covered(times: np.ndarray, grid: np.ndarray, gap: float) -> np.ndarray:
-    """Say of each sample whether the messages around it are at most `gap` [ns] apart."""
+    """Return for each sample whether the messages around it are at most `gap` [ns] apart."""
     after = np.clip(np.searchsorted(times, grid, side="left"), 0, len(times) - 1)
     before = np.clip(np.searchsorted(times, grid, side="right") - 1, 0, len(times) - 1)
     return times[after] - times[before] <= gap
@@ -220,12 +224,13 @@ def _tip(
         unit = AMBF_UNIT if str(arrays[f"{role}.type"]) in AMBF else config.length_scale
         joints[:, kinematics.INSERTION] *= unit
         return np.stack([kinematics.forward(row, instrument) for row in joints])
-    placed = getattr(config.frames, arm)
+    placed = {names.PSM1: config.frames.psm1, names.PSM2: config.frames.psm2}[arm]
     frame = str(arrays[f"{role}.frame"]).lower()
-    if not placed and any(part in frame for part in ELSEWHERE):
+    if not placed and any(part in frame for part in ENDOSCOPE_FRAMES):
         raise InputError(
-            f"{config.all_topics[role]} is in frame '{clean(frame)}', not in {arm}'s base. Take the topic that is "
-            f"(dVRK: /{arm.upper()}/local/measured_cp), or give the frame's place in the base as frames: {arm}."
+            f"{config.all_topics[role]} is in frame '{printable(frame)}', not in {arm}'s base. "
+            f"Take the topic that is (dVRK: /{arm.upper()}/local/measured_cp), "
+            f"or give the frame's pose in the base as frames: {arm}."
         )
     scaled = values * np.array([config.length_scale] * 3 + [1.0] * 4)
     return (

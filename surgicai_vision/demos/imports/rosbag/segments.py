@@ -11,9 +11,9 @@ By labels: the longest runs of one subtask. By events, in the order of the proce
     pullout  until the needle's last move in PSM1's jaws, after it has left the exit
 
 An arm holds the needle when its jaw is closed (0.2 rad, where the surgical robotics challenge
-grasps) with the needle within reach of its pads, for 0.1 s. Holes are passed by the very test of
-the envs (`envs.passage`). A recording that starts late starts with the subtask that is then under
-way, and a needle that is held as near to the entry as an insertion starts (5.5 mm, 12°) is
+grasps) with the needle within reach of its pads, for 0.1 s. Holes are traversed by the same test as
+in the envs (`envs.hole_crossing`). A recording that starts late starts with the subtask that is then
+under way, and a needle that is held as near to the entry as an insertion starts (5.5 mm, 12°) is
 inserted, not placed.
 """
 
@@ -82,27 +82,24 @@ def segments(
     Raises:
         InputError: nothing to segment by, an unknown label, or nothing found.
     """
-    way = config.segmentation
-    if way == "auto":
-        way = (
-            "labels"
-            if recording.label is not None
-            else "events"
-            if recording.needle is not None
-            else NOTHING
-        )
-    if way == NOTHING:
+    method = config.segmentation
+    if method == "auto" and recording.label is not None:
+        method = "labels"
+    elif method == "auto":
+        method = NOTHING if recording.needle is None else "events"
+    if method == NOTHING:
         if task is None:
             raise InputError(
-                "The recording has no labels and no needle to segment it by: say what it shows (--task)."
+                "The recording has no labels and no needle to segment it by: "
+                "say what it shows (--task)."
             )
         return [Segment(task, 0, len(recording) - 1)]
-    found = _by_labels(recording, config) if way == "labels" else _by_events(recording, pair)
+    found = _by_labels(recording, config) if method == "labels" else _by_events(recording, pair)
     wanted = [segment for segment in found if task in (None, segment.task)]
     if not wanted:
-        listed = ", ".join(sorted({segment.task for segment in found})) or "none"
+        shown = ", ".join(sorted({segment.task for segment in found})) or "none"
         raise InputError(
-            f"The recording shows no {task or 'subtask'}; segmented by {way} it shows {listed}."
+            f"The recording shows no {task or 'subtask'}; segmented by {method} it shows {shown}."
         )
     return wanted
 
@@ -129,27 +126,36 @@ def _by_labels(recording: Recording, config: BagConfig) -> list[Segment]:
 def _by_events(recording: Recording, pair: HolePair) -> list[Segment]:
     if recording.needle is None:
         raise InputError(
-            "Contact and hole events need the needle's pose; the recording has none. Segment by labels."
+            "Contact and hole events need the needle's pose; the recording has none. "
+            "Segment by labels."
         )
-    lying, last = recording.needle, len(recording) - 1
-    passed = holes_passed(lying, pair)
+    poses_of_needle = recording.needle
+    last = len(recording) - 1
+    passed = holes_passed(poses_of_needle, pair)
     inside = (passed == 1.0) | (passed == 2.0)
-    first, second = (holds(recording, arm) for arm in names.ARMS)
+    held_by_psm1, held_by_psm2 = (holds(recording, arm) for arm in names.ARMS)
     found: list[Segment] = []
     start = 0
     while start < last:
-        taken = _next(second | inside, start)
-        entered = _next(inside, taken)
-        placed = (
-            taken
-            if entered > taken and inside[entered] and _near_entry(lying[taken], pair)
-            else entered
-        )
-        given = _next(first, _next(passed >= 2.0, placed))
-        there = _arrival(lying, placed, given) if first[given] else given
-        end = _release(first, lying, given) if first[given] else given
-        cuts = [start, taken, placed, there, given, end]
-        happened = [second[taken] or inside[taken], True, True, first[given], True]
+        # The samples at which the subtasks end, in the order of the procedure.
+        grasped = _next(held_by_psm2 | inside, start)
+        placed = _next(inside, grasped)
+        if placed > grasped and inside[placed] and _near_entry(poses_of_needle[grasped], pair):
+            placed = grasped
+        handed_off = _next(held_by_psm1, _next(passed >= 2.0, placed))
+        inserted = handed_off
+        end = handed_off
+        if held_by_psm1[handed_off]:
+            inserted = _arrival(poses_of_needle, placed, handed_off)
+            end = _release(held_by_psm1, poses_of_needle, handed_off)
+        cuts = [start, grasped, placed, inserted, handed_off, end]
+        happened = [
+            held_by_psm2[grasped] or inside[grasped],
+            True,
+            True,
+            held_by_psm1[handed_off],
+            True,
+        ]
         found += [
             Segment(task, begin, stop)
             for task, begin, stop, done in zip(
@@ -157,7 +163,7 @@ def _by_events(recording: Recording, pair: HolePair) -> list[Segment]:
             )
             if done and stop - begin >= SHORTEST
         ]
-        start = _next(~first, max(end, start + 1))
+        start = _next(~held_by_psm1, max(end, start + 1))
     return found
 
 
@@ -168,37 +174,40 @@ def _next(event: np.ndarray, start: int) -> int:
 
 
 def holds(recording: Recording, arm: str) -> np.ndarray:
-    """Say of each sample whether an arm holds the needle, by the geometry alone, (N,) bool."""
+    """Return for each sample whether an arm holds the needle, by the geometry alone, (N,)."""
     motion = recording.arms.get(arm)
     if motion is None or motion.jaw is None or recording.needle is None:
         return np.zeros(len(recording), bool)
     return held(arm, motion.tip, motion.jaw, recording.needle)
 
 
-def held(arm: str, tip: np.ndarray, jaw: np.ndarray, lying: np.ndarray) -> np.ndarray:
-    """Say whether an arm holds the needle: T_base_tip and T_world_needle (N, 4, 4), jaw (N,) [rad]
-    → (N,) bool.
+def held(arm: str, tip: np.ndarray, jaw: np.ndarray, needle_poses: np.ndarray) -> np.ndarray:
+    """Return for each sample whether an arm holds the needle, (N,) bool.
+
+    Args:
+        arm: the arm.
+        tip: T_base_tip, (N, 4, 4).
+        jaw: one finger's angle, (N,) [rad].
+        needle_poses: T_world_needle, (N, 4, 4).
     """
     tips = kinematics.base_in_world(arm) @ tip
     grasps = tips[:, :3, 3] + GRASP_DEPTH * tips[:, :3, 2]
     # In the needle's frame, clamped to its arc: the distance from a point to the nearest point of
     # the needle.
-    x, y, z = np.einsum("nji,nj->in", lying[:, :3, :3], grasps - lying[:, :3, 3])
+    x, y, z = np.einsum("nji,nj->in", needle_poses[:, :3, :3], grasps - needle_poses[:, :3, 3])
     angle = np.clip(np.arctan2(y, -x), 0.0, needle.TIP_ANGLE)
-    away = np.sqrt(
+    distance = np.sqrt(
         (x + needle.RADIUS * np.cos(angle)) ** 2 + (y - needle.RADIUS * np.sin(angle)) ** 2 + z**2
     )
     # A jaw that goes on closing has not closed on anything yet.
     later = np.stack(
         [np.pad(jaw, (0, shift), mode="edge")[shift:] for shift in range(2 * WINDOW)]
     ).min(axis=0)
-    return sustained((jaw < HOLD_JAW) & (jaw <= later + STILL) & (away < HOLD_REACH))
+    return sustained((jaw < HOLD_JAW) & (jaw <= later + STILL) & (distance < HOLD_REACH))
 
 
 def sustained(event: np.ndarray) -> np.ndarray:
-    """Return an event (N,) bool without its runs shorter than `SUSTAINED`, save one that the
-    recording cuts short.
-    """
+    """Return an event (N,) without runs shorter than `SUSTAINED`, except one at the very end."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], event.astype(int), [0]])))
     kept = np.zeros(len(event), bool)
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
@@ -206,8 +215,8 @@ def sustained(event: np.ndarray) -> np.ndarray:
     return kept
 
 
-class _Lying:
-    """A needle alone: what `envs.passage` asks of a simulation."""
+class _NeedleAlone:
+    """A needle without a simulation: what `envs.hole_crossing` needs of one."""
 
     radius = needle.RADIUS
 
@@ -222,15 +231,15 @@ class _Lying:
         return x, y, z
 
 
-def holes_passed(lying: np.ndarray, pair: HolePair) -> np.ndarray:
+def holes_passed(needle_poses: np.ndarray, pair: HolePair) -> np.ndarray:
     """Return `Memory.passed` of each needle pose (N, 4, 4), as an episode would have it, (N,).
 
     A needle that is out and comes back to the entry begins the next stitch, with none passed.
     """
     memory = Memory()
     passed = []
-    for index, pose in enumerate(lying):
-        seen = cast(Simulation, _Lying(poses.flat(pose)))
+    for index, pose in enumerate(needle_poses):
+        seen = cast(Simulation, _NeedleAlone(poses.flat(pose)))
         if index == 0:
             hole_crossing.remember_tip(seen, memory)
             memory.passed = 2.0 if hole_crossing.in_both(seen, pair) else 0.0
@@ -245,37 +254,35 @@ def holes_passed(lying: np.ndarray, pair: HolePair) -> np.ndarray:
 
 
 def _near_entry(pose: np.ndarray, pair: HolePair) -> bool:
-    """Say whether a needle is as near to the goal of place as an insertion starts."""
+    """Return True if a needle is as near to the goal of place as an insertion starts."""
     goal = Stitch.of(pair).place()
     tip = needle_frame(needle.TIP_ANGLE)
     away = np.linalg.norm((pose @ tip - goal @ tip)[:3, 3])
     return bool(away <= START_SHIFT and geodesic_angle(pose[:3, :3], goal[:3, :3]) <= START_TURN)
 
 
-def _arrival(lying: np.ndarray, start: int, stop: int) -> int:
+def _arrival(needle_poses: np.ndarray, start: int, stop: int) -> int:
     """Return the sample in [start, stop] from which the needle stays where it is at `stop`."""
-    there = lying[stop]
-    away = np.linalg.norm(lying[start : stop + 1, :3, 3] - there[:3, 3], axis=1) > ARRIVED
-    turn = (
-        Rotation.from_matrix(lying[start : stop + 1, :3, :3])
-        * Rotation.from_matrix(there[:3, :3]).inv()
-    )
+    goal = needle_poses[stop]
+    path = needle_poses[start : stop + 1]
+    away = np.linalg.norm(path[:, :3, 3] - goal[:3, 3], axis=1) > ARRIVED
+    turn = Rotation.from_matrix(path[:, :3, :3]) * Rotation.from_matrix(goal[:3, :3]).inv()
     far = np.flatnonzero(away | (turn.magnitude() > ARRIVED_TURN))
     return start + int(far[-1]) + 1 if len(far) else start
 
 
-def _release(first: np.ndarray, lying: np.ndarray, given: int) -> int:
+def _release(holding: np.ndarray, needle_poses: np.ndarray, start: int) -> int:
     """Return the sample of the needle's last move in PSM1's jaws."""
-    loose = np.flatnonzero(~first[given:])
-    end = given + int(loose[0]) - 1 if len(loose) else len(first) - 1
-    return max(_arrival(lying, given, end), given)
+    released = np.flatnonzero(~holding[start:])
+    end = start + int(released[0]) - 1 if len(released) else len(holding) - 1
+    return max(_arrival(needle_poses, start, end), start)
 
 
 # -- pauses ----------------------------------------------------------------------------------------
 
 
 def moving(tip: np.ndarray, jaw: np.ndarray) -> np.ndarray:
-    """Return the indices of the samples without the pauses; the first and the last are always kept.
+    """Return the indices of the samples outside pauses, the first and the last always among them.
 
     Args:
         tip: T_base_tip (N, 4, 4) at `RATE`.

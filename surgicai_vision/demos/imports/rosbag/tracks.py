@@ -1,22 +1,19 @@
-"""Pieces: the subtasks found in a bag, each as a track that can be replayed.
+"""Tracks: the subtasks found in a bag, each as a track that can be replayed.
 
-It stands between reading (`foreign`, `recording`, `segments`) and replaying (`bag_import`).
-
-    pieces, skipped = take_apart(Path("trial.bag"), None, BagConfig(), TaskConfig())
+tracks, skipped = extract_tracks(Path("trial.bag"), None, BagConfig(), TaskConfig())
 """
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import JSON, TaskConfig
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.demos.imports.replay import Episode, Track, grip_error, needle_path
-from surgicai_vision.demos.imports.rosbag.config import BagConfig, listed
-from surgicai_vision.demos.imports.rosbag.resample import Arm, Recording, recording_of
+from surgicai_vision.demos.imports.rosbag.config import BagConfig, topic_list
+from surgicai_vision.demos.imports.rosbag.resample import Arm, Recording, resample
 from surgicai_vision.demos.imports.rosbag.segments import Segment, holes_passed, moving, segments
 from surgicai_vision.demos.imports.sandbox import read_sandboxed
 from surgicai_vision.scene import kinematics, needle
@@ -24,28 +21,26 @@ from surgicai_vision.scene.holes import PAIRS
 from surgicai_vision.scene.rotations import matrix_to_rpy
 
 CLOSED = ("place", "insert", "pullout")
-"""Subtasks whose arm holds the needle from beginning to end: without a jaw on record it is
-closed.
-"""
-SLACK = 0.005
-"""Furthest an inferred needle may lie outside the jaws that hold it [m]: the paper lets place and
+"""Subtasks whose arm holds the needle throughout: a jaw that was not recorded is closed."""
+MAX_GRIP_ERROR = 0.005
+"""Furthest an inferred needle may be outside the jaws that hold it [m]: the paper lets place and
 insert end that far from their goals."""
 START_JAW = kinematics.PSM1_START[6]
-"""Jaw of an arm that does not hold the needle and whose jaw is not on record [rad]."""
+"""Jaw of an arm that does not hold the needle and whose jaw was not recorded [rad]."""
 
 
-class Unusable(SurgicaiError):
+class UnusableSegment(SurgicaiError):
     """A part of a recording that cannot be replayed."""
 
 
 @dataclass(frozen=True)
-class Piece:
+class SegmentTrack:
     """One subtask found in a bag.
 
     Attributes:
         bag: the bag's name.
         task: the subtask.
-        begin, end: where it lies, in seconds of the recording.
+        begin, end: its first and last time in the recording [s].
         track: what is replayed.
         pauses: samples left out because the arm rested.
     """
@@ -57,16 +52,17 @@ class Piece:
     track: Track
     pauses: int
 
-    def row(self, reason: str) -> dict[str, Any]:
-        """Return what is told of a piece that is skipped."""
+    def row(self, reason: str) -> dict[str, JSON]:
+        """Return the entry of a segment that is skipped."""
         return _row(self.bag, self.task, self.begin, self.end, reason)
 
 
-def take_apart(
+def extract_tracks(
     bag: Path, task: str | None, config: BagConfig, base: TaskConfig
-) -> tuple[list[Piece], list[dict[str, Any]]]:
-    """Return the pieces of a bag, and the parts that cannot be used, {"bag", "task", "from", "to",
-    "reason"}.
+) -> tuple[list[SegmentTrack], list[dict[str, JSON]]]:
+    """Return the tracks of a bag's segments, and what is skipped.
+
+    A skipped segment is {"bag", "task", "from", "to", "reason"}.
 
     Args:
         bag: the bag.
@@ -82,24 +78,26 @@ def take_apart(
         bag, "bag", topics=config.all_topics, needed=list(config.topics.given())
     )
     try:
-        recording = recording_of(arrays, config, base.scene.instrument)
+        recording = resample(arrays, config, base.scene.instrument)
         pair = PAIRS[base.scene.layout][base.scene.hole_pair - 1]
         found = segments(recording, pair, config, task)
         passed = None if recording.needle is None else holes_passed(recording.needle, pair)
-        pieces, skipped = [], []
+        tracks = []
+        skipped = []
         for segment in found:
-            begin, end = (float(recording.time[index]) for index in (segment.start, segment.stop))
+            begin = float(recording.time[segment.start])
+            end = float(recording.time[segment.stop])
             try:
                 track, pauses = _track(recording, passed, segment, config, base)
-                pieces.append(Piece(bag.name, segment.task, begin, end, track, pauses))
-            except Unusable as error:
+                tracks.append(SegmentTrack(bag.name, segment.task, begin, end, track, pauses))
+            except UnusableSegment as error:
                 skipped.append(_row(bag.name, segment.task, begin, end, str(error)))
     except InputError as error:
         raise type(error)(f"{bag}: {error}") if type(error) is InputError else error from None
-    return pieces, skipped
+    return tracks, skipped
 
 
-def _row(bag: str, task: str, begin: float, end: float, reason: str) -> dict[str, Any]:
+def _row(bag: str, task: str, begin: float, end: float, reason: str) -> dict[str, JSON]:
     return {
         "bag": bag,
         "task": task,
@@ -119,7 +117,7 @@ def _track(
     """Return a segment's track without its pauses, and how many samples were left out."""
     whole = slice(segment.start, segment.stop + 1)
     if not recording.valid[whole].all():
-        raise Unusable(f"a topic is silent for over {config.max_gap:g} s")
+        raise UnusableSegment(f"a topic is silent for over {config.max_gap:g} s")
     active = names.ACTIVE_ARM[segment.task]
     arms = {
         arm: (motion.tip, _jaw(recording, arm, segment.task, config))
@@ -129,26 +127,22 @@ def _track(
         wanted = config.all_topics[f"{active}_pose"]
         raise InputError(
             f"{segment.task} is done by {active}, whose pose is not on {wanted}. "
-            f"The topics are {listed(recording.topics, wanted)}."
+            f"The topics are {topic_list(recording.topics, wanted)}."
         )
     tip, jaw = arms[active]
-    kept = (
-        moving(tip[whole], jaw[whole])
-        if config.drop_pauses
-        else np.arange(segment.stop - segment.start + 1)
-    )
-    index = segment.start + kept
+    index = np.arange(segment.start, segment.stop + 1)
+    if config.drop_pauses:
+        index = segment.start + moving(tip[whole], jaw[whole])
     if len(index) < 3:
-        raise Unusable("the arm does not move")
-    lying = (
-        _inferred(tip[index], jaw[index], segment.task, base)
-        if recording.needle is None
-        else recording.needle[index]
-    )
+        raise UnusableSegment("the arm does not move")
+    if recording.needle is None:
+        needle_poses = _inferred(tip[index], jaw[index], segment.task, base)
+    else:
+        needle_poses = recording.needle[index]
     return Track(
         {arm: (poses[index], angles[index]) for arm, (poses, angles) in arms.items()},
-        lying,
-        _grasp_angle(active, tip[index[-1]], lying[-1]),
+        needle_poses,
+        _grasp_angle(active, tip[index[-1]], needle_poses[-1]),
         None if passed is None else passed[index],
     ), segment.stop - segment.start + 1 - len(index)
 
@@ -163,33 +157,31 @@ def _jaw(recording: Recording, arm: str, task: str, config: BagConfig) -> np.nda
         wanted = config.all_topics[f"{arm}_jaw"]
         raise InputError(
             f"{task} needs the jaw of {arm}, which is not on {wanted}. "
-            f"The topics are {listed(recording.topics, wanted)}."
+            f"The topics are {topic_list(recording.topics, wanted)}."
         )
     holding = (arm == active and task in CLOSED) or (arm == names.PSM2 and task == "handoff")
     return np.full(len(recording), 0.0 if holding else START_JAW)
 
 
-def _grasp_angle(arm: str, tip: np.ndarray, lying: np.ndarray) -> float:
-    """Return the needle's point that lies nearest to an arm's jaws [rad]: the grasp that was
-    shown.
-    """
-    x, y, _ = (np.linalg.inv(lying) @ kinematics.base_in_world(arm) @ tip)[:3, 3]
+def _grasp_angle(arm: str, tip: np.ndarray, needle_pose: np.ndarray) -> float:
+    """Return the needle's point that is nearest to an arm's jaws, the demonstrated grasp [rad]."""
+    x, y, _ = (np.linalg.inv(needle_pose) @ kinematics.base_in_world(arm) @ tip)[:3, 3]
     return float(np.clip(np.arctan2(y, -x), 0.0, needle.TIP_ANGLE))
 
 
 def _inferred(tip: np.ndarray, jaw: np.ndarray, task: str, base: TaskConfig) -> np.ndarray:
-    """Return T_world_needle (T + 1, 4, 4) of a piece that has no needle: where the task's
-    definition puts it.
-    """
+    """Return T_world_needle (T + 1, 4, 4) where the task's definition puts an unseen needle."""
     if (base.scene.layout, base.scene.hole_pair) != ("simple", 1):
         raise InputError(
             "A bag without the needle's pose can be replayed at hole pair 1 of layout simple alone."
         )
     rpy = np.unwrap([matrix_to_rpy(pose[:3, :3]) for pose in tip], axis=0)
     poses = np.column_stack([tip[:, :3, 3], rpy, jaw])
-    nothing = np.zeros(len(poses) - 1)
-    episode = Episode(poses, poses[-1], np.zeros((len(nothing), 7)), nothing, nothing > 0)
+    zeros = np.zeros(len(poses) - 1)
+    episode = Episode(poses, poses[-1], np.zeros((len(zeros), 7)), zeros, zeros > 0)
     error = grip_error(episode, task)
-    if error > SLACK:
-        raise Unusable(f"with this end the needle would lie {error * 1e3:.0f} mm outside the jaws")
+    if error > MAX_GRIP_ERROR:
+        raise UnusableSegment(
+            f"with this end the needle would lie {error * 1e3:.0f} mm outside the jaws"
+        )
     return needle_path(episode, task)
