@@ -38,7 +38,7 @@ keys (by their place on a US keyboard) and gamepad:
 Only successes are kept. The same command goes on where a session was stopped or killed.""",
 )
 SECONDS = 60.0
-"""Time a subtask may take [s]; the paper's 4 s suit a policy, not a hand."""
+"""Time a subtask may take [s]; the paper's 4 s suit a policy, not a person."""
 WEB_PORT = 8765
 
 
@@ -89,8 +89,8 @@ class Options:
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Let a person drive and record, and print what was kept."""
     from surgicai_vision import envs
-    from surgicai_vision.teleoperation.input_mapping import Steering
-    from surgicai_vision.teleoperation.loop import Views, drive
+    from surgicai_vision.teleoperation.input_mapping import InputMapping
+    from surgicai_vision.teleoperation.loop import EnvViews, run_session
     from surgicai_vision.teleoperation.pacer import Pacer
     from surgicai_vision.teleoperation.recordings import open_recordings
     from surgicai_vision.teleoperation.session import Rules, Session
@@ -104,12 +104,16 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         env = envs.make(config)
         with open_recordings(out, config, env.scene.hash, options.seed) as recordings:
             session = Session(
-                env, Steering(env, options.frame, options.speed), recordings, options.view, rules
+                env,
+                InputMapping(env, options.frame, options.speed),
+                recordings,
+                options.view,
+                rules,
             )
-            views = Views(env, options.view, options.size)
+            views = EnvViews(env, options.view, options.size)
             for line in page.invitation:
                 console.note(line)
-            drive(
+            run_session(
                 session,
                 page,
                 page,
@@ -119,25 +123,22 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             )
             views.close()
     env.close()
-    held = (
-        f"{len(recordings.seeds)} demonstrations: {out}"
-        if recordings.seeds
-        else "no demonstrations yet."
-    )
-    console.say(f"{session.kept} kept, {session.discarded} discarded; {held}")
+    count = len(recordings.seeds)
+    total = f"{count} demonstrations: {out}" if count else "no demonstrations yet."
+    console.say(f"{session.kept} kept, {session.discarded} discarded; {total}")
     return {
         "task": options.task,
         "kept": session.kept,
         "discarded": session.discarded,
         "skipped": session.skipped,
         "steps": session.steps_kept,
-        "episodes": len(recordings.seeds),
+        "episodes": count,
         "demos": str(out),
     }
 
 
 def _config(options: Options) -> TaskConfig:
-    """Return the task's configuration with the time that a hand needs."""
+    """Return the task's configuration with the time that a person needs."""
     config = task_config(options.task, options.env)
     if options.env and options.env.get("max_steps"):
         if options.seconds is not None:

@@ -1,15 +1,13 @@
-"""Teleoperation: a person drives the active arm and keeps what succeeded, as demonstrations like
-any others.
+"""Teleoperation: a person drives the active arm; what succeeded is kept as demonstrations.
 
-    keys, sticks ──poll──► Input ──Steering──► action (7,) ──Session.tick──► env ──► Recordings: a
-    file an episode
-       web page ◄──────────────────── images and status ◄────────┘
+    keys, sticks ──poll──► Input ──InputMapping──► action (7,) ──Session.tick──► env ──► Recordings
+       web page ◄───────────────── images and status ◄──────────────┘
 
 The parts, each usable and tested alone:
 
-* `commands`: what a hand can say (`Input`: three motions, three turns, the jaw, fine or not,
-  events) and the protocol `Device`. `steering`: the env's action of it, in the axes of a camera or
-  of the tool.
+* `inputs`: what a person can command at one moment (`Input`: three translations, three rotations,
+  the jaw, fine or not, events) and the protocol `Device`. `input_mapping`: the env's action for it,
+  in the axes of a camera or of the tool.
 * `keyboard`, `gamepad`: presses and releases, axes and buttons → `Input`. The key table that
   `--help`, the page and the documentation show is in `keyboard`. Keys are named as browsers name
   them (`KeyboardEvent.code`): by their place on the keyboard, whatever is printed on them.
@@ -17,9 +15,9 @@ The parts, each usable and tested alone:
   one control step of 20 ms each; no clock, no thread, no randomness but the episode's seed: the
   same inputs give the same files.
 * `recordings`: the folder. An episode is written whole as soon as it is kept, so a process killed
-  at any moment costs the attempt in flight; the same command continues the numbers and the seeds.
-* `pacing`: ticks at 50 Hz of the wall clock. When drawing is too slow, images are dropped, never
-  ticks.
+  at any moment costs the attempt under way; the same command continues the numbers and the seeds.
+* `pacer`, `loop`: ticks at 50 Hz of the wall clock. When rendering is too slow, images are dropped,
+  never ticks.
 * `web`: the page on which a person sees and acts; a `Device` and a `Screen` (`loop`).
 
 The page's server listens on loopback only, its address holds a random token, and a gamepad on the

@@ -1,4 +1,4 @@
-"""Gamepad: axes and buttons in the order of the W3C's standard gamepad become an `Input`.
+"""Gamepad: axes and buttons of a W3C standard gamepad become an `Input`.
 
 A browser's Gamepad API reports gamepads with the mapping "standard" in this order.
 """
@@ -8,13 +8,13 @@ from types import MappingProxyType
 
 from surgicai_vision.teleoperation.inputs import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
 
-AXES, BUTTONS = 4, 16
-"""Left stick x y, right stick x y, each in [-1, 1], y downwards; and the buttons of the
-standard.
-"""
-DEAD = 0.12
+AXES = 4
+"""Left stick x y, right stick x y, each in [-1, 1], y downwards."""
+BUTTONS = 16
+DEAD_ZONE = 0.12
 """Deflection below which a stick is at rest; worn sticks stay up to a tenth off."""
 PRESSED = 0.5
+"""Value from which on a button is pressed."""
 _X, _LB, _RB, _LT, _RT, _UP, _DOWN = 2, 4, 5, 6, 7, 12, 13
 PRESSES = MappingProxyType({0: JAW, 3: VIEW, 8: STOP, 9: START, 14: DISCARD, 15: KEEP})
 """Button → event."""
@@ -29,26 +29,28 @@ class Gamepad:
         self._events: list[str] = []
 
     def update(self, axes: Sequence[float], buttons: Sequence[float]) -> None:
-        """Take over the present state; shorter lists leave the rest at rest."""
+        """Take over the present state; what shorter lists leave out is at rest."""
         self._axes = _filled(axes, AXES)
-        before, self._buttons = self._buttons, _filled(buttons, BUTTONS)
+        before = self._buttons
+        self._buttons = _filled(buttons, BUTTONS)
         for index, event in PRESSES.items():
             if before[index] < PRESSED <= self._buttons[index]:
                 self._events.append(event)
 
     def release_all(self) -> None:
-        """Let everything go: the gamepad is away."""
+        """Release everything: the gamepad is gone."""
         self.update((), ())
 
     def poll(self) -> Input:
         """Return the present deflections, and the buttons pressed since the last call."""
-        x, y, across, upright = map(curve, self._axes)
+        x, y, right_x, right_y = map(curve, self._axes)
         button = self._buttons
-        events, self._events = tuple(self._events), []
+        events = tuple(self._events)
+        self._events = []
         down = [value >= PRESSED for value in button]
         return Input(
             move=(x, y, curve(button[_RT]) - curve(button[_LT])),
-            turn=(-upright, across, float(down[_RB]) - float(down[_LB])),
+            turn=(-right_y, right_x, float(down[_RB]) - float(down[_LB])),
             jaw=float(down[_UP]) - float(down[_DOWN]),
             fine=down[_X],
             events=events,
@@ -56,8 +58,8 @@ class Gamepad:
 
 
 def curve(deflection: float) -> float:
-    """Return the speed of a deflection: nothing near the middle, gentle beyond it, 1 at the end."""
-    share = max(0.0, (min(abs(deflection), 1.0) - DEAD) / (1.0 - DEAD))
+    """Return the speed of a deflection: 0 in the dead zone, then quadratic, 1 at the end."""
+    share = max(0.0, (min(abs(deflection), 1.0) - DEAD_ZONE) / (1.0 - DEAD_ZONE))
     return share * share if deflection > 0 else -share * share
 
 

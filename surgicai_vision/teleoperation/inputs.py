@@ -1,9 +1,9 @@
-"""Commands: what a hand can say, and the protocol of whatever says it.
+"""Inputs: what a person can command at one moment, and the protocol of an input device.
 
 Axes are those of an image, as OpenCV has them: x right, y down, z away from the viewer, into the
 image. A turn is about these axes by the right-hand rule: about x it tilts what points away upwards,
-about y it swings it to the right, about z it rolls clockwise. In the tool's frame the viewer looks
-out of the instrument: z points out between the jaws.
+about y it swings it to the right, about z it rolls clockwise. In the tool's frame the view is along
+the instrument: z points out between the jaws.
 """
 
 from collections.abc import Iterable
@@ -12,24 +12,27 @@ from typing import Protocol
 
 Vector = tuple[float, float, float]
 
-KEEP, DISCARD, STOP, START = "keep", "discard", "stop", "start"
-JAW, VIEW = "jaw", "view"
+KEEP = "keep"
+DISCARD = "discard"
+STOP = "stop"
+START = "start"
+JAW = "jaw"
+VIEW = "view"
 EVENTS = (KEEP, DISCARD, STOP, START, JAW, VIEW)
-"""What happens once a press: → ← Esc of `lerobot-record`, begin, open or close the jaw, lead with
-the next view.
-"""
+"""What happens once a press: → ← Esc as in `lerobot-record`, start, open or close the jaw, lead
+with the next view."""
 
 
 @dataclass(frozen=True)
 class Input:
-    """What the hands do at one moment.
+    """What a person commands at one moment.
 
     Attributes:
         move: along x, y, z of the frame, each in [-1, 1].
         turn: about x, y, z of the frame, each in [-1, 1].
         jaw: opening (1) or closing (-1).
         fine: the fine modifier is held.
-        events: what was pressed since the last moment, of `EVENTS`, in order.
+        events: what was pressed since the last input, of `EVENTS`, in order.
     """
 
     move: Vector = (0.0, 0.0, 0.0)
@@ -39,27 +42,27 @@ class Input:
     events: tuple[str, ...] = ()
 
     @property
-    def moves(self) -> bool:
-        """Say whether anything is meant to move by what is held."""
+    def is_moving(self) -> bool:
+        """Return True if a motion of the tool or the jaw is held."""
         return any(self.move) or any(self.turn) or self.jaw != 0.0
 
 
 class Device(Protocol):
-    """Where inputs come from."""
+    """A source of inputs."""
 
     def poll(self) -> Input:
-        """Return what the hands do now; each event is returned once."""
+        """Return the present input; each event is returned once."""
 
 
-def merged(inputs: Iterable[Input]) -> Input:
-    """Return several hands as one: motions add up to at most 1, events follow one another."""
-    parts = tuple(inputs)
-    rows = (
-        zip(*((*part.move, *part.turn, part.jaw) for part in parts), strict=True)
-        if parts
-        else [(0.0,)] * 7
-    )
-    x, y, z, tilt, swing, roll, jaw = (min(max(sum(row), -1.0), 1.0) for row in rows)
-    events = tuple(event for part in parts for event in part.events)
-    fine = any(part.fine for part in parts)
-    return Input((x, y, z), (tilt, swing, roll), jaw, fine, events)
+def merge(inputs: Iterable[Input]) -> Input:
+    """Return several inputs as one: motions are added up to at most 1, events are concatenated."""
+    sums = [0.0] * 7
+    fine = False
+    events: list[str] = []
+    for one in inputs:
+        for axis, value in enumerate((*one.move, *one.turn, one.jaw)):
+            sums[axis] += value
+        fine = fine or one.fine
+        events += one.events
+    x, y, z, tilt, swing, roll, jaw = (min(max(value, -1.0), 1.0) for value in sums)
+    return Input((x, y, z), (tilt, swing, roll), jaw, fine, tuple(events))

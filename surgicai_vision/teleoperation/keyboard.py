@@ -12,7 +12,13 @@ from surgicai_vision.teleoperation.inputs import DISCARD, JAW, KEEP, START, STOP
 
 
 class Row(NamedTuple):
-    """A row of the key table: keys (codes), their names on a gamepad, what they do."""
+    """A row of the key table.
+
+    Attributes:
+        codes: the keys.
+        gamepad: what does the same on a gamepad.
+        meaning: what they do.
+    """
 
     codes: tuple[str, ...]
     gamepad: str
@@ -30,7 +36,7 @@ TABLE = (
     Row(("KeyX", "KeyZ"), "D-pad up, down", "open, close the jaw a little"),
     Row(("ShiftLeft", "ShiftRight"), "X, held", "slow and fine, a fifth of the speed"),
     Row(("KeyV",), "Y", "lead with the next view: its image is large, its axes count"),
-    Row(("Enter",), "Start", "begin without moving"),
+    Row(("Enter",), "Start", "start without moving"),
     Row(
         ("ArrowRight",),
         "D-pad right",
@@ -43,11 +49,22 @@ TABLE = (
 
 MOTIONS = MappingProxyType(
     {
-        "KeyD": (0, 1.0), "KeyA": (0, -1.0), "KeyS": (1, 1.0), "KeyW": (1, -1.0), "KeyE": (2, 1.0), "KeyQ": (2, -1.0),
-        "KeyI": (3, 1.0), "KeyK": (3, -1.0), "KeyL": (4, 1.0), "KeyJ": (4, -1.0), "KeyO": (5, 1.0), "KeyU": (5, -1.0),
-        "KeyX": (6, 1.0), "KeyZ": (6, -1.0),
+        "KeyD": (0, 1.0),
+        "KeyA": (0, -1.0),
+        "KeyS": (1, 1.0),
+        "KeyW": (1, -1.0),
+        "KeyE": (2, 1.0),
+        "KeyQ": (2, -1.0),
+        "KeyI": (3, 1.0),
+        "KeyK": (3, -1.0),
+        "KeyL": (4, 1.0),
+        "KeyJ": (4, -1.0),
+        "KeyO": (5, 1.0),
+        "KeyU": (5, -1.0),
+        "KeyX": (6, 1.0),
+        "KeyZ": (6, -1.0),
     }
-)  # fmt: skip
+)
 """Key → its place in (move, turn, jaw) and its sign."""
 FINE_KEYS = ("ShiftLeft", "ShiftRight")
 PRESSES = MappingProxyType(
@@ -82,9 +99,7 @@ class Keyboard:
         self._events: list[str] = []
 
     def press(self, code: str) -> None:
-        """Note that a key went down; one that is down already (autorepeat) or means nothing changes
-        nothing.
-        """
+        """Note that a key went down; autorepeat and keys without a meaning change nothing."""
         if code not in CODES or code in self._held:
             return
         self._held[code] = self._tapped[code] = None
@@ -96,9 +111,7 @@ class Keyboard:
         self._held.pop(code, None)
 
     def hold(self, codes: Iterable[str]) -> None:
-        """Note that these keys are down and no others, without a press: what they do once is not
-        done.
-        """
+        """Note that these keys are down and no others, without the events of a press."""
         down = {code: None for code in codes if code in CODES}
         self._tapped |= {code: None for code in down if code in MOTIONS}
         self._held = down
@@ -108,19 +121,19 @@ class Keyboard:
         self._held.clear()
 
     def poll(self) -> Input:
-        """Return what is held, or was for a moment since the last call, and what was pressed."""
+        """Return what is held or was tapped since the last call, and the events of presses."""
         down = {**self._held, **self._tapped}
-        seven = [0.0] * 7
+        motion = [0.0] * 7
         for code in down:
             if code in MOTIONS:
                 axis, sign = MOTIONS[code]
-                seven[axis] += sign
+                motion[axis] += sign
         events = tuple(self._events)
-        self._tapped, self._events = {}, []
+        self._tapped = {}
+        self._events = []
         fine = any(code in down for code in FINE_KEYS)
-        return Input(
-            (seven[0], seven[1], seven[2]), (seven[3], seven[4], seven[5]), seven[6], fine, events
-        )
+        x, y, z, tilt, swing, roll, jaw = motion
+        return Input((x, y, z), (tilt, swing, roll), jaw, fine, events)
 
 
 def key_name(code: str) -> str:

@@ -1,32 +1,41 @@
-"""Driving: the loop that joins a session, a device, a screen and the clock."""
+"""Loop: joins a session, an input device, a screen and the clock."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
+from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.scene.rendering import FrameRenderer
 from surgicai_vision.teleoperation.inputs import Device
 from surgicai_vision.teleoperation.pacer import Pacer
 from surgicai_vision.teleoperation.session import Session, Status
 
-Images = Mapping[str, NDArray[Any]]
-"""View → (size, size, 3) uint8."""
+Images = Mapping[str, NDArray[np.uint8]]
+"""View → image (size, size, 3)."""
 
 
 class Screen(Protocol):
-    """Where the person sees."""
+    """Shows images and the session's status to a person."""
 
-    def wants(self) -> bool:
-        """Say whether a new image would be seen."""
+    def wants_image(self) -> bool:
+        """Return True if a new image would be seen."""
 
     def show(self, images: Images, status: Status) -> None:
-        """Show what the views see now; the images are the screen's to keep."""
+        """Show new images and the status; the screen may keep the images."""
 
 
-class Views:
-    """Draws the views of an env, in this thread.
+class Views(Protocol):
+    """Renders what a session's views show."""
+
+    def render(self) -> Images:
+        """Return the present image of every view."""
+
+
+class EnvViews:
+    """Renders the views of an env, in this thread.
 
     Args:
         env: the env.
@@ -34,18 +43,19 @@ class Views:
         size: side of an image [pixel].
     """
 
-    def __init__(self, env: Any, cameras: tuple[str, ...], size: int):
-        self._env, self._cameras, self._size = env, cameras, size
-        self._renderer, self._draws = FrameRenderer(env.model, size, size), env.simulation.draws
+    def __init__(self, env: SuturingEnv, cameras: tuple[str, ...], size: int):
+        self._env = env
+        self._cameras = cameras
+        self._size = size
+        self._renderer = FrameRenderer(env.model, size, size)
+        self._draws = env.simulation.draws
 
-    def look(self) -> Images:
-        """Return what every view sees now."""
+    def render(self) -> Images:
+        """Return the present image of every view."""
         if self._env.simulation.draws is not self._draws:  # the needle may have another shape now
             self.close()
-            self._renderer, self._draws = (
-                FrameRenderer(self._env.model, self._size, self._size),
-                self._env.simulation.draws,
-            )
+            self._renderer = FrameRenderer(self._env.model, self._size, self._size)
+            self._draws = self._env.simulation.draws
         return {
             camera: self._renderer.render(self._env.data, camera, names.RGB)
             for camera in self._cameras
@@ -56,35 +66,38 @@ class Views:
         self._renderer.close()
 
 
-def drive(
+def run_session(
     session: Session,
     device: Device,
     screen: Screen,
     views: Views,
     pacer: Pacer,
-    heard: Callable[[Status], None] = lambda status: None,
+    on_message: Callable[[Status], None] = lambda status: None,
 ) -> None:
     """Run the session until it stops.
 
     Args:
-        session: what to run.
-        device: where inputs come from.
-        screen: where images go.
-        views: what draws them.
+        session: the session.
+        device: the source of its inputs.
+        screen: shows images and status.
+        views: renders the images.
         pacer: keeps the time.
-        heard: called with the status after every tick that changed its message.
+        on_message: called with the status after every tick that changed its message.
     """
-    message, moment, images = "", None, views.look()
+    message = ""
+    progress: tuple[int, ...] = ()
+    images = views.render()
     while not session.over:
         session.tick(device.poll())
         status = session.status()
         if status.message != message:
             message = status.message
-            heard(status)
-        if screen.wants() and pacer.may_draw():
+            on_message(status)
+        if screen.wants_image() and pacer.can_draw():
             now = (status.kept, status.discarded, status.skipped, status.steps)
-            if now != moment:  # else nothing has moved since the last image
-                moment, images = now, views.look()
+            if now != progress:  # else nothing has moved since the last image
+                progress = now
+                images = views.render()
             screen.show(images, status)
         pacer.wait()
     screen.show(images, session.status())

@@ -1,17 +1,13 @@
-"""Pacing: ticks at a fixed rate of the wall clock; where drawing takes too long, images are
-dropped, never ticks.
-"""
+"""Pacer: ticks at a fixed rate of the wall clock; slow rendering costs images, never ticks."""
 
 import time
 from collections.abc import Callable
 
 from surgicai_vision.core import names
 
-BEHIND = 5
-"""Ticks that may be caught up; what is lost beyond them is given up, for a hand cannot steer a
-burst.
-"""
-BLIND = 10
+MAX_CATCH_UP_TICKS = 5
+"""Ticks that may be caught up; those beyond are dropped, since nobody can steer a burst."""
+MAX_TICKS_WITHOUT_IMAGE = 10
 """Ticks after which an image is due even when late: five a second."""
 
 
@@ -19,8 +15,8 @@ class Pacer:
     """Keeps the time of a loop that ticks and draws.
 
     Args:
-        pace: share of real time; 0.5 is half as fast as life.
-        clock: seconds, monotonic.
+        pace: share of real time; 0.5 is half speed.
+        clock: returns monotonic seconds.
         sleep: waits so many seconds.
     """
 
@@ -30,18 +26,19 @@ class Pacer:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
-        self._period, self._clock, self._sleep = 1.0 / (names.FPS * pace), clock, sleep
+        self._period = 1.0 / (names.FPS * pace)
+        self._clock = clock
+        self._sleep = sleep
         self._due = clock() + self._period
-        self._blind = 0
+        self._ticks_without_image = 0
 
-    def may_draw(self) -> bool:
-        """Say whether an image fits in before the next tick is due, or has been missing for too
-        long.
-        """
-        self._blind += 1
-        if self._clock() >= self._due and self._blind < BLIND:
+    def can_draw(self) -> bool:
+        """Return True if there is time for an image, or the last one is too long ago."""
+        self._ticks_without_image += 1
+        is_late = self._clock() >= self._due
+        if is_late and self._ticks_without_image < MAX_TICKS_WITHOUT_IMAGE:
             return False
-        self._blind = 0
+        self._ticks_without_image = 0
         return True
 
     def wait(self) -> None:
@@ -49,6 +46,6 @@ class Pacer:
         now = self._clock()
         if now < self._due:
             self._sleep(self._due - now)
-        elif now > self._due + BEHIND * self._period:
+        elif now > self._due + MAX_CATCH_UP_TICKS * self._period:
             self._due = now
         self._due += self._period

@@ -33,9 +33,9 @@ class Recordings:
     """The episodes of one folder; made by `open_recordings`.
 
     Args:
-        folder: where they lie.
+        folder: the folder.
         request: what the folder is for; kept in its marker.
-        seeds: of the episodes that lie there, in their order.
+        seeds: those of the episodes in the folder, in their order.
         skipped: seeds given up, {"seed", "reason"}.
     """
 
@@ -46,28 +46,30 @@ class Recordings:
         seeds: list[int],
         skipped: list[dict[str, Any]],
     ):
-        self.folder, self._request = folder, request
-        self.seeds, self.skipped = seeds, skipped
+        self.folder = folder
+        self._request = request
+        self.seeds = seeds
+        self.skipped = skipped
 
     @property
     def next_seed(self) -> int:
         """Return the first seed after all that were kept or given up."""
-        gone = [*self.seeds, *(row["seed"] for row in self.skipped)]
-        return max(gone, default=int(self._request["seed"]) - 1) + 1
+        used = [*self.seeds, *(row["seed"] for row in self.skipped)]
+        return max(used, default=int(self._request["seed"]) - 1) + 1
 
     def keep(self, demo: Demo) -> Path:
         """Write an episode, whole or not at all."""
         path = write_demo(self.folder, len(self.seeds), demo)
         self.seeds.append(demo.seed)
-        self._note()
+        self._write_marker()
         return path
 
     def skip(self, seed: int, reason: str) -> None:
-        """Write down that no episode is wanted from `seed`."""
+        """Note that no episode is wanted from `seed`."""
         self.skipped.append({"seed": seed, "reason": reason})
-        self._note()
+        self._write_marker()
 
-    def _note(self) -> None:
+    def _write_marker(self) -> None:
         details = {
             "request": self._request,
             "seeds": self.seeds,
@@ -89,7 +91,7 @@ def open_recordings(
         folder: made if it does not exist; removed again if nothing came into it.
         config: the task; a folder holds one.
         scene_hash: hash of the compiled scene.
-        seed: first seed of a new folder, 0 by default; an old one goes on where it is.
+        seed: first seed of a new folder, 0 by default; an existing one is continued.
 
     Raises:
         OutputExists: the folder holds something else.
@@ -115,7 +117,7 @@ def open_recordings(
 
 
 def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -> Recordings:
-    """Return what lies in a folder; an empty one begins at `seed`."""
+    """Return the recordings in a folder; a new one starts at `seed`."""
     request = {
         "task": to_mapping(config),
         "demonstrator": DEMONSTRATOR,
@@ -125,19 +127,21 @@ def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -
     if not (folder / MARKER).exists() and not any(folder.glob("episode_*")):
         return Recordings(folder, request, [], [])
     marker = read_marker(folder)
-    before = marker.get("request")
-    if seed is None and isinstance(before, dict):
-        request["seed"] = before.get("seed", 0)
-    if before != request:
+    stored = marker.get("request")
+    if seed is None and isinstance(stored, dict):
+        request["seed"] = stored.get("seed", 0)
+    if stored != request:
         raise OutputExists(
-            f"--out {folder} holds demonstrations of another command, task or scene (see {folder / MARKER}); "
-            "give another folder."
+            f"--out {folder} holds demonstrations of another command, task or scene "
+            f"(see {folder / MARKER}); give another folder."
         )
     paths = list_demos(folder) if any(folder.glob("episode_*")) else []
-    seeds, skipped = marker.get("seeds"), marker.get("skipped")
+    seeds = marker.get("seeds")
+    skipped = marker.get("skipped")
     if not (isinstance(seeds, list) and isinstance(skipped, list)):
         raise BadFile(
-            f"{folder / MARKER} does not say which seeds were kept and given up; give another folder."
+            f"{folder / MARKER} does not say which seeds were kept and given up; "
+            "give another folder."
         )
     if len(seeds) != len(paths):  # killed between an episode and its entry
         seeds = [read_demo(path).seed for path in paths]

@@ -6,30 +6,35 @@
 → keeps an episode that succeeded and goes on to the next start. Where there is no success yet it
 gives the start up: in `waiting` at once, in `driving` after the episode was judged a failure. ←
 discards and goes back to the same start. Esc stops; a success that waits for its answer is kept. An
-episode begins when nothing was held and something moves, so a key still held from the last one does
+episode starts when nothing was held and something moves, so a key still held from the last one does
 not start the next.
 
-Nothing here knows the time: the same inputs give the same files.
+A session has no clock: the same inputs give the same files.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.files import code_version
 from surgicai_vision.demos.store import Demo
-from surgicai_vision.teleoperation.input_mapping import Steering
+from surgicai_vision.envs.base import SuturingEnv
+from surgicai_vision.envs.success import Info
+from surgicai_vision.teleoperation.input_mapping import InputMapping
 from surgicai_vision.teleoperation.inputs import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
 from surgicai_vision.teleoperation.recordings import DEMONSTRATOR, Recordings
 
-WAITING, DRIVING, JUDGED, STOPPED = "waiting", "driving", "judged", "stopped"
+WAITING = "waiting"
+DRIVING = "driving"
+JUDGED = "judged"
+STOPPED = "stopped"
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What a session does by itself.
+    """What a session does without asking.
 
     Attributes:
         episodes: stop when so many more were kept; None goes on until Esc.
@@ -46,18 +51,19 @@ class Rules:
 
 @dataclass(frozen=True)
 class Status:
-    """What the person is told.
+    """What a person is shown of a session.
 
     Attributes:
         state: "waiting", "driving", "judged" or "stopped".
         message: what happened and what to do, one line.
-        success: the present episode's, once judged.
+        success: whether the present episode succeeded, once judged.
         episode: number that the next kept episode gets.
-        seed: of the present start.
-        kept, discarded, skipped: in this session.
+        seed: seed of the present start.
+        kept, discarded, skipped: counts in this session.
         steps, limit: control steps of the attempt, and how many it may take.
-        subtask, arm: what is due, and with which arm.
-        distance: from the goal [m]; angle: from it [rad].
+        subtask, arm: the subtask under way, and its arm.
+        distance: distance from the goal [m].
+        angle: angle from the goal [rad].
         contact: both jaws touch the needle.
         view: the leading view.
         fine: the fine modifier is held.
@@ -90,11 +96,12 @@ class Attempt:
         seed: of the start.
     """
 
-    def __init__(self, env: Any, seed: int):
-        self._env, self.seed = env, seed
+    def __init__(self, env: SuturingEnv, seed: int):
+        self._env = env
+        self.seed = seed
         self._states = [env.get_state()]
-        self._rows: list[tuple[Any, ...]] = []
-        self.info: dict[str, Any] = {}
+        self._rows: list[tuple[NDArray[np.float32], int, float, bool, bool]] = []
+        self.info: Info = {}
 
     def __len__(self) -> int:
         """Return the control steps so far."""
@@ -102,16 +109,16 @@ class Attempt:
 
     @property
     def success(self) -> bool:
-        """Say whether the last step met the task."""
+        """Return True if the last step met the task."""
         return bool(self.info.get("is_success"))
 
     @property
-    def physical(self) -> bool:
-        """Say whether the physics held; what diverged is never kept."""
+    def is_physical(self) -> bool:
+        """Return True unless the physics diverged; such an attempt is never kept."""
         return not self.info.get("physics_error")
 
     def step(self, action: np.ndarray) -> bool:
-        """Take one step; say whether the episode is over."""
+        """Take one step; return True if the episode is over."""
         phase = self._env.phase
         _, reward, terminated, truncated, self.info = self._env.step(action)
         self._states.append(self._env.get_state())
@@ -120,9 +127,7 @@ class Attempt:
 
     def demo(self) -> Demo:
         """Return the episode as a demonstration."""
-        action, phase, reward, success, contact = (
-            list(column) for column in zip(*self._rows, strict=True)
-        )
+        action, phase, reward, success, contact = zip(*self._rows, strict=True)
         return Demo(
             config=self._env.config,
             seed=self.seed,
@@ -139,42 +144,49 @@ class Attempt:
 
 
 class Session:
-    """A person's session at one env; see the module's docstring.
+    """A person's session with one env; see the module's docstring.
 
     Args:
         env: the env, of obs_type "state".
-        steering: makes actions of inputs.
-        recordings: where kept episodes go.
+        mapping: maps inputs to actions.
+        recordings: holds the kept episodes.
         views: the cameras shown; the first leads.
         rules: what happens without asking.
     """
 
     def __init__(
         self,
-        env: Any,
-        steering: Steering,
+        env: SuturingEnv,
+        mapping: InputMapping,
         recordings: Recordings,
         views: tuple[str, ...],
         rules: Rules = Rules(),
     ):
-        self.env, self._steering, self._recordings, self.rules = env, steering, recordings, rules
-        self._views, self._lead, self._fine = views, 0, False
+        self.env = env
+        self.rules = rules
         self.kept = self.discarded = self.skipped = self.steps_kept = 0
-        self._state, self._message, self._rested = WAITING, "", False
-        self._begin(recordings.next_seed, "")
+        self._mapping = mapping
+        self._recordings = recordings
+        self._views = views
+        self._leading = 0
+        self._fine = False
+        self._was_released = False
+        self._state = WAITING
+        self._message = ""
+        self._reset(recordings.next_seed)
 
     @property
     def over(self) -> bool:
-        """Say whether the session has stopped."""
+        """Return True if the session has stopped."""
         return self._state == STOPPED
 
     @property
     def view(self) -> str:
         """Return the leading view."""
-        return self._views[self._lead]
+        return self._views[self._leading]
 
     def status(self) -> Status:
-        """Return what the person is told now."""
+        """Return what the person is shown now."""
         info = self._attempt.info
         return Status(
             state=self._state,
@@ -196,32 +208,32 @@ class Session:
             fine=self._fine,
         )
 
-    def tick(self, given: Input) -> None:
+    def tick(self, user_input: Input) -> None:
         """Take the input of one control step."""
-        self._fine = given.fine
-        for event in given.events:
+        self._fine = user_input.fine
+        for event in user_input.events:
             if not self.over:
-                self._answer(event)
+                self._handle(event)
         if self._state == WAITING:
-            self._wait(given)
+            self._wait(user_input)
         if self._state == DRIVING:
-            self._drive(given)
+            self._drive(user_input)
 
-    def _answer(self, event: str) -> None:
-        """Do what an event asks for in the present state."""
+    def _handle(self, event: str) -> None:
+        """Handle an event in the present state."""
         if event == VIEW:
-            self._lead = (self._lead + 1) % len(self._views)
+            self._leading = (self._leading + 1) % len(self._views)
         elif event == STOP:
             self._stop()
         elif event == START and self._state == WAITING:
-            self._state, self._message = DRIVING, "Recording."
+            self._start()
         elif event == DISCARD and self._state != WAITING:
             self.discarded += 1
-            self._begin(self._attempt.seed, "Discarded. The same start again.")
+            self._reset(self._attempt.seed, "Discarded. The same start again.")
         elif event == KEEP:
-            self._go_on()
+            self._advance()
 
-    def _go_on(self) -> None:
+    def _advance(self) -> None:
         """Keep the episode, or judge it, or give the start up, whichever is due."""
         if self._state == DRIVING and len(self._attempt):
             self._judge("ended by you")
@@ -234,26 +246,31 @@ class Session:
             self.skipped += 1
             seed = self._attempt.seed
             self._recordings.skip(seed, "given up")
-            self._begin(self._recordings.next_seed, f"Start {seed} given up.")
+            self._reset(self._recordings.next_seed, f"Start {seed} given up.")
 
     @property
     def _keepable(self) -> bool:
-        """Say whether → keeps the judged episode."""
-        return self._attempt.success or (self.rules.keep_failures and self._attempt.physical)
+        """Return True if → keeps the judged episode."""
+        return self._attempt.success or (self.rules.keep_failures and self._attempt.is_physical)
 
-    def _wait(self, given: Input) -> None:
-        """Begin when something moves that was at rest."""
-        moves = given.moves and self._rested
-        self._rested = self._rested or not given.moves
-        if moves or JAW in given.events:
-            self._state, self._message = DRIVING, "Recording."
+    def _wait(self, user_input: Input) -> None:
+        """Start when something moves after everything was released."""
+        starts = user_input.is_moving and self._was_released
+        self._was_released = self._was_released or not user_input.is_moving
+        if starts or JAW in user_input.events:
+            self._start()
 
-    def _drive(self, given: Input) -> None:
+    def _start(self) -> None:
+        self._state = DRIVING
+        self._message = "Recording."
+
+    def _drive(self, user_input: Input) -> None:
         """Take a step and judge the episode if that ended it."""
-        if self.rules.skip_idle and not (given.moves or JAW in given.events or self._steering.busy):
+        is_idle = not (user_input.is_moving or JAW in user_input.events or self._mapping.is_busy)
+        if self.rules.skip_idle and is_idle:
             return
-        if self._attempt.step(self._steering.action(given, self.view)):
-            self._judge("time is up" if self._attempt.physical else "physics error")
+        if self._attempt.step(self._mapping.action(user_input, self.view)):
+            self._judge("time is up" if self._attempt.is_physical else "physics error")
             if self._attempt.success and self.rules.auto_keep:
                 self._keep()
 
@@ -272,24 +289,28 @@ class Session:
         self._recordings.keep(self._attempt.demo())
         self.kept += 1
         self.steps_kept += len(self._attempt)
-        said = f"Kept as episode {number} ({len(self._attempt) / names.FPS:.1f} s)."
+        kept = f"Kept as episode {number} ({len(self._attempt) / names.FPS:.1f} s)."
         if self.rules.episodes is not None and self.kept >= self.rules.episodes:
-            self._state, self._message = STOPPED, f"{said} All {self.kept} are recorded."
+            self._state = STOPPED
+            self._message = f"{kept} All {self.kept} are recorded."
             return
-        self._begin(self._recordings.next_seed, said)
+        self._reset(self._recordings.next_seed, kept)
 
     def _stop(self) -> None:
-        """Stop; a success that waits is kept, what is under way is discarded."""
+        """Stop; a success that waits is kept, an attempt under way is discarded."""
         if self._state == JUDGED and self._attempt.success:
             self._keep()
         elif self._state != WAITING:
             self.discarded += 1
-        self._state, self._message = STOPPED, f"{self.kept} kept. Everything is written."
+        self._state = STOPPED
+        self._message = f"{self.kept} kept. Everything is written."
 
-    def _begin(self, seed: int, said: str) -> None:
+    def _reset(self, seed: int, message: str = "") -> None:
         """Wait at the start of `seed`."""
         self.env.reset(seed=seed)
-        self._steering.reset()
-        self._attempt, self._rested = Attempt(self.env, seed), False
+        self._mapping.reset()
+        self._attempt = Attempt(self.env, seed)
         self._attempt.info = self.env.measure()
-        self._state, self._message = WAITING, f"{said} Move to begin.".strip()
+        self._was_released = False
+        self._state = WAITING
+        self._message = f"{message} Move to start.".strip()

@@ -1,16 +1,16 @@
-"""Web: the page that shows the images and takes keys, touches and gamepads of the browser that
-looks at it.
+"""Web: the page that shows the images and takes a browser's keys, touches and gamepads.
 
 `http://127.0.0.1:PORT/TOKEN/` and below it:
 
     GET  .                  the page; page.js and page.css beside it
-    GET  status?after=N     JSON: what the session says, and the number of the newest images; waits
-    for one after N GET  view/NAME.jpg      the newest image of a view
-    POST input              JSON: what is held and what was pressed (`Hands.receive`)
+    GET  status?after=N     JSON: the session's status and the number of the newest images; waits
+                            for a status after N
+    GET  view/NAME.jpg      the newest image of a view
+    POST input              JSON: what is held and what was pressed (`PageInputs.receive`)
 
-The server listens on loopback alone. Whoever lacks the random token gets 404 and learns nothing; a
-page of another site that knows the port is refused by its Host (DNS rebinding) and its Origin. A
-browser that falls silent for half a second holds nothing any more.
+The server listens on loopback only. Without the random token every answer is 404; a page of another
+site that knows the port is refused by its Host (DNS rebinding) and its Origin. The keys of a
+browser that is silent for half a second count as released.
 """
 
 import dataclasses
@@ -28,33 +28,35 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import cv2
+import jinja2
 
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.teleoperation.gamepad import Gamepad
-from surgicai_vision.teleoperation.inputs import Input, merged
+from surgicai_vision.teleoperation.inputs import Input, merge
 from surgicai_vision.teleoperation.keyboard import TABLE, Keyboard, key_names
 from surgicai_vision.teleoperation.loop import Images
 from surgicai_vision.teleoperation.session import Status
 
 HOST = "127.0.0.1"
-NAMES = ("127.0.0.1", "localhost")
-"""What a browser on this machine, or at the end of a tunnel, may call the server."""
-SILENT = 0.5
-"""Seconds without a word after which a browser's keys count as released."""
-BROWSERS = 8
-"""Pages open at the same time whose hands are known."""
-PATIENCE = 1.0
-"""Seconds that a request for the next images waits at most."""
-LONGEST = 4096
-"""Bytes of an input, at most."""
-QUALITY = 85
-"""Of the JPEGs."""
+HOST_NAMES = ("127.0.0.1", "localhost")
+"""Names under which a browser, here or at the end of a tunnel, may address the server."""
+SILENCE_S = 0.5
+"""Time without a message after which a browser's keys count as released [s]."""
+MAX_PAGES = 8
+"""Pages open at the same time whose inputs count."""
+POLL_S = 1.0
+"""Time that a request for the next status waits at most [s]."""
+MAX_INPUT_BYTES = 4096
+"""Size of an input, at most [byte]."""
+JPEG_QUALITY = 85
 FOLDER = Path(__file__).parent / "page"
 FILES = MappingProxyType({"page.js": "text/javascript", "page.css": "text/css"})
 HEADERS = MappingProxyType(
     {
         "Cache-Control": "no-store",
-        "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'",
+        "Content-Security-Policy": (
+            "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'"
+        ),
         "Cross-Origin-Resource-Policy": "same-origin",
         "Referrer-Policy": "no-referrer",
         "X-Content-Type-Options": "nosniff",
@@ -63,141 +65,169 @@ HEADERS = MappingProxyType(
 
 
 @dataclasses.dataclass
-class _Browser:
-    """The hands at one open page: its keys, its gamepad, the number of its last message and when
-    that came.
+class _Page:
+    """The inputs of one open page.
+
+    Attributes:
+        keyboard: its keys.
+        gamepad: its gamepad.
+        number: number of its last message.
+        received: when that was received [s].
     """
 
     keyboard: Keyboard
     gamepad: Gamepad
     number: int = -1
-    heard: float = 0.0
+    received: float = 0.0
 
 
-class Hands:
-    """The hands at all open pages; a `Device` that server threads feed.
+@dataclasses.dataclass(frozen=True)
+class _Message:
+    """What a page sends: its keys, its gamepad, and a number that grows."""
+
+    client: str
+    number: int
+    held: list[str]
+    pressed: list[str]
+    axes: list[float]
+    buttons: list[float]
+
+
+class PageInputs:
+    """The inputs of all open pages; a `Device` that server threads feed.
 
     Args:
-        clock: seconds, monotonic.
+        clock: returns monotonic seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
-        self._clock, self._lock = clock, threading.Lock()
-        self._browsers: dict[str, _Browser] = {}
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._pages: dict[str, _Page] = {}
 
-    def receive(self, message: Any) -> None:
+    def receive(self, content: Any) -> None:
         """Take a page's message.
 
         Args:
-            message: {"client": str, "number": int, "held": [code], "pressed": [code], "axes":
+            content: {"client": str, "number": int, "held": [code], "pressed": [code], "axes":
                 [float], "buttons": [float]}; "pressed" went down since the message before. Older
-                numbers are passed over.
+                numbers are ignored.
 
         Raises:
             InputError: anything else.
         """
-        client, number, held, pressed, axes, buttons = _checked(message)
+        message = _read_message(content)
         with self._lock:
-            browser = self._browsers.get(client) or self._welcome(client)
-            if number <= browser.number:
+            page = self._pages.get(message.client) or self._add_page(message.client)
+            if message.number <= page.number:
                 return
-            browser.number, browser.heard = number, self._clock()
-            for code in pressed:
-                browser.keyboard.release(code)
-                browser.keyboard.press(code)
-            browser.keyboard.hold(held)
-            browser.gamepad.update(axes, buttons)
+            page.number = message.number
+            page.received = self._clock()
+            for code in message.pressed:
+                page.keyboard.release(code)
+                page.keyboard.press(code)
+            page.keyboard.hold(message.held)
+            page.gamepad.update(message.axes, message.buttons)
 
     def poll(self) -> Input:
-        """Return what all of them do now."""
+        """Return the present input of all pages."""
         with self._lock:
-            for browser in self._browsers.values():
-                if self._clock() - browser.heard > SILENT:
-                    browser.keyboard.release_all()
-                    browser.gamepad.release_all()
-            return merged(
+            for page in self._pages.values():
+                if self._clock() - page.received > SILENCE_S:
+                    page.keyboard.release_all()
+                    page.gamepad.release_all()
+            return merge(
                 device.poll()
-                for browser in self._browsers.values()
-                for device in (browser.keyboard, browser.gamepad)
+                for page in self._pages.values()
+                for device in (page.keyboard, page.gamepad)
             )
 
-    def _welcome(self, client: str) -> _Browser:
-        """Know one more page; the one silent for longest makes room."""
-        if len(self._browsers) >= BROWSERS:
-            del self._browsers[min(self._browsers, key=lambda name: self._browsers[name].heard)]
-        self._browsers[client] = _Browser(Keyboard(), Gamepad())
-        return self._browsers[client]
+    def _add_page(self, client: str) -> _Page:
+        """Add a page; where there are too many, the one silent for longest is dropped."""
+        if len(self._pages) >= MAX_PAGES:
+            del self._pages[min(self._pages, key=lambda name: self._pages[name].received)]
+        self._pages[client] = _Page(Keyboard(), Gamepad())
+        return self._pages[client]
 
 
-def _checked(message: Any) -> tuple[str, int, list[str], list[str], list[float], list[float]]:
-    """Return the parts of a message, or raise `InputError`."""
-    if not isinstance(message, dict):
+def _read_message(content: Any) -> _Message:
+    """Return a checked message, or raise `InputError`."""
+    if not isinstance(content, dict):
         raise InputError("An input must be a table.")
-    client, number = message.get("client"), message.get("number")
-    texts = [message.get(name, []) for name in ("held", "pressed")]
-    numbers = [message.get(name, []) for name in ("axes", "buttons")]
-    fine = isinstance(client, str) and len(client) <= 64 and isinstance(number, int)
-    fine = fine and all(isinstance(row, list) and len(row) <= 64 for row in (*texts, *numbers))
-    fine = fine and all(isinstance(code, str) for row in texts for code in row)
-    fine = fine and all(
-        isinstance(value, (int, float)) and -2 < value < 2 for row in numbers for value in row
-    )
-    if not fine:
+    client = content.get("client")
+    number = content.get("number")
+    texts = [content.get(name, []) for name in ("held", "pressed")]
+    numbers = [content.get(name, []) for name in ("axes", "buttons")]
+    if not (
+        isinstance(client, str)
+        and len(client) <= 64
+        and isinstance(number, int)
+        and all(isinstance(row, list) and len(row) <= 64 for row in (*texts, *numbers))
+        and all(isinstance(code, str) for row in texts for code in row)
+        and all(isinstance(value, (int, float)) for row in numbers for value in row)
+        and all(-2 < value < 2 for row in numbers for value in row)
+    ):
         raise InputError("An input must have client, number, held, pressed, axes and buttons.")
-    return str(client), int(number or 0), *texts, *numbers
+    return _Message(client, number, *texts, *numbers)
 
 
-class Show:
-    """The newest images and status, handed from the session's thread to the server's; a `Screen`.
+class PageScreen:
+    """The newest images and status, passed from the session's thread to the server's; a `Screen`.
 
-    An image that is the one before, the very object, keeps its number, and a page does not fetch it
+    Images that are the same object as before keep their number, and a page does not fetch them
     again.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._number, self._image, self._asked, self.watched = 0, 0, False, False
+        self.watched = False
+        self._number = 0
+        self._image_number = 0
+        self._requested = False
         self._images: Images = {}
         self._encoded: dict[str, bytes] = {}
         self._status: dict[str, Any] = {}
 
-    def wants(self) -> bool:
-        """Say whether a page waits for an image."""
-        return self._asked
+    def wants_image(self) -> bool:
+        """Return True if a page waits for an image."""
+        return self._requested
 
     def show(self, images: Images, status: Status) -> None:
-        """Offer new images to whoever waits."""
+        """Offer new images to the pages."""
         with self._changed:
             self._number += 1
             if images is not self._images:
-                self._image += 1
-                self._images, self._encoded = images, {}
-            self._asked = False
+                self._image_number += 1
+                self._images = images
+                self._encoded = {}
+            self._requested = False
             self._status = dataclasses.asdict(status)
             self._changed.notify_all()
 
     def status(self, after: int) -> dict[str, Any]:
-        """Return the newest status with its number, a newer one than `after` if it comes in
-        time.
-        """
+        """Return the newest status with its number, waiting a while for one after `after`."""
         with self._changed:
             self.watched = True
             if self._number <= after:
-                self._asked = True
-                self._changed.wait_for(lambda: self._number > after, PATIENCE)
-            return {**self._status, "number": self._number, "image": self._image}
+                self._requested = True
+                self._changed.wait_for(lambda: self._number > after, POLL_S)
+            return {**self._status, "number": self._number, "image": self._image_number}
 
     def jpeg(self, view: str) -> bytes | None:
         """Return the newest image of a view; None where there is none."""
         with self._changed:
-            number, image, known = self._image, self._images.get(view), self._encoded.get(view)
-        if known is not None or image is None:
-            return known
+            number = self._image_number
+            image = self._images.get(view)
+            encoded = self._encoded.get(view)
+        if encoded is not None or image is None:
+            return encoded
         # Outside the lock: the session's thread must not wait for it.
-        done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        done, data = cv2.imencode(
+            ".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        )
         encoded = data.tobytes() if done else b""
         with self._changed:
-            if number == self._image:
+            if number == self._image_number:
                 self._encoded[view] = encoded
         return encoded
 
@@ -215,13 +245,14 @@ class WebView:
     """
 
     def __init__(self, views: tuple[str, ...], title: str, port: int = 0):
-        self.hands, self.screen = Hands(), Show()
+        self.inputs = PageInputs()
+        self.screen = PageScreen()
         self.token = secrets.token_urlsafe(16)
         self._page = _page(views, title)
         try:
             self._server = _Server(port, self)
         except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
+            reason = (error.strerror if isinstance(error, OSError) else None) or error
             raise InputError(
                 f"--port {port} is not free ({reason}); give another, or 0 for any."
             ) from None
@@ -229,9 +260,12 @@ class WebView:
         self.url = f"http://{HOST}:{self.port}/{self.token}/"
         self.invitation = (
             f"Open {self.url}",
-            f"From another machine: ssh -L {self.port}:{HOST}:{self.port} THIS-MACHINE, then open the same there.",
+            f"From another machine: ssh -L {self.port}:{HOST}:{self.port} THIS-MACHINE, "
+            "then open the same there.",
         )
-        self.wants, self.show, self.poll = self.screen.wants, self.screen.show, self.hands.poll
+        self.wants_image = self.screen.wants_image
+        self.show = self.screen.show
+        self.poll = self.inputs.poll
 
     def __enter__(self) -> "WebView":
         threading.Thread(
@@ -240,16 +274,14 @@ class WebView:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Let open pages hear the last word, then shut the server."""
+        """Let open pages fetch the last status, then shut the server down."""
         if self.screen.watched:
             time.sleep(0.5)
         self._server.shutdown()
         self._server.server_close()
 
     def answer(self, path: str, query: str) -> tuple[bytes, str] | None:
-        """Return the content of an address below the token, and its type; None where there is
-        nothing.
-        """
+        """Return the content of an address below the token and its type, or None."""
         if path == "":
             return self._page, "text/html; charset=utf-8"
         if path == "status":
@@ -272,8 +304,8 @@ class _Server(ThreadingHTTPServer):
         self.web = web
         super().__init__((HOST, port), _Handler)
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing: a browser that leaves is no error."""
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Print nothing: a browser that leaves is no error."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -289,7 +321,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
 
     def do_GET(self) -> None:
-        """Answer with what lies there."""
+        """Answer with the content of an address."""
         path = self._path()
         if path is None:
             return
@@ -302,7 +334,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """Take an input."""
         length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > LONGEST:
+        if not length.isdecimal() or int(length) > MAX_INPUT_BYTES:
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
             return
         body = self.rfile.read(int(length))
@@ -316,20 +348,22 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND)
             return
         try:
-            self.server.web.hands.receive(json.loads(body))
+            self.server.web.inputs.receive(json.loads(body))
         except (InputError, ValueError, RecursionError):
             self._refuse(HTTPStatus.BAD_REQUEST)
             return
         self._send(HTTPStatus.NO_CONTENT, b"", "application/json")
 
-    def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing: the console is the session's, and addresses hold the token."""
+    def log_message(self, format: str, *args: object) -> None:
+        """Log nothing: the console is the session's, and addresses contain the token."""
 
     def _path(self) -> str | None:
-        """Return the path below the token; refuse a request that may not ask."""
+        """Return the path below the token, or refuse the request and return None."""
         host = self.headers.get("Host", "")
         origin = self.headers.get("Origin")
-        if _name(f"//{host}") not in NAMES or (origin is not None and origin != f"http://{host}"):
+        if _host_name(f"//{host}") not in HOST_NAMES or (
+            origin is not None and origin != f"http://{host}"
+        ):
             self._refuse(HTTPStatus.FORBIDDEN)
             return None
         token, slash, path = urlsplit(self.path).path.removeprefix("/").partition("/")
@@ -357,11 +391,11 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def version_string(self) -> str:
-        """Return no version: it is nobody's business."""
+        """Return no version."""
         return "surgicai-vision"
 
 
-def _name(address: str) -> str | None:
+def _host_name(address: str) -> str | None:
     try:
         return urlsplit(address).hostname
     except ValueError:
@@ -370,8 +404,6 @@ def _name(address: str) -> str | None:
 
 def _page(views: tuple[str, ...], title: str) -> bytes:
     """Return the page."""
-    import jinja2
-
     loader = jinja2.FileSystemLoader(FOLDER)
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined

@@ -1,6 +1,4 @@
-"""Bags of ROS 1 and ROS 2: our own expert's motions go out and come back; what is wrong is told in
-one line.
-"""
+"""Bags of ROS 1 and ROS 2: our own expert's motions are written, imported and compared."""
 
 import itertools
 
@@ -123,9 +121,7 @@ def test_several_bags_become_one_folder(tmp_path):
 
 
 def swinging(seconds):
-    """Return T_base_tip (N, 4, 4) that swings about the start: ±5 mm and ±40° at 1 Hz, a smooth
-    known motion.
-    """
+    """Return T_base_tip (N, 4, 4) that swings about the start, ±5 mm and ±40° at 1 Hz."""
     phase = 2 * np.pi * np.asarray(seconds)
     motion = np.tile(kinematics.start_in_base("psm2"), (len(phase), 1, 1))
     turn = Rotation.from_rotvec(
@@ -266,9 +262,7 @@ def test_pauses_are_left_out_and_slow_motion_is_not():
 
 
 def test_yaw_past_half_a_turn_is_no_jump(tmp_path):
-    """SurgicAI's half of the insertions turn the long way round; through quaternions of either sign
-    none does.
-    """
+    """Half of SurgicAI's insertions turn the long way round; with quaternions none does."""
     times = (np.arange(100) * 20_000_000).astype(np.int64)
     motion = np.tile(kinematics.start_in_base("psm2"), (100, 1, 1))
     yaw = np.arctan2(motion[0, 1, 0], motion[0, 0, 0])

@@ -1,6 +1,4 @@
-"""Bags and options that are wrong: each is told in one line that names what there is, and nothing
-of a bag is run.
-"""
+"""Bags and options that are wrong: one line names what there is, and nothing of a bag is run."""
 
 import json
 import sys

@@ -185,9 +185,7 @@ turns = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
 @settings(max_examples=15, deadline=None)
 @given(shift=vectors, turn=turns, vector=turns)
 def test_a_moved_demonstration_gives_the_moved_path(shift, turn, vector):
-    """Round trip: learning in another frame and going back is learning here; and log is the inverse
-    of exp.
-    """
+    """Fitting in another frame and going back is fitting here; log is the inverse of exp."""
     np.testing.assert_allclose(log_quaternion(exp_quaternion(vector)), vector, atol=1e-12)
     demo, frame = motion(20), exp_quaternion(turn)
     matrix = np.stack(

@@ -74,9 +74,7 @@ def test_an_action_depends_on_the_state_alone(task):
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_the_expert_recovers_from_random_actions(task):
-    """Ten random actions in the middle of an episode, the jaw's small: a dropped needle is another
-    subtask's start.
-    """
+    """Ten random actions in the middle of an episode; the jaw's are small, to drop no needle."""
     solved = 0
     for seed in SEEDS:
         env = shared(task)

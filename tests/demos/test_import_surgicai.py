@@ -1,6 +1,4 @@
-"""Importing SurgicAI's recordings: what comes in is checked, what comes out stands where the
-recording says.
-"""
+"""Import of SurgicAI's recordings: input is checked, and the arm is posed as recorded."""
 
 import dataclasses
 import os

@@ -1,5 +1,4 @@
-"""Two hundred malformed and malicious inputs: each is refused with one line, and nothing in it
-runs.
+"""Two hundred malformed and malicious inputs: each is refused in one line, nothing in it runs.
 
 Made here, by format: pickle, npz and bags (recordings), safetensors (demonstrations), parquet
 (datasets), YAML (options). An audit hook sees every process, socket and write that a reader would

@@ -1,6 +1,4 @@
-"""Pickles that are not trusted: arrays come out as they went in, everything else is refused and
-never run.
-"""
+"""Untrusted pickles: arrays are read as they were written, all else is refused and never run."""
 
 import collections
 import io

@@ -51,9 +51,7 @@ def test_it_meets_every_goal_and_reads_none() -> None:
 
 
 def test_its_demonstrations_show_every_attempt() -> None:
-    """They go on after the success, so that what a learner does after a failed attempt has been
-    shown.
-    """
+    """They go on after the success, so that a learner has seen what follows a failed attempt."""
     env = envs.make(TaskConfig("grasp"))
     result = rollout(env, SearchExpert(env), 500_000, "search")
     assert result.success and len(result.demo) == env.config.max_steps and result.demo.success.any()

@@ -1,13 +1,11 @@
-"""Scripted people: they look at the env and press what a person would, through the real keyboard
-and gamepad.
-"""
+"""Scripted operators: they read the env and press what a person would, by keyboard or gamepad."""
 
 import numpy as np
 from fake_env import FakeEnv
 
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.teleoperation.gamepad import DEAD, Gamepad
+from surgicai_vision.teleoperation.gamepad import DEAD_ZONE, Gamepad
 from surgicai_vision.teleoperation.input_mapping import FINE
 from surgicai_vision.teleoperation.inputs import Input
 from surgicai_vision.teleoperation.keyboard import MOTIONS, Keyboard
@@ -27,23 +25,23 @@ def right(x=1.0):
     return Input(move=(x, 0.0, 0.0))
 
 
-def wish(env, steering, view):
-    """Return the expert's action in the frame of the steering: move and turn (6,) and the jaw."""
+def expert_motion(env, mapping, view):
+    """Return the expert's action in the mapping's frame: move and turn (6,), and the jaw."""
     action = Expert(env).action().astype(np.float64)
-    rotation = steering.axes(view)
+    rotation = mapping.axes(view)
     return np.concatenate([action[:3] @ rotation, action[3:6] @ rotation]), float(action[6])
 
 
-class AtGamepad:
-    """Steers by both sticks, triggers and bumpers of a gamepad, in steps of 1/127 as they come."""
+class GamepadOperator:
+    """Moves sticks, triggers and bumpers of a gamepad, in their steps of 1/127."""
 
-    def __init__(self, session, steering):
-        self.session, self.steering = session, steering
+    def __init__(self, session, mapping):
+        self.session, self.mapping = session, mapping
         self.gamepad = Gamepad()
 
     def poll(self):
-        motion, jaw = wish(self.session.env, self.steering, self.session.view)
-        motion /= self.steering.speed * max(
+        motion, jaw = expert_motion(self.session.env, self.mapping, self.session.view)
+        motion /= self.mapping.speed * max(
             1.0, np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])
         )
         left, up, depth, tilt, swing, roll = (deflection(value) for value in motion)
@@ -57,41 +55,39 @@ class AtGamepad:
 
 def deflection(speed):
     """Return the deflection, in steps of 1/127, that the gamepad's curve makes `speed` of."""
-    value = np.sign(speed) * (DEAD + (1 - DEAD) * np.sqrt(min(abs(speed), 1.0)))
+    value = np.sign(speed) * (DEAD_ZONE + (1 - DEAD_ZONE) * np.sqrt(min(abs(speed), 1.0)))
     return float(np.round(value * 127) / 127) if abs(speed) > 1e-3 else 0.0
 
 
-class AtKeyboard:
-    """Steers by keys alone, down or up; what one press was too much or too little, the next ones
-    make good.
-    """
+class KeyboardOperator:
+    """Presses keys; the error of one press is made up for by the next ones."""
 
-    def __init__(self, session, steering):
-        self.session, self.steering = session, steering
-        self.keyboard, self.owed = Keyboard(), np.zeros(6)
+    def __init__(self, session, mapping):
+        self.session, self.mapping = session, mapping
+        self.keyboard, self.remainder = Keyboard(), np.zeros(6)
 
     def poll(self):
-        motion, jaw = wish(self.session.env, self.steering, self.session.view)
-        motion = motion / self.steering.speed
+        motion, jaw = expert_motion(self.session.env, self.mapping, self.session.view)
+        motion = motion / self.mapping.speed
         fine = np.abs(motion).max() < FAST
         speed = FINE if fine else 1.0
-        self.owed = np.clip(self.owed + motion, -1, 1)
+        self.remainder = np.clip(self.remainder + motion, -1, 1)
         wanted = {"ShiftLeft"} if fine else set()
         for code, (axis, sign) in MOTIONS.items():
-            if (self.owed[axis] / speed if axis < 6 else jaw) * sign > 0.5:
+            if (self.remainder[axis] / speed if axis < 6 else jaw) * sign > 0.5:
                 wanted.add(code)
         for code in [*MOTIONS, "ShiftLeft"]:
             (self.keyboard.press if code in wanted else self.keyboard.release)(code)
-        given = self.keyboard.poll()
-        for start, vector in ((0, given.move), (3, given.turn)):
-            self.owed[start : start + 3] -= (
+        user_input = self.keyboard.poll()
+        for start, vector in ((0, user_input.move), (3, user_input.turn)):
+            self.remainder[start : start + 3] -= (
                 speed * np.array(vector) / max(1.0, np.linalg.norm(vector))
             )
-        return given
+        return user_input
 
 
 class Script:
-    """Says one input a tick, then nothing."""
+    """Plays one input a tick, then none."""
 
     def __init__(self, *inputs):
         self.inputs = list(inputs)
@@ -100,22 +96,23 @@ class Script:
         return self.inputs.pop(0) if self.inputs else REST
 
 
-class Still:
-    """Steering of the stand-in env: motion along x is its action."""
+class FakeMapping:
+    """Mapping of the stand-in env: motion along x is its action."""
 
-    busy = False
+    is_busy = False
 
     def reset(self):
         pass
 
-    def action(self, given, view):
-        return np.array([given.move[0], 0, 0, 0, 0, 0, 0], np.float32)
+    def action(self, user_input, view):
+        return np.array([user_input.move[0], 0, 0, 0, 0, 0, 0], np.float32)
 
 
-class Stand(FakeEnv):
-    """The stand-in env with what a session asks besides."""
+class SessionEnv(FakeEnv):
+    """The stand-in env with what a session needs besides."""
 
     class subtask:
+        name = "grasp"
         arm = "psm2"
 
     def measure(self):

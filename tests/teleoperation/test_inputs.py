@@ -1,4 +1,4 @@
-"""Hands: keys and sticks become inputs, and inputs motions along the axes that the person sees."""
+"""Inputs: keys and sticks become inputs, and inputs motions along the axes that the person sees."""
 
 import numpy as np
 import pytest
@@ -10,11 +10,11 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.scene.cameras import extrinsics
 from surgicai_vision.teleoperation import gamepad, inputs
 from surgicai_vision.teleoperation.gamepad import Gamepad
-from surgicai_vision.teleoperation.input_mapping import Steering
-from surgicai_vision.teleoperation.inputs import JAW, KEEP, Input, merged
+from surgicai_vision.teleoperation.input_mapping import InputMapping
+from surgicai_vision.teleoperation.inputs import JAW, KEEP, Input, merge
 from surgicai_vision.teleoperation.keyboard import CODES, PRESSES, TABLE, Keyboard, key_table
 
-# -- hands -----------------------------------------------------------------------------------------
+# -- devices ---------------------------------------------------------------------------------------
 
 
 def test_keys_are_held_until_released():
@@ -40,14 +40,14 @@ def test_a_tap_between_two_ticks_moves_once_and_a_press_counts_once():
     assert keyboard.poll() == REST, "an autorepeated key is no second press"
 
 
-def test_opposite_keys_cancel_and_both_hands_add_up():
+def test_opposite_keys_cancel_and_devices_add_up():
     keyboard = Keyboard()
     keyboard.press("KeyA")
     keyboard.press("KeyD")
     assert keyboard.poll().move == (0, 0, 0)
-    both = merged((right(0.8), right(0.8), Input(turn=(0, 0, -1), events=(JAW,))))
+    both = merge((right(0.8), right(0.8), Input(turn=(0, 0, -1), events=(JAW,))))
     assert both == Input((1.0, 0, 0), (0, 0, -1.0), 0, False, (JAW,))
-    assert merged(()) == REST
+    assert merge(()) == REST
 
 
 def test_the_key_table_names_every_key_once():
@@ -60,7 +60,7 @@ def test_the_key_table_names_every_key_once():
 def test_a_gamepad_rests_near_the_middle_and_reaches_both_ends():
     pad = Gamepad()
     pad.update([0.1, -0.1, 0.05, 0.0], [])
-    assert not pad.poll().moves
+    assert not pad.poll().is_moving
     buttons = [0.0] * 16
     buttons[6], buttons[4], buttons[2], buttons[13] = 1.0, 1.0, 1.0, 1.0
     pad.update([1.0, -1.0, 1.0, -1.0], buttons)
@@ -81,7 +81,7 @@ def test_a_gamepad_button_counts_once_a_press():
     assert pad.poll().events == (JAW,)
 
 
-# -- steering --------------------------------------------------------------------------------------
+# -- mapping ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -99,10 +99,10 @@ def test_a_key_moves_the_tool_along_its_cameras_axis(grasp, view, axis):
     grasp.reset(seed=0)
     camera = extrinsics(grasp.model, grasp.data, view)[:3, :3]
     before = np.array(grasp.simulation.tip("psm2")[:3])
-    steering = Steering(grasp, speed=1.0)
+    mapping = InputMapping(grasp, speed=1.0)
     # A wrist camera goes along: only the first steps are along where it looked first.
     for _ in range(8):
-        grasp.step(steering.action(Input(tuple(float(i == axis) for i in range(3))), view))
+        grasp.step(mapping.action(Input(tuple(float(i == axis) for i in range(3))), view))
     moved = camera.T @ (np.array(grasp.simulation.tip("psm2")[:3]) - before)
     assert moved[axis] > 2e-3
     assert moved[axis] > 0.9 * np.linalg.norm(moved)
@@ -111,7 +111,7 @@ def test_a_key_moves_the_tool_along_its_cameras_axis(grasp, view, axis):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_key_turns_the_tool_about_its_cameras_axis(grasp, axis):
     grasp.reset(seed=0)
-    action = Steering(grasp, speed=1.0).action(
+    action = InputMapping(grasp, speed=1.0).action(
         Input(turn=tuple(float(i == axis) for i in range(3))), "front"
     )
     base = np.array(grasp.simulation.bases["psm2"][3:]).reshape(3, 3)
@@ -123,9 +123,9 @@ def test_a_key_turns_the_tool_about_its_cameras_axis(grasp, axis):
 def test_in_the_tools_frame_deeper_is_out_between_the_jaws(grasp):
     grasp.reset(seed=0)
     tip = np.array(grasp.simulation.tip("psm2")).copy()
-    steering = Steering(grasp, "tool", speed=1.0)
+    mapping = InputMapping(grasp, "tool", speed=1.0)
     for _ in range(8):
-        grasp.step(steering.action(Input((0, 0, 1)), "front"))
+        grasp.step(mapping.action(Input((0, 0, 1)), "front"))
     moved = np.array(grasp.simulation.tip("psm2")[:3]) - tip[:3]
     assert moved @ tip[3:].reshape(3, 3)[:, 2] > 0.95 * np.linalg.norm(moved) > 1e-3
 
@@ -138,29 +138,29 @@ def test_speed_fine_and_diagonals(grasp):
         "two": Input((1, 1, 1)),
         "fine": Input((1, 0, 0), fine=True),
     }.items():
-        lengths[name] = np.linalg.norm(Steering(grasp, speed=0.5).action(given, "front")[:3])
+        lengths[name] = np.linalg.norm(InputMapping(grasp, speed=0.5).action(given, "front")[:3])
     np.testing.assert_allclose(
         [lengths["one"], lengths["two"], lengths["fine"]], [0.5, 0.5, 0.1], rtol=1e-6
     )
     for speed in (0, 1.1, float("nan")):
         with pytest.raises(InputError, match="speed is"):
-            Steering(grasp, speed=speed)
+            InputMapping(grasp, speed=speed)
     with pytest.raises(InputError, match="Did you mean 'camera'"):
-        Steering(grasp, "camra")
+        InputMapping(grasp, "camra")
 
 
 def test_the_jaw_toggle_closes_an_open_jaw_and_opens_a_closed_one(grasp):
     grasp.reset(seed=0)
-    steering, jaw = Steering(grasp), lambda: grasp.simulation.commands["psm2"].jaw
+    mapping, jaw = InputMapping(grasp), lambda: grasp.simulation.commands["psm2"].jaw
     for wanted in (0.0, 0.4, 0.0):
-        grasp.step(steering.action(event(JAW), "front"))
+        grasp.step(mapping.action(event(JAW), "front"))
         steps = 0
-        while steering.busy:
-            grasp.step(steering.action(REST, "front"))
+        while mapping.is_busy:
+            grasp.step(mapping.action(REST, "front"))
             steps += 1
         assert jaw() == pytest.approx(wanted, abs=1e-6)
         assert steps < 20
-    grasp.step(steering.action(event(JAW), "front"))
-    half = grasp.step(steering.action(Input(jaw=-0.5), "front")) and jaw()
-    grasp.step(steering.action(REST, "front"))
+    grasp.step(mapping.action(event(JAW), "front"))
+    half = grasp.step(mapping.action(Input(jaw=-0.5), "front")) and jaw()
+    grasp.step(mapping.action(REST, "front"))
     assert jaw() == half > 0, "a held key ends what a toggle began"

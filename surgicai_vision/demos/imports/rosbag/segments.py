@@ -12,9 +12,9 @@ By labels: the longest runs of one subtask. By events, in the order of the proce
 
 An arm holds the needle when its jaw is closed (0.2 rad, where the surgical robotics challenge
 grasps) with the needle within reach of its pads, for 0.1 s. Holes are traversed by the same test as
-in the envs (`envs.hole_crossing`). A recording that starts late starts with the subtask that is then
-under way, and a needle that is held as near to the entry as an insertion starts (5.5 mm, 12°) is
-inserted, not placed.
+in the envs (`envs.hole_crossing`). A recording that starts late starts with the subtask that is
+then under way, and a needle that is held as near to the entry as an insertion starts (5.5 mm, 12°)
+is inserted, not placed.
 """
 
 import itertools

@@ -1,6 +1,4 @@
-"""Teleoperation: scripted hands drive whole sessions; what they kept is demonstrations like any
-others.
-"""
+"""Sessions driven by scripted inputs: what was kept is demonstrations like any others."""
 
 import json
 import os
@@ -9,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from teleoperators import REST, SHORT, VIEWS, Script, Stand, Still, event, right
+from teleoperators import REST, SHORT, VIEWS, FakeMapping, Script, SessionEnv, event, right
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.core.config import TaskConfig
@@ -17,7 +15,7 @@ from surgicai_vision.core.errors import BadFile, OutputExists, SurgicaiError
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_marker
 from surgicai_vision.teleoperation.inputs import DISCARD, KEEP, START, STOP, VIEW, Input
 from surgicai_vision.teleoperation.keyboard import TABLE, key_names, key_table
-from surgicai_vision.teleoperation.loop import drive
+from surgicai_vision.teleoperation.loop import run_session
 from surgicai_vision.teleoperation.pacer import Pacer
 from surgicai_vision.teleoperation.recordings import open_recordings
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, STOPPED, WAITING, Rules, Session
@@ -29,17 +27,19 @@ LONG = TaskConfig("grasp", max_steps=1500)
 
 
 @pytest.fixture
-def begin(tmp_path):
+def open_session(tmp_path):
     """Return a function that opens a session of the stand-in env on one folder."""
     opened = []
 
-    def begin(config=SHORT, seed=None, **rules):
+    def open_session(config=SHORT, seed=None, **rules):
         for before in opened:
             before.__exit__(None, None, None)
         opened[:] = [open_recordings(tmp_path / "demos", config, "f" * 64, seed)]
-        return Session(Stand(config), Still(), opened[0].__enter__(), VIEWS, Rules(**rules))
+        return Session(
+            SessionEnv(config), FakeMapping(), opened[0].__enter__(), VIEWS, Rules(**rules)
+        )
 
-    yield begin
+    yield open_session
     for before in opened:
         before.__exit__(None, None, None)
 
@@ -60,8 +60,8 @@ def succeed(session):
     return session.status()
 
 
-def test_keep_goes_on_to_the_next_start(begin, tmp_path):
-    session = begin()
+def test_keep_goes_on_to_the_next_start(open_session, tmp_path):
+    session = open_session()
     status = succeed(session)
     assert (status.state, status.success, status.kept) == (JUDGED, True, 0)
     assert not list((tmp_path / "demos").iterdir()), "nothing is written before it is kept"
@@ -73,8 +73,8 @@ def test_keep_goes_on_to_the_next_start(begin, tmp_path):
     assert demo.success.tolist() == [False] * (len(demo) - 1) + [True]
 
 
-def test_discard_does_the_same_start_again(begin, tmp_path):
-    session = begin()
+def test_discard_does_the_same_start_again(open_session, tmp_path):
+    session = open_session()
     succeed(session)
     status = ticks(session, event(DISCARD))
     assert (status.state, status.seed, status.steps, status.discarded) == (WAITING, 0, 0, 1)
@@ -88,8 +88,8 @@ def test_discard_does_the_same_start_again(begin, tmp_path):
     assert read_demo(list_demos(tmp_path / "demos")[0]).seed == 0
 
 
-def test_a_start_is_given_up(begin, tmp_path):
-    session = begin()
+def test_a_start_is_given_up(open_session, tmp_path):
+    session = open_session()
     assert ticks(session, event(KEEP)).seed == 1, "at once while waiting"
     status = ticks(session, REST, right(), event(KEEP))
     assert (status.state, status.success, status.seed) == (JUDGED, False, 1), (
@@ -100,24 +100,24 @@ def test_a_start_is_given_up(begin, tmp_path):
     assert not list((tmp_path / "demos").glob("episode*"))
 
 
-def test_time_ends_an_attempt_and_a_failure_is_not_kept(begin):
-    session = begin()
+def test_time_ends_an_attempt_and_a_failure_is_not_kept(open_session):
+    session = open_session()
     status = ticks(session, REST, event(START), *[REST] * 11)
     assert (status.state, status.success, status.steps) == (JUDGED, False, 12)
     assert "time is up" in status.message
     assert ticks(session, event(KEEP)).kept == 0
 
 
-def test_failures_are_kept_on_request(begin, tmp_path):
-    session = begin(keep_failures=True)
+def test_failures_are_kept_on_request(open_session, tmp_path):
+    session = open_session(keep_failures=True)
     assert ticks(session, REST, right(), right(), event(KEEP)).kept == 1
     assert ticks(session, event(START), *[REST] * 11, event(KEEP)).kept == 2
     demos = [read_demo(path) for path in list_demos(tmp_path / "demos")]
     assert [(len(demo), demo.success.any()) for demo in demos] == [(2, False), (12, False)]
 
 
-def test_successes_are_kept_without_asking_on_request_and_counted(begin):
-    session = begin(auto_keep=True, episodes=2)
+def test_successes_are_kept_without_asking_on_request_and_counted(open_session):
+    session = open_session(auto_keep=True, episodes=2)
     for _ in range(60):
         if session.over:
             break
@@ -130,8 +130,8 @@ def test_successes_are_kept_without_asking_on_request_and_counted(begin):
 @pytest.mark.parametrize(
     ("before", "kept", "discarded"), [("waiting", 0, 0), ("driving", 0, 1), ("judged", 1, 0)]
 )
-def test_escape_stops_and_loses_no_success(begin, before, kept, discarded):
-    session = begin()
+def test_escape_stops_and_loses_no_success(open_session, before, kept, discarded):
+    session = open_session()
     if before == "driving":
         ticks(session, REST, right())
     elif before == "judged":
@@ -141,27 +141,27 @@ def test_escape_stops_and_loses_no_success(begin, before, kept, discarded):
     assert (status.kept, status.discarded) == (kept, discarded)
 
 
-def test_a_key_still_held_does_not_begin_the_next_episode(begin):
-    session = begin()
+def test_a_key_still_held_does_not_start_the_next_episode(open_session):
+    session = open_session()
     succeed(session)
     status = ticks(session, Input((1, 0, 0), events=(KEEP,)), *[right()] * 5)
     assert (status.state, status.steps) == (WAITING, 0)
     assert ticks(session, REST, right()).state == DRIVING
 
 
-def test_pauses_are_recorded_unless_told_otherwise(begin):
-    assert ticks(begin(), REST, right(), REST, REST, right()).steps == 4
-    assert ticks(begin(skip_idle=True), REST, right(), REST, REST, right()).steps == 2
+def test_pauses_are_recorded_unless_told_otherwise(open_session):
+    assert ticks(open_session(), REST, right(), REST, REST, right()).steps == 4
+    assert ticks(open_session(skip_idle=True), REST, right(), REST, REST, right()).steps == 2
 
 
-def test_the_next_view_leads(begin):
-    session = begin()
+def test_the_next_view_leads(open_session):
+    session = open_session()
     seen = [session.view] + [ticks(session, event(VIEW)).view for _ in range(2)]
     assert seen == ["front", "back", "front"]
 
 
-def test_an_episode_that_diverged_is_never_kept(begin):
-    session = begin(keep_failures=True)
+def test_an_episode_that_diverged_is_never_kept(open_session):
+    session = open_session(keep_failures=True)
     step = session.env.step
     session.env.step = lambda action: (
         *step(action)[:2],
@@ -181,33 +181,33 @@ def keep_one(session):
     session.tick(event(KEEP))
 
 
-def test_the_same_folder_goes_on_with_numbers_and_seeds(begin, tmp_path):
-    session = begin(seed=7)
+def test_the_same_folder_goes_on_with_numbers_and_seeds(open_session, tmp_path):
+    session = open_session(seed=7)
     keep_one(session)
     ticks(session, event(KEEP))  # seed 8 is given up
-    session = begin()
+    session = open_session()
     assert (session.status().seed, session.status().episode) == (9, 1)
     keep_one(session)
     assert [read_demo(path).seed for path in list_demos(tmp_path / "demos")] == [7, 9]
     assert read_marker(tmp_path / "demos")["seeds"] == [7, 9]
 
 
-def test_an_episode_whose_entry_a_kill_prevented_counts(begin, tmp_path):
-    session = begin()
+def test_an_episode_whose_entry_a_kill_prevented_counts(open_session, tmp_path):
+    session = open_session()
     keep_one(session)
     marker = (tmp_path / "demos" / "demos.json").read_bytes()
     keep_one(session)
     (tmp_path / "demos" / "demos.json").write_bytes(marker)
     (tmp_path / "demos" / ".partial-1-episode_000002.safetensors").write_bytes(b"half")
-    session = begin()
+    session = open_session()
     assert (session.status().seed, session.status().episode) == (2, 2)
     keep_one(session)
     assert len(list_demos(tmp_path / "demos")) == 3
     assert not list((tmp_path / "demos").glob(".partial*"))
 
 
-def test_a_folder_is_one_sessions_at_a_time(begin, tmp_path):
-    keep_one(begin())
+def test_a_folder_is_one_sessions_at_a_time(open_session, tmp_path):
+    keep_one(open_session())
     with (
         pytest.raises(SurgicaiError, match="another session"),
         open_recordings(tmp_path / "demos", SHORT, "f" * 64),
@@ -273,13 +273,13 @@ class Canvas:
     def __init__(self, clock, cost):
         self.clock, self.cost, self.shown = clock, cost, []
 
-    def wants(self):
+    def wants_image(self):
         return True
 
     def show(self, images, status):
         self.shown.append(status)
 
-    def look(self):
+    def render(self):
         self.clock.now += self.cost
         return {}
 
@@ -288,30 +288,32 @@ def run_loop(session, cost, inputs, pace=1.0):
     clock = Clock()
     canvas = Canvas(clock, cost)
     heard = []
-    drive(session, Script(*inputs), canvas, canvas, Pacer(pace, clock, clock.sleep), heard.append)
+    run_session(
+        session, Script(*inputs), canvas, canvas, Pacer(pace, clock, clock.sleep), heard.append
+    )
     return clock.now, canvas.shown, heard
 
 
 @pytest.mark.parametrize(("cost", "images"), [(0.001, 102), (0.03, 68), (0.09, 22)])
-def test_a_slow_screen_loses_images_and_no_ticks(begin, cost, images):
+def test_a_slow_screen_loses_images_and_no_ticks(open_session, cost, images):
     config = TaskConfig("grasp", max_steps=1000)
     inputs = [REST, event(START), *[right(1e-6)] * 99, event(STOP)]
-    session = begin(config, keep_failures=True)
+    session = open_session(config, keep_failures=True)
     seconds, shown, _ = run_loop(session, cost, inputs)
     assert shown[-1].steps == 100, "a step a tick, whatever is drawn"
     assert len(shown) == pytest.approx(images, abs=3)
     assert seconds == pytest.approx(102 / 50, abs=0.15), "in real time all the same"
 
 
-def test_pace_slows_the_clock_and_not_the_world(begin):
+def test_pace_slows_the_clock_and_not_the_world(open_session):
     inputs = [REST, event(START), *[right(1e-6)] * 8, event(STOP)]
-    times = {pace: run_loop(begin(), 0.0, inputs, pace)[0] for pace in (1.0, 0.5)}
+    times = {pace: run_loop(open_session(), 0.0, inputs, pace)[0] for pace in (1.0, 0.5)}
     assert times[0.5] == pytest.approx(2 * times[1.0])
 
 
-def test_what_happened_is_heard_once(begin):
+def test_what_happened_is_heard_once(open_session):
     _, _, heard = run_loop(
-        begin(), 0.0, [REST, *[right()] * 9, event(KEEP), REST, REST, event(STOP)]
+        open_session(), 0.0, [REST, *[right()] * 9, event(KEEP), REST, REST, event(STOP)]
     )
     messages = [status.message for status in heard]
     assert len(messages) == len(set(messages))
@@ -357,11 +359,11 @@ ENDLESS = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from teleoperators import REST, SHORT, VIEWS, Stand, Still, right
+from teleoperators import REST, SHORT, VIEWS, SessionEnv, FakeMapping, right
 from surgicai_vision.teleoperation.recordings import open_recordings
 from surgicai_vision.teleoperation.session import Rules, Session
 with open_recordings(Path(sys.argv[2]), SHORT, "f" * 64) as recordings:
-    session = Session(Stand(SHORT), Still(), recordings, VIEWS, Rules(auto_keep=True))
+    session = Session(SessionEnv(SHORT), FakeMapping(), recordings, VIEWS, Rules(auto_keep=True))
     while True:
         for _ in range(12):
             session.tick(right() if session.status().steps else REST)
@@ -370,7 +372,7 @@ with open_recordings(Path(sys.argv[2]), SHORT, "f" * 64) as recordings:
 """
 
 
-def test_a_killed_process_leaves_whole_episodes_and_the_next_goes_on(begin, root, tmp_path):
+def test_a_killed_process_leaves_whole_episodes_and_the_next_goes_on(open_session, root, tmp_path):
     for enough in (3, 6):
         command = [
             sys.executable,
@@ -391,7 +393,7 @@ def test_a_killed_process_leaves_whole_episodes_and_the_next_goes_on(begin, root
         assert all(demo.success[-1] for demo in demos)
         seeds = [demo.seed for demo in demos]
         assert len(set(seeds)) == len(seeds), "no start twice"
-    session = begin()
+    session = open_session()
     assert session.status().episode == len(demos)
     assert session.status().seed > max(seeds)
     assert (

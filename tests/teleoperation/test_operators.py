@@ -1,18 +1,16 @@
-"""Teleoperation of the real env by scripted people: what was kept is what happened, and renders as
-it is.
-"""
+"""Teleoperation of the real env by scripted operators: what was kept is what happened."""
 
 import itertools
 
 import numpy as np
 import pytest
-from teleoperators import VIEWS, AtGamepad, AtKeyboard, event
+from teleoperators import VIEWS, GamepadOperator, KeyboardOperator, event
 
 from surgicai_vision import envs
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 from surgicai_vision.demos.store import list_demos, read_demo
-from surgicai_vision.teleoperation.input_mapping import Steering
+from surgicai_vision.teleoperation.input_mapping import InputMapping
 from surgicai_vision.teleoperation.inputs import DISCARD, KEEP, START
 from surgicai_vision.teleoperation.recordings import open_recordings
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, Rules, Session
@@ -25,15 +23,15 @@ def play(folder, who, config=LONG, frame="camera", speed=0.5, episodes=1, answer
     env = envs.make(config)
     answers = iter(answers or itertools.repeat(KEEP))
     with open_recordings(folder, config, env.scene.hash) as recordings:
-        steering = Steering(env, frame, speed)
-        session = Session(env, steering, recordings, VIEWS, Rules(episodes=episodes))
-        hands = who(session, steering)
+        mapping = InputMapping(env, frame, speed)
+        session = Session(env, mapping, recordings, VIEWS, Rules(episodes=episodes))
+        operator = who(session, mapping)
         while not session.over:
             state = session.status().state
             session.tick(
                 event(next(answers))
                 if state == JUDGED
-                else hands.poll()
+                else operator.poll()
                 if state == DRIVING
                 else event(START)
             )
@@ -42,9 +40,9 @@ def play(folder, who, config=LONG, frame="camera", speed=0.5, episodes=1, answer
 
 
 @pytest.mark.parametrize(
-    ("who", "frame", "speed"), [(AtKeyboard, "camera", 0.5), (AtGamepad, "tool", 1.0)]
+    ("who", "frame", "speed"), [(KeyboardOperator, "camera", 0.5), (GamepadOperator, "tool", 1.0)]
 )
-def test_hands_grasp_and_the_recording_is_what_happened(tmp_path, who, frame, speed):
+def test_an_operator_grasps_and_the_recording_is_what_happened(tmp_path, who, frame, speed):
     session = play(tmp_path / "demos", who, frame=frame, speed=speed, answers=[DISCARD, KEEP])
     assert (session.kept, session.discarded) == (1, 1)
     demo = read_demo(list_demos(tmp_path / "demos")[0])
@@ -58,15 +56,15 @@ def test_hands_grasp_and_the_recording_is_what_happened(tmp_path, who, frame, sp
         np.testing.assert_array_equal(env.get_state(), state)
 
 
-def test_the_same_hands_give_the_same_files(tmp_path):
+def test_the_same_operator_gives_the_same_files(tmp_path):
     for name in ("one", "two"):
-        play(tmp_path / name, AtGamepad, speed=1.0, episodes=2)
+        play(tmp_path / name, GamepadOperator, speed=1.0, episodes=2)
     for path in list_demos(tmp_path / "one"):
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
 
 
 def test_kept_episodes_go_through_render_demos_as_they_are(tmp_path):
-    play(tmp_path / "demos", AtGamepad, speed=1.0, episodes=2)
+    play(tmp_path / "demos", GamepadOperator, speed=1.0, episodes=2)
     summary = render_demos(tmp_path / "demos", tmp_path / "dataset", views=("back",), size=32)
     lengths = [len(read_demo(path)) for path in list_demos(tmp_path / "demos")]
     assert (summary.episodes, summary.frames) == (2, sum(lengths))
@@ -77,7 +75,9 @@ def test_kept_episodes_go_through_render_demos_as_they_are(tmp_path):
 
 def test_a_whole_suture_is_driven_with_one_gamepad_and_changes_arms(tmp_path):
     assert (
-        play(tmp_path / "demos", AtGamepad, TaskConfig("suture", max_steps=2000), speed=1.0).kept
+        play(
+            tmp_path / "demos", GamepadOperator, TaskConfig("suture", max_steps=2000), speed=1.0
+        ).kept
         == 1
     )
     demo = read_demo(list_demos(tmp_path / "demos")[0])
@@ -89,4 +89,4 @@ def test_randomised_and_delayed_envs_are_driven_too(tmp_path):
     config = TaskConfig(
         "grasp", max_steps=600, randomisation=RandomisationConfig(needle_thickness=0.1, latency=2)
     )
-    assert play(tmp_path / "demos", AtGamepad, config, speed=1.0).kept == 1
+    assert play(tmp_path / "demos", GamepadOperator, config, speed=1.0).kept == 1

@@ -1,6 +1,4 @@
-"""The web view: who may ask and who not, keys that arrive, images that change, and a real
-browser.
-"""
+"""The web view: access, keys that arrive, images that change, and a real browser."""
 
 import http.client
 import itertools
@@ -16,20 +14,27 @@ import cv2
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
-from teleoperators import REST, SHORT, VIEWS, AtKeyboard, Stand, Still
+from teleoperators import REST, SHORT, VIEWS, FakeMapping, KeyboardOperator, SessionEnv
 
 from surgicai_vision import envs
 from surgicai_vision.commands.main import main
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.store import list_demos, read_demo
-from surgicai_vision.teleoperation.input_mapping import Steering
+from surgicai_vision.teleoperation.input_mapping import InputMapping
 from surgicai_vision.teleoperation.inputs import JAW, KEEP, START, Input
-from surgicai_vision.teleoperation.loop import drive
+from surgicai_vision.teleoperation.loop import run_session
 from surgicai_vision.teleoperation.pacer import Pacer
 from surgicai_vision.teleoperation.recordings import open_recordings
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, WAITING, Rules, Session
-from surgicai_vision.teleoperation.web import BROWSERS, FOLDER, LONGEST, SILENT, Hands, WebView
+from surgicai_vision.teleoperation.web import (
+    FOLDER,
+    MAX_INPUT_BYTES,
+    MAX_PAGES,
+    SILENCE_S,
+    PageInputs,
+    WebView,
+)
 
 
 class Clock:
@@ -39,7 +44,7 @@ class Clock:
         return self.now
 
 
-def said(number, held=(), pressed=(), client="a", axes=(), buttons=()):
+def page_message(number, held=(), pressed=(), client="a", axes=(), buttons=()):
     return {
         "client": client,
         "number": number,
@@ -50,48 +55,48 @@ def said(number, held=(), pressed=(), client="a", axes=(), buttons=()):
     }
 
 
-# -- hands -----------------------------------------------------------------------------------------
+# -- inputs ----------------------------------------------------------------------------------------
 
 
 def test_keys_arrive_once_and_stay_while_they_are_heard_of():
-    hands = Hands(clock := Clock())
-    hands.receive(said(0, ["KeyD", "ArrowRight"], ["KeyD", "ArrowRight"]))
-    assert hands.poll() == Input((1, 0, 0), events=(KEEP,))
-    clock.now += 0.9 * SILENT
-    hands.receive(said(1, ["KeyD", "ArrowRight"]))
-    clock.now += 0.9 * SILENT
-    assert hands.poll() == Input((1, 0, 0)), "a key that stays down is no second press"
-    clock.now += 0.2 * SILENT
-    assert hands.poll() == REST, "a browser that fell silent holds nothing"
-    hands.receive(said(2, ["KeyD", "Space"]))
-    assert hands.poll() == Input((1, 0, 0)), "heard again: held keys count, and press nothing"
-    hands.receive(said(3))
-    assert hands.poll() == REST
+    inputs = PageInputs(clock := Clock())
+    inputs.receive(page_message(0, ["KeyD", "ArrowRight"], ["KeyD", "ArrowRight"]))
+    assert inputs.poll() == Input((1, 0, 0), events=(KEEP,))
+    clock.now += 0.9 * SILENCE_S
+    inputs.receive(page_message(1, ["KeyD", "ArrowRight"]))
+    clock.now += 0.9 * SILENCE_S
+    assert inputs.poll() == Input((1, 0, 0)), "a key that stays down is no second press"
+    clock.now += 0.2 * SILENCE_S
+    assert inputs.poll() == REST, "a browser that fell silent holds nothing"
+    inputs.receive(page_message(2, ["KeyD", "Space"]))
+    assert inputs.poll() == Input((1, 0, 0)), "heard again: held keys count, and press nothing"
+    inputs.receive(page_message(3))
+    assert inputs.poll() == REST
 
 
 def test_a_tap_between_two_messages_counts():
-    hands = Hands(Clock())
-    hands.receive(said(0, pressed=["KeyE", "Space", "Space"]))
-    assert hands.poll() == Input((0, 0, 1), events=(JAW, JAW))
-    assert hands.poll() == REST
+    inputs = PageInputs(Clock())
+    inputs.receive(page_message(0, pressed=["KeyE", "Space", "Space"]))
+    assert inputs.poll() == Input((0, 0, 1), events=(JAW, JAW))
+    assert inputs.poll() == REST
 
 
 def test_messages_that_come_late_or_twice_are_passed_over():
-    hands = Hands(Clock())
-    hands.receive(said(5, ["KeyD"], ["KeyD"]))
-    hands.receive(said(4, ["KeyA"], ["KeyA"]))
-    hands.receive(said(5, ["KeyA", "Enter"], ["KeyA", "Enter"]))
-    assert hands.poll() == Input((1, 0, 0))
+    inputs = PageInputs(Clock())
+    inputs.receive(page_message(5, ["KeyD"], ["KeyD"]))
+    inputs.receive(page_message(4, ["KeyA"], ["KeyA"]))
+    inputs.receive(page_message(5, ["KeyA", "Enter"], ["KeyA", "Enter"]))
+    assert inputs.poll() == Input((1, 0, 0))
 
 
 def test_gamepads_and_several_pages_add_up_and_the_oldest_page_makes_room():
-    hands = Hands(clock := Clock())
-    hands.receive(said(0, axes=[1, 0, 0, 0], buttons=[0] * 9 + [1]))
-    assert hands.poll() == Input((1, 0, 0), events=(START,))
-    for index in range(BROWSERS):
+    inputs = PageInputs(clock := Clock())
+    inputs.receive(page_message(0, axes=[1, 0, 0, 0], buttons=[0] * 9 + [1]))
+    assert inputs.poll() == Input((1, 0, 0), events=(START,))
+    for index in range(MAX_PAGES):
         clock.now += 0.01
-        hands.receive(said(0, ["KeyL"], ["KeyL"], client=f"page {index}"))
-    assert hands.poll() == Input(turn=(0, 1, 0)), "the gamepad's page is forgotten"
+        inputs.receive(page_message(0, ["KeyL"], ["KeyL"], client=f"page {index}"))
+    assert inputs.poll() == Input(turn=(0, 1, 0)), "the gamepad's page is forgotten"
 
 
 @pytest.mark.parametrize(
@@ -100,20 +105,20 @@ def test_gamepads_and_several_pages_add_up_and_the_oldest_page_makes_room():
         None,
         [],
         {},
-        said("0"),
-        said(0, client="x" * 65),
-        {**said(0), "held": "KeyD"},
-        said(0, held=[1]),
-        said(0, held=["KeyD"] * 65),
-        said(0, axes=["1"]),
-        said(0, axes=[float("nan")]),
-        said(0, buttons=[1e9]),
-        {**said(0), "axes": None},
+        page_message("0"),
+        page_message(0, client="x" * 65),
+        {**page_message(0), "held": "KeyD"},
+        page_message(0, held=[1]),
+        page_message(0, held=["KeyD"] * 65),
+        page_message(0, axes=["1"]),
+        page_message(0, axes=[float("nan")]),
+        page_message(0, buttons=[1e9]),
+        {**page_message(0), "axes": None},
     ],
 )
 def test_what_no_page_would_say_is_refused(message):
     with pytest.raises(InputError, match="An input must"):
-        Hands().receive(message)
+        PageInputs().receive(message)
 
 
 # -- the server ------------------------------------------------------------------------------------
@@ -196,8 +201,8 @@ def test_there_is_nothing_else_below_the_token(web, path):
     ],
 )
 def test_pages_of_other_sites_are_refused(web, headers, status):
-    assert post(web, said(0, ["KeyD"], ["KeyD"]), **headers) == status
-    assert web.poll().moves == (status == 204)
+    assert post(web, page_message(0, ["KeyD"], ["KeyD"]), **headers) == status
+    assert web.poll().is_moving == (status == 204)
 
 
 @pytest.mark.parametrize(
@@ -208,12 +213,12 @@ def test_pages_of_other_sites_are_refused(web, headers, status):
         (b"[" * 3000, 400),
         (b"\xff\xfe", 400),
         (b"[]", 400),
-        (b" " * (LONGEST + 1), 413),
+        (b" " * (MAX_INPUT_BYTES + 1), 413),
     ],
 )
 def test_broken_inputs_are_refused_and_the_server_lives(web, body, status):
     assert post(web, body) == status
-    assert post(web, said(0, ["KeyD"], ["KeyD"])) == 204
+    assert post(web, page_message(0, ["KeyD"], ["KeyD"])) == 204
     assert web.poll().move == (1, 0, 0)
 
 
@@ -223,7 +228,7 @@ def status_of(config=SHORT):
     class Nowhere:
         seeds, next_seed = (), 3
 
-    return Session(Stand(config), Still(), Nowhere(), VIEWS).status()
+    return Session(SessionEnv(config), FakeMapping(), Nowhere(), VIEWS).status()
 
 
 def test_images_are_jpegs_and_change(web):
@@ -242,7 +247,7 @@ def test_images_are_jpegs_and_change(web):
 
 def test_a_page_waits_for_the_next_image_and_asks_for_it(web):
     image = {"front": np.zeros((8, 8, 3), np.uint8)}
-    assert not web.wants(), "nobody looks: nothing is drawn"
+    assert not web.wants_image(), "nobody looks: nothing is drawn"
     web.show(image, status_of())
     first = json.loads(ask(web, "status?after=0")[2])
     assert (first["number"], first["image"], first["state"], first["seed"]) == (1, 1, WAITING, 3)
@@ -251,12 +256,12 @@ def test_a_page_waits_for_the_next_image_and_asks_for_it(web):
         target=lambda: answers.append(json.loads(ask(web, "status?after=1")[2]))
     )
     thread.start()
-    while not web.wants():
+    while not web.wants_image():
         time.sleep(0.001)
     web.show(image, status_of())
     thread.join()
     assert (answers[0]["number"], answers[0]["image"]) == (2, 1), "the same image keeps its number"
-    assert not web.wants()
+    assert not web.wants_image()
     assert json.loads(ask(web, "status?after=x")[2])["number"] == 2
 
 
@@ -276,15 +281,15 @@ def test_keys_that_came_by_http_grasp_the_needle(web, tmp_path):
     config = TaskConfig("grasp", max_steps=1500)
     env = envs.make(config)
     with open_recordings(tmp_path / "demos", config, env.scene.hash) as recordings:
-        steering = Steering(env)
-        session = Session(env, steering, recordings, VIEWS, Rules(episodes=1))
-        person, numbers = AtKeyboard(session, steering), itertools.count()
+        mapping = InputMapping(env)
+        session = Session(env, mapping, recordings, VIEWS, Rules(episodes=1))
+        person, numbers = KeyboardOperator(session, mapping), itertools.count()
         connection = http.client.HTTPConnection("127.0.0.1", web.port, timeout=10)
         while not session.over:
             presses = {WAITING: ["Enter"], JUDGED: ["ArrowRight"]}.get(session.status().state, [])
             person.poll()
             held = list(person.keyboard._held) if session.status().state == DRIVING else []
-            body = json.dumps(said(next(numbers), held, presses))
+            body = json.dumps(page_message(next(numbers), held, presses))
             connection.request(
                 "POST", f"/{web.token}/input", body, {"Content-Type": "application/json"}
             )
@@ -320,7 +325,7 @@ def test_the_command_records_stops_and_sums_up(tmp_path):
     for number, (code, state, kept) in enumerate(
         (("Enter", DRIVING, 0), ("ArrowRight", WAITING, 1), ("Escape", "stopped", 1))
     ):
-        body = json.dumps(said(number, pressed=[code]))
+        body = json.dumps(page_message(number, pressed=[code]))
         connection.request(
             "POST", f"{address.path}input", body, {"Content-Type": "application/json"}
         )
@@ -350,7 +355,7 @@ class Painted:
     def __init__(self, env):
         self.env = env
 
-    def look(self):
+    def render(self):
         grey = int(40 + 150 * self.env.state[1])
         return {view: np.full((32, 32, 3), grey, np.uint8) for view in VIEWS}
 
@@ -368,9 +373,9 @@ def test_a_browser_drives_keeps_discards_and_stops(web, tmp_path):
     )
     state = "document.getElementById('message').className"
     with open_recordings(tmp_path / "demos", config, "f" * 64) as recordings:
-        session = Session(Stand(config), Still(), recordings, VIEWS)
+        session = Session(SessionEnv(config), FakeMapping(), recordings, VIEWS)
         loop = threading.Thread(
-            target=drive, args=(session, web, web, Painted(session.env), Pacer())
+            target=run_session, args=(session, web, web, Painted(session.env), Pacer())
         )
         loop.start()
         try:
