@@ -1,7 +1,7 @@
 """Render demonstrations: states → images, one job an episode, then one LeRobot dataset.
 
-    summary = render_demos(Path("demos"), Path("dataset"), views=("front", "back"), depth=True,
-    workers=2) summary.frames, summary.episodes, summary.seconds, summary.digest
+    summary = render_demos(Path("demos"), Path("dataset"), views=("front", "back"), depth=True)
+    summary.frames, summary.episodes, summary.seconds, summary.digest
 
 Every state of a demonstration is set in the environment as it was recorded and observed; frame t is
 the state before action t. An episode is committed whole to `<out>.work`, and when all are there the

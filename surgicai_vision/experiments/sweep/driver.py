@@ -26,6 +26,7 @@ from surgicai_vision.evaluation.storage import (
     parquet_bytes,
     read_rows,
 )
+from surgicai_vision.experiments.prepare import prepare_dataset
 from surgicai_vision.experiments.run import Cell
 from surgicai_vision.experiments.sweep.grid import Grid, chain_parts
 from surgicai_vision.experiments.sweep.plan import (
@@ -167,8 +168,6 @@ class _Sweep:
         """Make the datasets, features and policies that cells share; a task whose dataset fails
         fails its cells.
         """
-        from surgicai_vision.experiments.prepare import prepare_dataset
-
         needed = {state.cell.task: None for state in to_do}
         replayed = [
             task
@@ -178,11 +177,18 @@ class _Sweep:
         for task in [*needed, *(task for task in replayed if task not in needed)]:
             try:
                 prepare_dataset(
-                    self.grid.config(task), self.jobs.data_folder(task), self.context,
-                    demonstrations=self.grid.recorded, views=self.grid.cameras or ("front",), size=self.grid.size,
-                    depth=self.grid.has_depth, demonstrator=self.grid.demonstrator, disturbance=self.grid.disturbance,
-                    frame_stride=self.grid.frame_stride, post_success_steps=self.grid.post_success_steps,
-                )  # fmt: skip
+                    self.grid.config(task),
+                    self.jobs.data_folder(task),
+                    self.context,
+                    demonstrations=self.grid.recorded,
+                    views=self.grid.cameras or ("front",),
+                    size=self.grid.size,
+                    depth=self.grid.has_depth,
+                    demonstrator=self.grid.demonstrator,
+                    disturbance=self.grid.disturbance,
+                    frame_stride=self.grid.frame_stride,
+                    post_success_steps=self.grid.post_success_steps,
+                )
             except SurgicaiError as error:
                 for state in to_do:
                     if task == state.cell.task:
