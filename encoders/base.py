@@ -30,24 +30,19 @@ BatchNorms are folded into the convolutions before them (`encoders.folding`).
 
 import functools
 import hashlib
-import pickle
-import zipfile
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from pathlib import Path
-from typing import Any, final
+from typing import final
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import nn
 
 from encoders.card import EncoderCard, Plugin
 from encoders.folding import fold_batch_norms
+from encoders.state import load_exactly, read_tensors, read_torch
 from surgicai_vision.core.config import digest
-from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
+from surgicai_vision.core.errors import InputError, SurgicaiError, check_name
 
 __all__ = [
     "POOLS",
@@ -70,9 +65,7 @@ FINGERPRINT_VERSION = 2  # raise when the same weights and card begin to give ot
 
 
 class MapNetwork(nn.Sequential):
-    """Layers whose answer is a feature map (B, C, h, w); the global feature is its mean over
-    places.
-    """
+    """Layers with a feature map (B, C, h, w) at their end; its mean is the global feature."""
 
     def forward_features(self, images: torch.Tensor) -> torch.Tensor:
         """Return the feature map (B, C, h, w)."""
@@ -157,7 +150,8 @@ class Encoder:
         )
         self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         low, high = card.input_range
-        mean, std = torch.tensor(card.mean), torch.tensor(card.std)
+        mean = torch.tensor(card.mean)
+        std = torch.tensor(card.std)
         self._scale = ((high - low) / 255 / std).to(self._device)
         self._shift = ((low - mean) / std).to(self._device)
         self._channels = [2, 1, 0] if card.channel_order == "BGR" else None
@@ -237,9 +231,7 @@ class Encoder:
 
     @functools.cached_property
     def _any_size(self) -> bool:
-        """Whether pieces of `SMALL` give the bits of whole ones; asked of the network itself,
-        once.
-        """
+        """Whether pieces of `SMALL` give the bits of whole ones; asked of the network, once."""
         if self._device.type == "cuda":
             return False
         side = self.card.input_size
@@ -259,8 +251,10 @@ class Encoder:
 
     @torch.inference_mode()
     def _run(self, frames: np.ndarray, pad: bool | None = None) -> torch.Tensor:
-        """Encode one piece of at most a batch, padded unless it need not be; (b, *shape) float32 on
-        the device.
+        """Encode one piece of at most a batch, padded unless it need not be.
+
+        Returns:
+            (b, *shape) float32, on the device.
         """
         count = len(frames)
         if count < self._batch and (not self._any_size if pad is None else pad):
@@ -290,8 +284,8 @@ class Encoder:
             return features
         return features.flatten(2).transpose(1, 2) if features.ndim == 4 else features
 
-    def _identity(self) -> dict[str, Any]:
-        """Everything a feature depends on, as plain data."""
+    def _identity(self) -> dict[str, object]:
+        """Return everything a feature depends on, as plain data."""
         card = asdict(self.card)
         keys = (
             "architecture",
@@ -310,73 +304,3 @@ class Encoder:
             "compute": f"{self._device.type} {self._dtype}",
             **{key: card[key] for key in keys},
         }
-
-
-DAMAGED = (
-    pickle.UnpicklingError,
-    RuntimeError,
-    EOFError,
-    OSError,
-    ValueError,
-    KeyError,
-    zipfile.BadZipFile,
-)
-"""What `torch.load` raises on a file that is no torch file, cut short, or holds more than
-tensors.
-"""
-
-
-def read_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """Read a flat table of tensors from a safetensors or a torch file; no code in it can run."""
-    if path.suffix == ".safetensors":
-        try:
-            return load_file(path)
-        except (SafetensorError, OSError) as error:
-            raise BadFile(f"{path} is not a whole safetensors file ({_one_line(error)}).") from None
-    return read_torch(path)
-
-
-def read_torch(path: Path) -> dict[str, torch.Tensor]:
-    """Read a torch file with `weights_only=True`; wrappers like {"model": …} are opened."""
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except DAMAGED as error:
-        raise BadFile(
-            f"{path} is not a whole torch file of weights alone ({_one_line(error)})."
-        ) from None
-    for wrapper in ("state_dict", "model", "r3m"):
-        if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
-            content = content[wrapper]
-    if not isinstance(content, Mapping):
-        raise BadFile(f"{path} holds {type(content).__name__}, not a table of weights.")
-    return {str(key): value for key, value in content.items() if isinstance(value, torch.Tensor)}
-
-
-def load_exactly(network: nn.Module, tensors: Mapping[str, torch.Tensor], where: object) -> None:
-    """Load `tensors` into `network`; refuse a missing, an unexpected or a misshapen tensor by
-    name.
-    """
-    wanted = network.state_dict()
-    missing = sorted(wanted.keys() - tensors.keys())
-    # Old checkpoints lack BatchNorm's counter, which nothing reads in eval mode.
-    missing = [name for name in missing if not name.endswith("num_batches_tracked")]
-    unexpected = sorted(tensors.keys() - wanted.keys())
-    shapes = [
-        name for name in wanted.keys() & tensors.keys() if wanted[name].shape != tensors[name].shape
-    ]
-    for problem, names in (
-        ("lacks", missing),
-        ("holds unexpected", unexpected),
-        ("has the wrong shape of", shapes),
-    ):
-        if names:
-            raise BadFile(
-                f"{where} {problem} {len(names)} of {len(wanted)} tensors ('{names[0]}' first): "
-                "not weights of this architecture."
-            )
-    network.load_state_dict(dict(tensors), strict=False)
-
-
-def _one_line(error: Exception) -> str:
-    """First line of an error's text, cut to a readable length."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:120]

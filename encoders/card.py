@@ -1,5 +1,6 @@
-"""An encoder's card, and what a member file offers: plain data, so that listing encoders loads no
-torch.
+"""An encoder's card, and what a member file offers.
+
+Both are plain data, so that listing encoders loads no torch.
 """
 
 from collections.abc import Callable, Mapping

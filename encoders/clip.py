@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard, Plugin
+from encoders.state import load_exactly, read_tensors
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import sha256_file
 
@@ -64,8 +65,6 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     import open_clip
     import torch
 
-    from encoders.base import load_exactly
-
     if path is None:
         raise BadFile(f"Encoder '{card.name}' needs a weights file.")
     tensors = {
@@ -88,8 +87,6 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
 def _read(path: Path) -> "dict[str, torch.Tensor]":
     """Read a weights file, or one of OpenAI's archives by its hash."""
     import torch
-
-    from encoders.base import read_tensors
 
     if path.suffix == ".pt" and sha256_file(path) in ARCHIVES.values():
         return dict(torch.jit.load(path, map_location="cpu").state_dict())

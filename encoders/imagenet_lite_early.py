@@ -1,5 +1,4 @@
-"""`imagenet-lite-early`: the first three stages of `imagenet-lite`, for a trained head on its map
-(`--pool spatial`).
+"""`imagenet-lite-early`: the first three stages of `imagenet-lite`, for `--pool spatial`.
 
 A map of 28 × 28 places still says where a thin needle lies, which the last layer's 7 × 7 and a
 global feature lose (docs/results/best.md compares), at a third of the whole network's arithmetic.
@@ -7,15 +6,17 @@ global feature lose (docs/results/best.md compares), at a third of the whole net
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from encoders import packaged
 from encoders.card import EncoderCard, Plugin
+from encoders.state import map_network
 
 if TYPE_CHECKING:
     from torch import nn
 
-STAGES, CHANNELS = 3, 40
+STAGES = 3
+CHANNELS = 40
 
 CARD = replace(
     packaged.CARD,
@@ -28,13 +29,14 @@ CARD = replace(
 )
 
 
-def early_of(network: Any) -> "nn.Module":
-    """Return the network (B, 3, 224, 224) → (B, 40), map (B, 40, 28, 28), of timm's
-    EfficientNet-Lite0.
-    """
-    from encoders.base import MapNetwork
+def early_of(network: "nn.Module") -> "nn.Module":
+    """Return the first stages of timm's EfficientNet-Lite0.
 
-    return MapNetwork(network.conv_stem, network.bn1, *network.blocks[:STAGES])
+    Returns:
+        The network (B, 3, 224, 224) → (B, 40), with a map (B, 40, 28, 28).
+    """
+    blocks = list(network.get_submodule("blocks").children())[:STAGES]
+    return map_network(network.get_submodule("conv_stem"), network.get_submodule("bn1"), *blocks)
 
 
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":

@@ -1,9 +1,8 @@
-"""EfficientNet-Lite0 whose weights are installed by pip: what `imagenet-lite` and
-`imagenet-lite-early` share.
+"""EfficientNet-Lite0 whose weights are installed by pip.
 
-The package ships one torch file whose tensors stand in the same order, with the same shapes, as
-those of timm's `tf_efficientnet_lite0`; only the names differ, so they are mapped by position.
-Checked by classification in tests/test_encoders.py.
+`imagenet-lite` and `imagenet-lite-early` share it. The package ships one torch file whose tensors
+stand in the same order, with the same shapes, as those of timm's `tf_efficientnet_lite0`; only the
+names differ, so they are mapped by position. Checked by classification in the tests of encoders.
 """
 
 import importlib.util
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard
+from encoders.state import read_torch
 from surgicai_vision.core.errors import BadFile, MissingWeights
 
 if TYPE_CHECKING:
@@ -58,7 +58,8 @@ def network_from(tensors: dict, where: object) -> "nn.Module":
     shapes = [tuple(tensor.shape) for tensor in tensors.values()]
     if shapes != [tuple(tensor.shape) for tensor in wanted.values()]:
         raise BadFile(
-            f"{where} does not hold EfficientNet-Lite0: {len(shapes)} tensors, {len(wanted)} wanted."
+            f"{where} does not hold EfficientNet-Lite0: "
+            f"{len(shapes)} tensors, {len(wanted)} wanted."
         )
     network.load_state_dict(dict(zip(wanted, tensors.values(), strict=True)))
     network.reset_classifier(0)
@@ -67,7 +68,5 @@ def network_from(tensors: dict, where: object) -> "nn.Module":
 
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
     """Build the network from the packaged file or from `path`."""
-    from encoders.base import read_torch
-
     path = path or packaged_file()
     return card, network_from(read_torch(path), path)

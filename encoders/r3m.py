@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard, Plugin
+from encoders.state import load_exactly, read_tensors
 from surgicai_vision.core.errors import BadFile
 
 if TYPE_CHECKING:
@@ -39,8 +40,6 @@ CARD = EncoderCard(
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
     """Build the network from an R3M file; its language and reward heads are left out."""
     import timm
-
-    from encoders.base import load_exactly, read_tensors
 
     if path is None:
         raise BadFile(f"Encoder '{card.name}' needs a weights file.")

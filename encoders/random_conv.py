@@ -1,5 +1,4 @@
-"""`random-conv`: four convolutions that were never trained, for a trained pooling on top (`--pool
-spatial`).
+"""`random-conv`: four convolutions that were never trained, for `--pool spatial`.
 
 A map of 28 × 28 places keeps where things are, which a global feature loses, at a fiftieth of a
 ResNet-50's arithmetic. Random filters followed by a trained choice among their answers are an old
@@ -11,13 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard, Plugin
+from encoders.state import map_network
 from surgicai_vision.core.errors import InputError
 
 if TYPE_CHECKING:
     from torch import nn
 
 SEED = 0
-WIDTHS, KERNELS, STRIDES = (24, 32, 48, 48), (5, 3, 3, 3), (2, 2, 2, 1)
+WIDTHS = (24, 32, 48, 48)
+KERNELS = (5, 3, 3, 3)
+STRIDES = (2, 2, 2, 1)
 
 CARD = EncoderCard(
     name="random-conv",
@@ -36,18 +38,21 @@ CARD = EncoderCard(
     dim=WIDTHS[-1],
     paper="not one of SurgicAI's",
     layers="the fourth convolution (spatial, tokens), its mean over places (global)",
-    note="Never trained; meant for pool 'spatial'. Its weights hash is recorded with every checkpoint.",
+    note=(
+        "Never trained; meant for pool 'spatial'. "
+        "Its weights hash is recorded with every checkpoint."
+    ),
 )
 
 
 def network_from(seed: int) -> "nn.Module":
-    """Build the network (B, 3, 224, 224) → (B, 48), map (B, 48, 28, 28); the global random state
-    stays as it was.
+    """Build the network; the global random state stays as it was.
+
+    Returns:
+        The network (B, 3, 224, 224) → (B, 48), with a map (B, 48, 28, 28).
     """
     import torch
     from torch import nn
-
-    from encoders.base import MapNetwork
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -59,7 +64,7 @@ def network_from(seed: int) -> "nn.Module":
             torch.nn.init.constant_(layer.get_parameter("bias"), 0.0)
             layers += [layer, nn.ReLU()]
             channels = width
-    return MapNetwork(*layers)
+    return map_network(*layers)
 
 
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":

@@ -1,8 +1,8 @@
-"""`random`: the paper's control, a randomly initialised ResNet-50; the same seed gives the same
-network.
+"""`random`: the paper's control, a randomly initialised ResNet-50.
 
-torchvision's initialisation (He normal, fan out; BatchNorm at scale 1 and shift 0). timm's default
-would start the last BatchNorm of each block at scale 0, which switches every residual branch off.
+The same seed gives the same network. The initialisation is torchvision's (He normal, fan out;
+BatchNorm at scale 1 and shift 0). timm's default would start the last BatchNorm of each block at
+scale 0, which switches every residual branch off.
 """
 
 from pathlib import Path

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard, Plugin
+from encoders.state import DAMAGED
 from surgicai_vision.core.errors import BadFile, UnknownName
 from surgicai_vision.core.files import sha256_file
 
@@ -56,8 +57,6 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     """Build the network by timm's own loader, which reads torch files with `weights_only`."""
     import timm
     import torch
-
-    from encoders.base import DAMAGED
 
     if path is None:
         raise BadFile(f"Encoder '{card.name}' needs a weights file.")

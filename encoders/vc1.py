@@ -1,5 +1,4 @@
-"""`vc1`: VC-1, a masked autoencoder's ViT-B/16 trained on egocentric video (non-commercial
-weights).
+"""`vc1`: VC-1, a masked autoencoder's ViT-B/16 of egocentric video (non-commercial weights).
 
 VC-1 resizes to 256 and crops to 224; here the whole image is resized to 224, so that no part of a
 view is cut off. The feature is the class token after the last norm.
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard, Plugin
+from encoders.state import load_exactly, read_tensors
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import sha256_file
 
@@ -31,7 +31,9 @@ CARD = EncoderCard(
     std=(0.229, 0.224, 0.225),
     interpolation="bicubic",
     dim=768,
-    paper="Majumdar et al., Where are we in the search for an Artificial Visual Cortex?, NeurIPS 2023",
+    paper=(
+        "Majumdar et al., Where are we in the search for an Artificial Visual Cortex?, NeurIPS 2023"
+    ),
     layers="class and patch tokens after the last norm (tokens), the class token (global)",
     note="No centre crop: the whole image is resized.",
 )
@@ -40,8 +42,6 @@ CARD = EncoderCard(
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":
     """Build the encoder of the autoencoder; its mask token and decoder are left out."""
     import timm
-
-    from encoders.base import load_exactly, read_tensors
 
     if path is None:
         raise BadFile(f"Encoder '{card.name}' needs a weights file.")

@@ -1,4 +1,4 @@
-"""Where pretrained weights are found. Loads no torch, so a missing file is reported at once.
+"""Find pretrained weights, without torch: a missing file is reported at once.
 
 Interface:
 
@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from encoders.card import EncoderCard
+from encoders.download import BrokenOff, fetch
 from surgicai_vision.core.errors import BadFile, InputError, MissingWeights
 from surgicai_vision.core.files import cache_root, sha256_file
 
@@ -58,22 +59,22 @@ def find(
     if card.filename is None or card.source.startswith("PyPI"):
         return None
     wanted = {card.filename: card.sha256, **(known or {})}
-    found, problem = _in_folder(card, wanted) or _in_hub_cache(card), ""
-    if found is None:
-        found, problem = _downloaded(card)
+    found = _in_folder(card, wanted) or _in_hub_cache(card)
+    if found is not None:
+        return found
+    found, problem = _downloaded(card)
     if found is None:
         raise MissingWeights(missing_line(card, offline_encoders, problem))
     return found
 
 
 def missing_line(card: EncoderCard, offline_encoders: tuple[str, ...], problem: str = "") -> str:
-    """Say in one line which file is wanted, from where, what went wrong, and what works without
-    it.
-    """
+    """Return one line: which file is wanted, from where, and what works without it."""
+    reason = f" ({problem})" if problem else ""
     return (
         f"Encoder '{card.name}' needs {card.filename} of the hub repository {card.source} "
-        f"(revision {card.revision}, sha256 {card.sha256 or 'unpinned'}), and it is neither here nor "
-        f"downloadable{f' ({problem})' if problem else ''}; hand it over with --weights FILE or put it in the folder "
+        f"(revision {card.revision}, sha256 {card.sha256 or 'unpinned'}), and it is neither here "
+        f"nor downloadable{reason}; hand it over with --weights FILE or put it in the folder "
         f"${FOLDER_VARIABLE}. Encoders that work offline: {', '.join(offline_encoders)}."
     )
 
@@ -87,8 +88,8 @@ def _given(card: EncoderCard, path: Path, known: Mapping[str, str]) -> Path:
     published = [sha256 for sha256 in (card.sha256, *known.values()) if sha256]
     if published and not sha256_file(path).startswith(tuple(published)):
         warnings.warn(
-            f"{path} is not the published weights file of '{card.name}'; it is used as given and its own "
-            "hash is recorded.",
+            f"{path} is not the published weights file of '{card.name}'; "
+            "it is used as given and its own hash is recorded.",
             stacklevel=2,
         )
     return path
@@ -133,11 +134,7 @@ def _in_hub_cache(card: EncoderCard) -> Path | None:
 
 
 def _downloaded(card: EncoderCard) -> tuple[Path | None, str]:
-    """Return what was downloaded before, or fetch it when the hub answers at all; else None and
-    why.
-    """
-    from encoders.download import BrokenOff, fetch
-
+    """Return the file downloaded before or now; else None and the reason."""
     folder = cache_root() / "weights" / card.source.replace("/", "--") / card.revision
     target = folder / str(card.filename)
     if target.is_file():

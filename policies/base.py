@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, final
+from typing import final
 
 import numpy as np
 import torch
@@ -53,18 +53,19 @@ class Recipe:
             down to nothing (Smith and Topin, Super-convergence, 2017).
         epochs: passes over the training frames; the last one is the checkpoint.
         batch_size: frames per step.
-        split: "episode", or "transition" as SurgicAI's released code did (neighbouring frames leak).
+        split: "episode", or "transition" as in SurgicAI's released code (neighbouring frames
+            leak).
         validation: share of the episodes (or transitions) held out of training.
         proprioception: feed tip pose and jaw too: the active arm's, for a high-level policy both
             arms'.
-        clock: feed how long the subtask has been on as well (needs proprioception): for
-            demonstrations that act by it.
+        clock: feed the time since the subtask began as well (needs proprioception), for
+            demonstrators that act by it.
         map_head: what takes in a feature map: "softmax" (where each of 32 patterns lies) or
             "convolutions".
-        frame_stride: train on every so-manieth frame of each episode alone, from its first:
-            neighbours say nearly the same.
-        privileged: feed the 21 values of obs_type "state", goal included, in place of all else: a
-            ceiling.
+        frame_stride: train on each N-th frame of an episode alone, from its first: neighbours show
+            nearly the same.
+        privileged: feed the 21 values of obs_type "state", goal included, in place of all else:
+            an upper bound.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -154,8 +155,8 @@ class Plugin:
     """
 
     name: str
-    recipe: type
-    make: Callable[[Any, tuple[tuple[int, ...], ...]], "Policy"]
+    recipe: type[Recipe]
+    make: Callable[[Recipe, tuple[tuple[int, ...], ...]], "Policy"]
     target: str = names.ACTION
     ahead: int = 0
 
@@ -181,21 +182,15 @@ class Policy(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return answers (B, n) for normalised inputs (B, inputs.dim): actions, or logits of
-        classes.
-        """
+        """Return actions or logits (B, n) for normalised inputs (B, inputs.dim)."""
 
     @abc.abstractmethod
     def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Return the training loss (scalar) for normalised inputs and demonstrated answers (B,
-        …).
-        """
+        """Return the loss (scalar) for normalised inputs and demonstrated answers (B, …)."""
 
     @final
     def normalise(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return raw inputs (B, inputs.dim) with zero mean and unit variance over the training
-        frames.
-        """
+        """Return raw inputs (B, inputs.dim) with the training frames' mean and variance removed."""
         return (observed - self.input_mean) / self.input_std
 
     @final
@@ -218,9 +213,8 @@ class Policy(nn.Module, abc.ABC):
         exact = self._exact
         if exact is None:
             exact = copy.deepcopy(self).double().eval().requires_grad_(False)
-            object.__setattr__(
-                self, "_exact", exact
-            )  # not a submodule: it must not enter the state dict
+            # Not a submodule: it must not enter the state dict.
+            object.__setattr__(self, "_exact", exact)
         with torch.inference_mode():
             return exact(exact.normalise(torch.from_numpy(observed))).float().numpy()
 
@@ -243,7 +237,8 @@ class Policy(nn.Module, abc.ABC):
         key = self.inputs.vector or names.STATE
         if agent_pos.shape[1:] != (VECTORS[key],) or (parts and len(parts[0]) != len(agent_pos)):
             raise InputError(
-                f"{key} must be (batch, {VECTORS[key]}) with one row an image, got {agent_pos.shape}."
+                f"{key} must be (batch, {VECTORS[key]}) with one row an image, "
+                f"got {agent_pos.shape}."
             )
         if self.inputs.vector:
             parts.append(agent_pos)

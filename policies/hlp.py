@@ -1,4 +1,4 @@
-"""`hlp`: the paper's high-level policy, which says the subtask that is due.
+"""`hlp`: the paper's high-level policy, which classifies the subtask that is due.
 
 The recipe `paper` (paper, Section 4 and appendix): the network of `bc` with the logits of five
 classes at its end; cross-entropy against the phases of whole procedures, a little ahead (`AHEAD`);
@@ -42,8 +42,10 @@ class HighLevelPolicy(Policy):
         return nn.functional.cross_entropy(self(observed), target)
 
     def choose(self, features: np.ndarray | None, both_arms: np.ndarray) -> np.ndarray:
-        """Return the subtask that is due, (B,) indices in `names.SUBTASKS`, for a batch as `act`
-        takes it.
+        """Return the subtask that is due for a batch as `act` takes it.
+
+        Returns:
+            (B,) indices in `names.SUBTASKS`.
         """
         return self.act(features, both_arms).argmax(axis=1)
 

@@ -1,4 +1,4 @@
-"""Layers the members share: what takes in each kind of feature, and the paper's MLP.
+"""Layers that the policies share: the head of each kind of feature, and the paper's MLP.
 
 A global feature (the paper's) enters as it is; a feature map passes a trained spatial softmax or
 trained convolutions, and tokens a trained attention, before the MLP.
@@ -14,9 +14,8 @@ from torch import nn
 from policies.base import Inputs, Recipe
 from surgicai_vision.core.errors import InputError
 
-POINTS = (
-    32  # patterns of a spatial softmax (Levine et al., End-to-end visuomotor policies, JMLR 2016)
-)
+POINTS = 32
+"""Patterns of a spatial softmax (Levine et al., End-to-end visuomotor policies, JMLR 2016)."""
 
 
 @final
@@ -34,9 +33,7 @@ class GlobalFeature(nn.Module):
 
 @final
 class SpatialSoftmax(nn.Module):
-    """A trained spatial softmax: where in the image each of `POINTS` learned patterns lies, in [-1,
-    1].
-    """
+    """A trained spatial softmax: where in the image each of `POINTS` learned patterns lies."""
 
     def __init__(self, channels: int, height: int, width: int):
         super().__init__()
@@ -51,8 +48,10 @@ class SpatialSoftmax(nn.Module):
         )
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the expected x and y of each pattern, (B, 2 · POINTS), for flattened maps (B,
-        C·h·w).
+        """Return the expected place of each pattern for flattened maps (B, C·h·w).
+
+        Returns:
+            (B, 2 · POINTS): x and y in [-1, 1].
         """
         scores = self.patterns(rows.unflatten(1, self.shape)).flatten(2).softmax(dim=2)
         return (scores @ self.places).flatten(1)
@@ -60,13 +59,15 @@ class SpatialSoftmax(nn.Module):
 
 @final
 class MapConvolutions(nn.Module):
-    """Trained convolutions over a map, halved until at most 7 × 7 are left, then `FEATURES` numbers
-    of them all.
+    """Trained convolutions over a map, and `FEATURES` numbers of what they leave.
 
-    They see the needle's arc as a whole, where a softmax's 1 × 1 patterns see one place at a time.
+    The map is halved until at most 7 × 7 places are left. Convolutions see the needle's arc as a
+    whole, where a softmax's 1 × 1 patterns see one place at a time.
     """
 
-    FEATURES, WIDTH, SMALLEST = 64, 32, 7
+    FEATURES = 64
+    WIDTH = 32
+    SMALLEST = 7
 
     def __init__(self, channels: int, height: int, width: int):
         super().__init__()
@@ -75,7 +76,9 @@ class MapConvolutions(nn.Module):
         layers: list[nn.Module] = []
         while max(height, width) > self.SMALLEST:
             layers += [nn.Conv2d(channels, self.WIDTH, 3, stride=2, padding=1), nn.ReLU()]
-            channels, height, width = self.WIDTH, (height + 1) // 2, (width + 1) // 2
+            channels = self.WIDTH
+            height = (height + 1) // 2
+            width = (width + 1) // 2
         self.layers = nn.Sequential(
             *layers, nn.Flatten(), nn.Linear(channels * height * width, self.FEATURES), nn.ReLU()
         )
@@ -118,16 +121,15 @@ def _head(shape: tuple[int, ...], map_head: str) -> Head:
     }
     if len(shape) not in heads:
         raise InputError(
-            f"A feature of shape {shape} cannot be taken in; allowed are (dim,), (C, h, w) and (N, C)."
+            f"A feature of shape {shape} cannot be taken in; "
+            "allowed are (dim,), (C, h, w) and (N, C)."
         )
     return heads[len(shape)](*shape)
 
 
 @final
 class FeatureMLP(nn.Module):
-    """The paper's network: hidden layers, each preceded by BatchNorm, on features beside a
-    vector.
-    """
+    """The paper's network on features beside a vector: layers with BatchNorm before each."""
 
     def __init__(self, recipe: Recipe, inputs: Inputs, answers: int):
         super().__init__()

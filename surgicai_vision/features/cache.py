@@ -25,7 +25,7 @@ from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 from filelock import Timeout
@@ -36,29 +36,36 @@ from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, Unkn
 from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, locked, read_json, write_json
 
 if TYPE_CHECKING:
+    from encoders.base import Encoder
     from surgicai_vision.dataset.protocol import Dataset
 
 FORMAT = 1
 CHUNK = 256  # frames per progress step: 38 MB of images at 224 × 224
-MANIFEST, PROGRESS, ROWS = "manifest.json", "progress.json", "features.npy"
+MANIFEST = "manifest.json"
+PROGRESS = "progress.json"
+ROWS = "features.npy"
 LOCK = "lock"
 
 Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
 
 
-class FrameEncoder(Protocol):
-    """The part of an encoder that encoding uses; `encoders.base.Encoder` has it."""
+class Manifest(TypedDict):
+    """What an entry holds and by what it was encoded."""
 
-    card: Any
-    pool: str
-    dim: int
-    shape: tuple[int, ...]
-    fingerprint: str
+    format: int
+    dataset: str
+    view: str
+    encoder: str
+    card: dict[str, Any]
+    encoder_fingerprint: str
     weights_sha256: str
-
-    def __call__(self, frames: np.ndarray) -> np.ndarray:
-        """Return (B, dim) float32 features of (B, H, W, 3) uint8 RGB frames."""
+    pool: str
+    shape: list[int]
+    length: int
+    dim: int
+    dtype: str
+    code_version: str
 
 
 @dataclass(frozen=True)
@@ -69,11 +76,11 @@ class Features:
         folder: the cache entry.
         manifest: what was encoded and by what.
         rows: (N, dim) float16 memory map; row i belongs to frame i of the dataset.
-        encoded: frames encoded by the call that returned this; 0 when all were at hand.
+        encoded: frames encoded by the call that returned this; 0 where all were in the cache.
     """
 
     folder: Path
-    manifest: dict[str, Any]
+    manifest: Manifest
     rows: np.ndarray
     encoded: int = 0
 
@@ -110,7 +117,7 @@ class Features:
 default_cache_root = cache_root
 
 
-def entry_key(dataset: "Dataset", view: str, encoder: FrameEncoder) -> str:
+def entry_key(dataset: "Dataset", view: str, encoder: "Encoder") -> str:
     """Return the address of an entry: a hash of everything its rows depend on."""
     return digest(
         {
@@ -126,7 +133,7 @@ def entry_key(dataset: "Dataset", view: str, encoder: FrameEncoder) -> str:
 def encode(
     dataset: "Dataset",
     view: str,
-    encoder: FrameEncoder,
+    encoder: "Encoder",
     cache_root: Path | None = None,
     progress: Progress | None = None,
 ) -> Features:
@@ -155,7 +162,8 @@ def encode(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"The feature cache {folder} cannot be made ({error.strerror}); set ${CACHE_VARIABLE} to another folder."
+            f"The feature cache {folder} cannot be made ({error.strerror}); "
+            f"set ${CACHE_VARIABLE} to another folder."
         ) from None
     with locked(folder / LOCK):  # a second process waits here
         if (folder / MANIFEST).exists():  # and finds the entry complete
@@ -168,7 +176,7 @@ def encode(
 
 def open_entry(folder: Path, length: int | None = None, encoded: int = 0) -> Features:
     """Open a complete entry; `BadFile` where it is damaged."""
-    manifest = read_json(folder / MANIFEST)
+    manifest: Manifest = read_json(folder / MANIFEST)
     try:
         rows = np.load(folder / ROWS, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError) as error:
@@ -183,7 +191,7 @@ def open_entry(folder: Path, length: int | None = None, encoded: int = 0) -> Fea
     return Features(folder, manifest, rows, encoded)
 
 
-def _manifest(dataset: "Dataset", view: str, encoder: FrameEncoder) -> dict[str, Any]:
+def _manifest(dataset: "Dataset", view: str, encoder: "Encoder") -> Manifest:
     """Describe the entry."""
     return {
         "format": FORMAT,
@@ -203,7 +211,7 @@ def _manifest(dataset: "Dataset", view: str, encoder: FrameEncoder) -> dict[str,
 
 
 def _fill(
-    folder: Path, dataset: "Dataset", view: str, encoder: FrameEncoder, progress: Progress | None
+    folder: Path, dataset: "Dataset", view: str, encoder: "Encoder", progress: Progress | None
 ) -> int:
     """Encode what is missing; return how many frames that was."""
     rows, start = _allocated(folder, (dataset.length, encoder.dim))
@@ -215,7 +223,8 @@ def _fill(
             features = encoder(frames).astype(np.float16)
         if not np.isfinite(features).all():
             raise SurgicaiError(
-                f"Encoder '{encoder.card.name}' gave features that are not finite in float16 for view '{view}'."
+                f"Encoder '{encoder.card.name}' gave features that are not finite in float16 "
+                f"for view '{view}'."
             )
         rows[done:stop] = features
         rows.flush()
@@ -260,13 +269,17 @@ def _chunks(dataset: "Dataset", view: str, start: int) -> Iterator[tuple[int, np
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """One entry of the cache as `list_cache` shows it: its folder, size [bytes] and manifest (None:
-    unfinished).
+    """One entry of the cache as `list_cache` shows it.
+
+    Attributes:
+        folder: where it lies.
+        size: what it takes on the disk [bytes].
+        manifest: what it holds; None where it is unfinished.
     """
 
     folder: Path
     size: int
-    manifest: dict[str, Any] | None
+    manifest: Manifest | None
 
 
 def list_cache(root: Path | None = None) -> list[CacheEntry]:
@@ -281,10 +294,13 @@ def list_cache(root: Path | None = None) -> list[CacheEntry]:
 
 
 def prune_cache(root: Path | None = None, keep_datasets: Collection[str] = ()) -> list[CacheEntry]:
-    """Delete unfinished entries and those of datasets not in `keep_datasets` (fingerprints); return
-    them.
+    """Delete unfinished entries and those of other datasets; return them.
 
     An entry that a process is writing now is left alone.
+
+    Args:
+        root: folder of the cache; `default_cache_root()` by default.
+        keep_datasets: fingerprints of the datasets whose whole entries stay.
     """
     removed = []
     for entry in list_cache(root):

@@ -140,7 +140,7 @@ class WeightsSource:
 
     @classmethod
     def of(cls, file: Path | str | None, accept_licence: bool = False) -> "WeightsSource":
-        """Return the source that takes `file` for every encoder, or names no file where it is None."""
+        """Return the source with one file for every encoder, or none where `file` is None."""
         return cls(() if file is None else (("", Path(file)),), accept_licence)
 
     def file_for(self, encoder: str) -> Path | None:

@@ -1,7 +1,7 @@
-"""Probe before rollout: what of the needle's pose can be read linearly from an encoder's features.
+"""Linear probe: read the needle's pose from an encoder's features, before any rollout.
 
 `probe(dataset, features, seed=…, progress=…) -> Probe`: ridge regression in closed form from the
-features to the position of the needle's tip and to its orientation, judged on episodes it was not
+features to the position of the needle's tip and to its orientation, tested on episodes it was not
 fitted on.
 
 Every episode is held out once (`FOLDS` folds of whole episodes). Each penalty is chosen on the
@@ -15,7 +15,6 @@ on: what needs no seeing.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +41,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Measure:
-    """One error: its median over episodes, the 95 % interval of that, and what the mean pose would
-    err.
-    """
+    """One error: its median over episodes with a 95 % interval, and that of the mean pose."""
 
     median: float
     low: float
@@ -72,14 +69,14 @@ class Probe:
     tip_of_episode: tuple[float, ...]
     angle_of_episode: tuple[float, ...]
 
-    def row(self) -> dict[str, Any]:
-        """Return it as a row of `probe.json`."""
-        row: dict[str, Any] = {"n": self.n, "frames": self.frames}
-        for name, unit, measure in (("tip", "mm", self.tip), ("angle", "deg", self.angle)):
-            row[f"{name}_{unit}"] = measure.median
-            row |= {
-                f"{name}_{unit}_{key}": getattr(measure, key) for key in ("low", "high", "chance")
-            }
+    def row(self) -> dict[str, float]:
+        """Return the errors as a row of `probe.json`."""
+        row: dict[str, float] = {"n": self.n, "frames": self.frames}
+        for key, measure in (("tip_mm", self.tip), ("angle_deg", self.angle)):
+            row[key] = measure.median
+            row[f"{key}_low"] = measure.low
+            row[f"{key}_high"] = measure.high
+            row[f"{key}_chance"] = measure.chance
         return row
 
 
@@ -116,7 +113,8 @@ def probe(
     seen = np.concatenate([np.asarray(entry.rows[rows], np.float64) for entry in features], axis=1)
     position, rotation = _targets(pose[rows])
     folds = _folds(index[rows], FOLDS, np.random.default_rng(seed))
-    tip, angle = np.empty((2, len(rows))), np.empty((2, len(rows)))
+    tip = np.empty((2, len(rows)))
+    angle = np.empty((2, len(rows)))
     for done, fold in enumerate(np.unique(folds)):
         held = folds == fold
         reader = _Reader(seen[~held], seen[held], folds[~held])
@@ -139,8 +137,9 @@ def probe(
 
 
 def spread(episode_index: np.ndarray, frames: int) -> NDArray[np.int64]:
-    """Return at most `frames` row numbers, equally many from every episode (all of a shorter one),
-    evenly spread.
+    """Return at most `frames` row numbers, evenly spread over every episode.
+
+    Every episode gives equally many, a shorter one all it has.
     """
     episodes = np.unique(episode_index)
     each = max(1, frames // len(episodes))
@@ -169,9 +168,7 @@ def _pose(dataset: Dataset) -> Array:
 
 
 def _targets(pose: Array) -> tuple[Array, Array]:
-    """Return the tip's position in the world (n, 3) [m] and two columns of the orientation (n,
-    6).
-    """
+    """Return the tip in the world (n, 3) [m] and two columns of its orientation (n, 6)."""
     matrices = np.stack([quaternion_to_matrix(quaternion) for quaternion in pose[:, 3:]])
     tip = pose[:, :3] + matrices @ point(TIP_ANGLE)
     return tip, matrices[:, :, :2].transpose(0, 2, 1).reshape(len(pose), 6)
@@ -185,7 +182,8 @@ def _angles(answers: Array, wanted: Array) -> Array:
 
 def _matrices(columns: Array) -> Array:
     """Return the rotations (n, 3, 3) nearest to two columns (n, 6), by Gram–Schmidt."""
-    x, y = columns[:, :3], columns[:, 3:]
+    x = columns[:, :3]
+    y = columns[:, 3:]
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
     y = y - (x * y).sum(1, keepdims=True) * x
     y = y / np.linalg.norm(y, axis=1, keepdims=True)
@@ -199,8 +197,9 @@ def _folds(episode: np.ndarray, count: int, generator: np.random.Generator) -> n
 
 
 class _Reader:
-    """Ridge regression from one table of features, in its dual form: frames are fewer than
-    features.
+    """Ridge regression from one table of features, in its dual form.
+
+    Frames are fewer than features.
 
     Args:
         fitted: features of the rows fitted, (n, d).
@@ -209,9 +208,11 @@ class _Reader:
     """
 
     def __init__(self, fitted: Array, asked: Array, folds: np.ndarray) -> None:
-        mean, std = fitted.mean(0), fitted.std(0)
+        mean = fitted.mean(0)
+        std = fitted.std(0)
         std = np.where(std > SMALLEST_STD, std, np.inf)
-        fitted, asked = (fitted - mean) / std, (asked - mean) / std
+        fitted = (fitted - mean) / std
+        asked = (asked - mean) / std
         gram = fitted @ fitted.T
         self._whole = _Ridge(gram, asked @ fitted.T)
         parts = [folds == fold for fold in np.unique(folds)]
@@ -225,9 +226,7 @@ class _Reader:
         return np.broadcast_to(target.mean(0), (self._asked, target.shape[1]))
 
     def answer(self, target: Array) -> Array:
-        """Return the answers (m, k) for targets (n, k), with the penalty that is best across the
-        folds.
-        """
+        """Return the answers (m, k) for targets (n, k), with the penalty best across the folds."""
         errors = np.zeros(len(PENALTIES))
         for held, ridge in self._parts:
             for at, penalty in enumerate(PENALTIES):
@@ -254,8 +253,11 @@ class _Ridge:
         ) @ self._vectors
 
     def answer(self, target: Array, penalty: float) -> Array:
-        """Return the answers (m, k) for targets (n, k); `penalty` is a share of the features' total
-        variance.
+        """Return the answers (m, k) for targets (n, k).
+
+        Args:
+            target: what is to be read.
+            penalty: a share of the features' total variance.
         """
         mean = target.mean(0)
         turned = self._vectors.T @ (target - mean) / (self._values + penalty * self._scale)[:, None]
@@ -265,9 +267,7 @@ class _Ridge:
 def _measure(
     errors: Array, episode: np.ndarray, generator: np.random.Generator
 ) -> tuple[Measure, Array]:
-    """Return the measure of (2, n) errors, read and chance, and the median error of each
-    episode.
-    """
+    """Return the measure of (2, n) errors, read and chance, and each episode's median error."""
     of_episode = np.array(
         [np.median(errors[:, episode == one], axis=1) for one in np.unique(episode)]
     )
