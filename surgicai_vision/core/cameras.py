@@ -34,10 +34,7 @@ def register_camera(name: str, camera: "Camera", distribution: str = "") -> None
 
 def camera_names() -> tuple[str, ...]:
     """Return the name of every camera, ours first."""
-    known = CAMERAS.names()
-    for name in known[len(names.CAMERAS) :]:
-        _check_form(name)
-    return known
+    return CAMERAS.names()
 
 
 def view_names() -> tuple[str, ...]:
@@ -65,8 +62,15 @@ def camera_number(name: str) -> int:
 
 
 def other_cameras() -> tuple[str, ...]:
-    """Return the names of the cameras that are not ours."""
-    return camera_names()[len(names.CAMERAS) :]
+    """Return the names of the cameras that are not ours.
+
+    Raises:
+        InputError: no camera can be called so.
+    """
+    others = camera_names()[len(names.CAMERAS) :]
+    for name in others:
+        _check_form(name)
+    return others
 
 
 def _check_form(name: str) -> None:

@@ -1,0 +1,1 @@
+"""An encoder, a policy, a camera and a task for surgicai-vision; see the README."""
