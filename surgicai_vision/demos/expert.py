@@ -118,7 +118,7 @@ class WorldState:
     Attributes:
         arm: the active arm.
         stitch: the path through the holes.
-        memory: the task's state beyond MuJoCo's.
+        task_state: the task's state beyond MuJoCo's.
         step: the step sizes of an action.
         base: T_world_base of the active arm.
         needle: T_world_needle.
@@ -132,7 +132,7 @@ class WorldState:
         simulation = env.simulation
         self.arm = env.subtask.arm
         self.stitch: Stitch = env.stitch
-        self.memory = simulation.memory
+        self.task_state = simulation.task_state
         self.step = StepSize.of(env.config.step)
         self.base = poses.square(simulation.bases[self.arm])
         self.needle = poses.square(simulation.needle())
@@ -220,7 +220,7 @@ def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: flo
 
 def _grasp(world: WorldState) -> ToolTarget:
     goal = world.needle @ grasp_in_needle(
-        world.arm, world.memory.grasp_angle, radius=world.stitch.radius
+        world.arm, world.task_state.grasp_angle, radius=world.stitch.radius
     )
     return approach_and_grasp(world, goal, HOVER, OPEN_ABOVE)
 
@@ -295,7 +295,7 @@ def _insert(world: WorldState) -> ToolTarget:
     )
     local = world.stitch.pair.entry.rotation.T @ (tip - np.asarray(world.stitch.pair.entry.centre))
     turned = turn_about_wound(start, world.needle)
-    if world.memory.passed == 0.0:
+    if world.task_state.holes_passed == 0:
         near = float(np.linalg.norm(local)) < 0.0009
         tilt = _angle_between(world.needle, on_path(world.stitch, max(turned, 0.0)))
         if not (near and tilt < math.radians(4.0)):
@@ -316,7 +316,7 @@ def _drive(world: WorldState, turned: float, last: float) -> ToolTarget:
     commanded = turn_about_wound(start, world.commanded_needle)
     ahead = max(min(commanded, turned + LEAD), turned - LEAD) + DRIVE
     off = world.needle[:3, 3] - on_path(world.stitch, min(max(turned, 0.0), last))[:3, 3]
-    if world.memory.passed >= 2.0 and float(np.linalg.norm(off)) > BLOCKED:
+    if world.task_state.holes_passed >= 2 and float(np.linalg.norm(off)) > BLOCKED:
         ahead = min(ahead - DRIVE, turned)
     return ToolTarget(world.tip_for_needle(on_path(world.stitch, min(max(ahead, 0.0), last))), 0.0)
 
@@ -324,7 +324,7 @@ def _drive(world: WorldState, turned: float, last: float) -> ToolTarget:
 def _pullout(world: WorldState) -> ToolTarget:
     """Turn the needle along the circle until its base is out, then carry it to the end point."""
     stitch = world.stitch
-    if world.memory.release > 30:
+    if world.task_state.release_steps > 30:
         return ToolTarget(world.command, 0.0)
     line = (
         world.needle[:3, :3] @ needle.polyline(13, world.stitch.radius).T + world.needle[:3, 3:4]

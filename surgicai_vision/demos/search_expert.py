@@ -64,7 +64,7 @@ class SearchExpert(Demonstrator):
         if self.env.subtask.name != "grasp":
             return self._expert.action()
         world = WorldState(self.env)
-        return action_towards(world, self._target(world, int(self.env.simulation.memory.steps)))
+        return action_towards(world, self._target(world, self.env.simulation.task_state.steps))
 
     def _target(self, world: WorldState, step: int) -> ToolTarget:
         """Grasp the needle as the present attempt does, or open before a new one."""

@@ -28,7 +28,7 @@ class Welds:
         self._ids = {arm: model.equality(f"{arm}_attach").id for arm in names.ARMS}
 
     def active(self, arm: str) -> bool:
-        """Say whether the needle is attached to an arm."""
+        """Return True if the needle is attached to an arm."""
         return bool(self._data.eq_active[self._ids[arm]])
 
     def update(self, arm: str, *, closed: bool, touching: bool, tip: Pose, needle: Pose) -> bool:
@@ -48,8 +48,8 @@ class Welds:
         if not active:
             held = poses.relative(tip, needle)
             self._model.eq_data[self._ids[arm], 3:10] = [
-                *held[:3],
-                *matrix_to_quaternion_flat(held[3:]),
+                *poses.position(held),
+                *matrix_to_quaternion_flat(poses.rotation(held)),
             ]
         return True
 

@@ -1,17 +1,17 @@
 """SuturingEnv: a task of the suture as a gymnasium environment.
 
-Description: two da Vinci PSMs, a needle and a phantom; one subtask, or all five in a row
-(`suture`). Action: Box(-1, 1, (7,), float32): Δx Δy Δz Δroll Δpitch Δyaw of the active arm's tip in
-its own base frame and
-    Δjaw, each times the step size (`config.STEPS`); every step is 20 ms.
-Observation: see `observation`.
-Reward: sparse: 0 on success, else -1; dense: -(d_trans / 100 + d_angle / 10) with d_trans in cm and
-d_angle in rad. Success: from the measured state: position and geodesic angle within the tolerance,
-and what the subtask demands
-    (jaw contact, both holes passed, needle out). Never from the command.
-Start: random, seeded by `reset(seed=…)`; covers the end states of the subtask before.
-Termination: success, or a physics error (`info["physics_error"]`, never a success). Truncation:
-`max_steps`.
+* Description: two da Vinci PSMs, a needle and a phantom; one subtask, or all five in a row
+  (`suture`).
+* Action: Box(-1, 1, (7,), float32): Δx Δy Δz Δroll Δpitch Δyaw of the active arm's tip in its own
+  base frame and Δjaw, each times the step size (`config.STEPS`); every step is 20 ms.
+* Observation: see `observation`.
+* Reward: sparse: 0 on success, else -1; dense: -(d_trans / 100 + d_angle / 10) with d_trans in cm
+  and d_angle in rad.
+* Success: judged from the measured state, never from the command: position and geodesic angle
+  within the tolerance, and what the subtask demands (jaw contact, both holes passed, needle out).
+* Start: random, seeded by `reset(seed=…)`; covers the end states of the subtask before.
+* Termination: success, or a physics error (`info["physics_error"]`, never a success).
+* Truncation: `max_steps`.
 """
 
 from math import isfinite
@@ -80,30 +80,35 @@ class SuturingEnv(gymnasium.Env):
         self.observation_space = view.space()
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
         self._subtasks = subtasks
-        self.simulation.memory.phase = float(subtasks[0].phase)
+        self.simulation.task_state.phase = subtasks[0].phase
         self._step_size = StepSize.of(config.step)
         self._images = Images(self.simulation.model)
 
     def _refuse_impossible(self, subtasks: tuple[Subtask, ...]) -> None:
-        """Refuse subtasks for which the holes are too far apart, with the smallest needle of all
-        episodes.
-        """
-        config, pair = self.config, self.scene.pair
+        """Refuse subtasks for which the holes are too far apart, with the smallest needle drawn."""
+        config = self.config
+        pair = self.scene.pair
         for subtask in subtasks:
             kind = f"tolerance preset of '{subtask.name}'"
             check_name(kind, config.tolerance, subtask.tolerances)
         smallest = needle.RADIUS * (1.0 - config.randomisation.needle_size)
         if Stitch.of(pair, smallest).possible or not any(subtask.through for subtask in subtasks):
             return
-        why = f"the holes of pair {config.scene.hole_pair} are {pair.gap * 1e3:.1f} mm apart, too far for this needle"
+        layout = config.scene.layout
+        why = (
+            f"the holes of pair {config.scene.hole_pair} are {pair.gap * 1e3:.1f} mm apart, too "
+            "far for this needle"
+        )
         if self.stitch.possible:
             raise InputError(
-                f"randomisation: needle_size {config.randomisation.needle_size} makes '{config.task}' impossible in "
-                f"layout '{config.scene.layout}': {why} when it is smallest. Take a smaller one, or layout simple."
+                f"randomisation: needle_size {config.randomisation.needle_size} makes "
+                f"'{config.task}' impossible in layout '{layout}': {why} when it is smallest. "
+                "Take a smaller one, or layout simple."
             )
         raise InputError(
-            f"'{config.task}' is not possible in layout '{config.scene.layout}': {why} (see "
-            "surgicai_vision.envs.geometry). Allowed there: grasp, place. All tasks: simple, 3dmed_straight."
+            f"'{config.task}' is not possible in layout '{layout}': {why} (see "
+            "surgicai_vision.envs.geometry). Allowed there: grasp, place. "
+            "All tasks: simple, 3dmed_straight."
         )
 
     # -- gymnasium ---------------------------------------------------------------------------------
@@ -113,7 +118,8 @@ class SuturingEnv(gymnasium.Env):
     ) -> tuple[Observation, Info]:
         """Draw a start state; `seed` makes it reproducible."""
         super().reset(seed=seed)
-        simulation, first = self.simulation, self._subtasks[0]
+        simulation = self.simulation
+        first = self._subtasks[0]
         axes = self.config.randomisation
         if axes.on:
             # Numbers of their own: a start is the same whatever is randomised, so that evaluations
@@ -122,14 +128,14 @@ class SuturingEnv(gymnasium.Env):
             self._meet_draws()
         for _ in range(START_DRAWS):
             simulation.reset()
-            simulation.memory.phase = float(first.phase)
+            simulation.task_state.phase = first.phase
             if first.start(simulation, self.stitch, self.np_random):
                 break
         else:
             raise PhysicsError(
                 f"No start of '{self.config.task}' was physical in {START_DRAWS} draws."
             )
-        hole_crossing.remember_tip(simulation, simulation.memory)
+        hole_crossing.remember_tip(simulation, simulation.task_state)
         self._remember_tool()
         info = self.measure()
         if axes.on:
@@ -138,13 +144,16 @@ class SuturingEnv(gymnasium.Env):
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
         """Take one control step of 20 ms."""
-        simulation, memory, subtask = self.simulation, self.simulation.memory, self.subtask
+        simulation = self.simulation
+        state = simulation.task_state
+        subtask = self.subtask
         if not simulation.advance(subtask.arm, self._checked(action), self._step_size):
-            memory.diverged = 1.0
+            state.has_diverged = True
+        # Between these reads nothing moves, so each pose is read once.
         simulation.keep_reads()
-        memory.steps += 1.0
+        state.steps += 1
         self._add_path(subtask.arm)
-        hole_crossing.watch(simulation, memory, self.stitch.pair)
+        hole_crossing.update(simulation, state, self.stitch.pair)
         target = subtask.target(simulation, self.stitch)
         info = measure(simulation, subtask, self.stitch, self.config.tolerance, target)
         if self._progress(info):
@@ -152,13 +161,11 @@ class SuturingEnv(gymnasium.Env):
         terminated = info["is_success"] or info["physics_error"]
         seen = self._observe(target)
         simulation.forget_reads()
-        truncated = self._truncates and memory.steps >= self.config.max_steps
+        truncated = self._truncates and state.steps >= self.config.max_steps
         return seen, self.reward(info), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the front camera's image, (480, 640, 3) uint8, when `render_mode` is
-        "rgb_array".
-        """
+        """Return the front camera's image, (480, 640, 3) uint8, in render mode "rgb_array"."""
         if self.render_mode is None:
             return None
         return self._images.image(self.data, RENDER_CAMERA, RENDER_SIZE)
@@ -209,12 +216,12 @@ class SuturingEnv(gymnasium.Env):
     @property
     def subtask(self) -> Subtask:
         """Return the present subtask."""
-        return self._subtasks[int(self.simulation.memory.phase) - self._subtasks[0].phase]
+        return self._subtasks[self.simulation.task_state.phase - self._subtasks[0].phase]
 
     @property
     def phase(self) -> int:
         """Return the present subtask's index in `names.SUBTASKS`, -1 for a task of its own."""
-        return int(self.simulation.memory.phase)
+        return self.simulation.task_state.phase
 
     def named(self, kind: str, name: str) -> int:
         """Return an element's id; a wrong name lists what exists."""
@@ -234,15 +241,14 @@ class SuturingEnv(gymnasium.Env):
             self._meet_draws()
 
     def set_state(self, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
-        """Set positions and velocities, as gymnasium's MujocoEnv does; commands stay as they
-        are.
-        """
+        """Set positions and velocities, as gymnasium's MujocoEnv does; commands stay."""
         if np.shape(qpos) != (self.model.nq,) or np.shape(qvel) != (self.model.nv,):
             raise InputError(
                 f"set_state got shapes {np.shape(qpos)} and {np.shape(qvel)}; "
                 f"this scene needs ({self.model.nq},) and ({self.model.nv},)."
             )
-        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        self.data.qpos[:] = qpos
+        self.data.qvel[:] = qvel
         self.simulation.refresh()
 
     # -- measuring ---------------------------------------------------------------------------------
@@ -265,19 +271,16 @@ class SuturingEnv(gymnasium.Env):
     # -- observing ---------------------------------------------------------------------------------
 
     def agent_pos(self) -> NDArray[np.float32]:
-        """Return x y z [m], roll pitch yaw, jaw [rad] of the active arm's measured tip in its base,
-        (7,).
-        """
-        simulation, arm = self.simulation, self.subtask.arm
+        """Return the active arm's measured tip in its base, (7,): x y z [m], roll pitch yaw, jaw."""
+        simulation = self.simulation
+        arm = self.subtask.arm
         return np.array(
             observation.seven(arm, simulation.tip_in_base(arm), simulation.jaw(arm)),
             dtype=np.float32,
         )
 
     def both_arms(self) -> NDArray[np.float32]:
-        """Return what `agent_pos` is for psm1, then for psm2, (14,): the proprioception of a
-        high-level policy.
-        """
+        """Return both arms' `agent_pos`, psm1 first, (14,): a high-level policy's input."""
         simulation = self.simulation
         sevens = [
             observation.seven(arm, simulation.tip_in_base(arm), simulation.jaw(arm))
@@ -306,8 +309,10 @@ class SuturingEnv(gymnasium.Env):
         return seen
 
     def _state_vector(self, target: Target) -> NDArray[np.float32]:
-        simulation, arm = self.simulation, self.subtask.arm
-        tip, jaw = simulation.tip(arm), simulation.jaw(arm)
+        simulation = self.simulation
+        arm = self.subtask.arm
+        tip = simulation.tip(arm)
+        jaw = simulation.jaw(arm)
         if simulation.offsets:
             achieved, desired = target
             goal = simulation.to_base(arm, poses.compose(desired, poses.relative(achieved, tip)))
@@ -324,33 +329,29 @@ class SuturingEnv(gymnasium.Env):
         return [-1.0 if value < -1.0 else 1.0 if value > 1.0 else value for value in values]
 
     def _meet_draws(self) -> None:
-        """Follow a new randomisation: goals stand on the phantom, and a renderer keeps the needle's
-        shape.
-        """
-        pair, axes = (
-            randomisation.shifted(self.scene.pair, self.simulation.draws),
-            self.config.randomisation,
-        )
+        """Follow new draws: goals move with the phantom, and a renderer keeps the needle's shape."""
+        pair = randomisation.shifted(self.scene.pair, self.simulation.draws)
+        axes = self.config.randomisation
         self.stitch = Stitch.of(pair, self.simulation.radius)
         if axes.needle_thickness or axes.needle_size:
             self._images.close()
 
     def _remember_tool(self) -> None:
-        memory = self.simulation.memory
-        memory.tool_x, memory.tool_y, memory.tool_z = self.simulation.tip(self.subtask.arm)[:3]
+        """Measure the path of the active tip from its present place on."""
+        tip = self.simulation.tip(self.subtask.arm)
+        self.simulation.task_state.tool_tip = poses.position(tip)
 
     def _add_path(self, arm: str) -> None:
-        memory = self.simulation.memory
-        x, y, z = self.simulation.tip(arm)[:3]
-        memory.tip_path += (
-            (x - memory.tool_x) ** 2 + (y - memory.tool_y) ** 2 + (z - memory.tool_z) ** 2
-        ) ** 0.5
-        memory.tool_x, memory.tool_y, memory.tool_z = x, y, z
+        """Add the last move of the active tip to its path."""
+        state = self.simulation.task_state
+        x0, y0, z0 = state.tool_tip
+        state.tool_tip = x, y, z = poses.position(self.simulation.tip(arm))
+        state.tip_path += ((x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2) ** 0.5
 
     def _meets_demands(self) -> bool:
-        """Say whether what success needs besides the pose holds now."""
+        """Return True if what success needs besides the pose holds now."""
         return meets_demands(self.simulation, self.subtask, self.stitch, self.config.tolerance)
 
     def _progress(self, info: Info) -> bool:
-        """Move on to the next subtask and say so, where a task has several; here there is none."""
+        """Go on to the next subtask, where a task has several; return True if so."""
         return False

@@ -11,10 +11,11 @@ arrays would cost more than the physics saves.
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from surgicai_vision.core.config import STEPS
 from surgicai_vision.core.errors import UnreachablePose
+from surgicai_vision.envs import poses
 from surgicai_vision.scene.kinematics import Joints, Pose, inverse_flat
 from surgicai_vision.scene.rotations import multiply_flat, rotvec_to_matrix_flat
 
@@ -25,16 +26,31 @@ SQUEEZE, SQUEEZE_BELOW = 0.3, 0.1
 motor's torque limit then sets the force of the grip, and the pads do not slam."""
 WORKSPACE = ((-0.09, -0.09, 0.060), (0.09, 0.14, 0.165))
 """Corners of the box the tips may move in [m, world]."""
+COMMAND_SIZE = 12 + 1 + 6
+"""Numbers of a packed command."""
 
 
 class Command(NamedTuple):
-    """What an arm is told to do: tip pose in its base, jaw angle [rad], and the joints that put it
-    there.
+    """What an arm is told to do.
+
+    Attributes:
+        pose: tip pose in the arm's base.
+        jaw: jaw angle [rad].
+        joints: what puts the tip there.
     """
 
     pose: Pose
     jaw: float
     joints: Joints
+
+    def pack(self) -> list[float]:
+        """Return the command as `COMMAND_SIZE` numbers."""
+        return [*self.pose, self.jaw, *self.joints]
+
+    @classmethod
+    def unpack(cls, values: list[float]) -> "Command":
+        """Return the command that `pack` wrote as `values`."""
+        return cls(cast(Pose, tuple(values[:12])), values[12], cast(Joints, tuple(values[13:])))
 
 
 class StepSize(NamedTuple):
@@ -54,10 +70,13 @@ class StepSize(NamedTuple):
 def moved(pose: Pose, action: list[float], step: StepSize) -> Pose:
     """Return `pose` moved by the first six numbers of `action`."""
     x, y, z, a, b, c, _ = action
-    shift, turn, rotation = step.translation, step.rotation, pose[3:]
+    px, py, pz = poses.position(pose)
+    rotation = poses.rotation(pose)
+    shift = step.translation
     if a or b or c:
+        turn = step.rotation
         rotation = multiply_flat(rotvec_to_matrix_flat(a * turn, b * turn, c * turn), rotation)
-    return (pose[0] + x * shift, pose[1] + y * shift, pose[2] + z * shift, *rotation)
+    return (px + x * shift, py + y * shift, pz + z * shift, *rotation)
 
 
 def follow(
@@ -84,12 +103,9 @@ def follow(
 
 
 def in_workspace(pose: Pose, base: Pose) -> bool:
-    """Say whether a tip pose in the base lies in the workspace."""
+    """Return True if a tip pose in the base lies in the workspace."""
     (x0, y0, z0), (x1, y1, z1) = WORKSPACE
-    px, py, pz = pose[0], pose[1], pose[2]
-    x = base[0] + base[3] * px + base[4] * py + base[5] * pz
-    y = base[1] + base[6] * px + base[7] * py + base[8] * pz
-    z = base[2] + base[9] * px + base[10] * py + base[11] * pz
+    x, y, z = poses.transform(base, poses.position(pose))
     return x0 <= x <= x1 and y0 <= y <= y1 and z0 <= z <= z1
 
 

@@ -1,7 +1,6 @@
-"""Gauge: what one episode does to needle and tissue, read from the measured state after every
-control step.
+"""Episode monitor: what one episode does to needle and tissue, read after every control step.
 
-A `Gauge` only looks: neither the env's state nor its physics know of it, so an episode is the same
+An `EpisodeMonitor` only reads: neither the env's state nor its physics know of it, so an episode is the same
 with and without.
 
 * Where the needle's tip goes through the stitch's planes: `entry_error` and `exit_error`, the
@@ -18,7 +17,6 @@ with and without.
 """
 
 import math
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,100 +25,82 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.envs import randomisation
 from surgicai_vision.envs.base import SuturingEnv
-from surgicai_vision.envs.hole_crossing import JUMP
+from surgicai_vision.envs.hole_crossing import JUMP, Point, crossing
+from surgicai_vision.envs.success import Info
 from surgicai_vision.scene import needle
-from surgicai_vision.scene.holes import OPENING, PAIRS, Hole
+from surgicai_vision.scene.holes import PAIRS
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
-Point = tuple[float, float, float]
 
-
-class Gauge:
+class EpisodeMonitor:
     """What the present episode of `env` has done; see the module's docstring.
 
     Args:
-        env: the env to look at. `begin` after each of its resets, `look` after each of its steps.
+        env: the env to read; `reset` follows each of its resets, `update` each of its steps.
     """
 
     def __init__(self, env: SuturingEnv):
         self._env = env
-        self._plate = Plate(env.model)
+        self._plate = ForcePlate(env.model)
         self._layout = PAIRS[env.scene.config.layout]
         self._chosen = env.scene.config.hole_pair - 1
-        self.forget()
+        self.clear()
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Forget the last episode."""
         self.entry_error = self.exit_error = math.nan
         self.slip = self.turn = self.tissue_force = 0.0
         self.wrong_hole = False
 
-    def begin(self) -> None:
-        """Start watching; the env has just been reset."""
-        self.forget()
+    def reset(self) -> None:
+        """Begin an episode; the env has just been reset."""
+        self.clear()
         simulation = self._env.simulation
         self._pairs = [randomisation.shifted(pair, simulation.draws) for pair in self._layout]
-        self._through = simulation.memory.passed >= 1.0
+        self._is_through_entry = simulation.task_state.holes_passed >= 1
         self._tip = simulation.needle_point(needle.TIP_ANGLE)
 
-    def look(self, info: dict[str, Any]) -> None:
+    def update(self, info: Info) -> None:
         """Read the state that a step ended in; `info` is that step's."""
         simulation = self._env.simulation
         slip, turn = info["needle_slip"]
-        self.slip, self.turn = max(self.slip, float(slip)), max(self.turn, float(turn))
+        self.slip = max(self.slip, float(slip))
+        self.turn = max(self.turn, float(turn))
         self.tissue_force = max(self.tissue_force, self._plate.force(simulation.data))
-        before, self._tip = self._tip, simulation.needle_point(needle.TIP_ANGLE)
+        before = self._tip
+        self._tip = simulation.needle_point(needle.TIP_ANGLE)
         if math.dist(before, self._tip) <= JUMP:
-            self._watch(before, self._tip)
+            self._note_crossings(before, self._tip)
 
-    def held(self) -> bool:
-        """Say whether either arm holds the needle now."""
+    def is_held(self) -> bool:
+        """Return True if either arm holds the needle now."""
         return any(self._env.simulation.holds(arm) for arm in names.ARMS)
 
-    def _watch(self, before: Point, now: Point) -> None:
-        """Note a passage of the tip through the plane of any hole, inside its opening."""
+    def _note_crossings(self, before: Point, now: Point) -> None:
+        """Note where the tip went through the opening of any hole."""
         pair = self._pairs[self._chosen]
         entering = crossing(before, now, pair.entry, inward=True)
         leaving = crossing(before, now, pair.exit, inward=False)
         if entering is not None:
-            self.entry_error, self._through = entering, True
-        elif leaving is not None and self._through:
-            self.exit_error, self.wrong_hole = leaving, False
-        elif crossing(before, now, pair.entry, inward=False) is not None:
-            self._through = False
-        elif not self._through and crossing(before, now, pair.exit, inward=True) is not None:
+            self.entry_error = math.hypot(*entering)
+            self._is_through_entry = True
+        elif leaving is not None and self._is_through_entry:
+            self.exit_error = math.hypot(*leaving)
+            self.wrong_hole = False
+        elif crossing(before, now, pair.entry, inward=False):
+            self._is_through_entry = False
+        elif not self._is_through_entry and crossing(before, now, pair.exit, inward=True):
             self.wrong_hole = True
         for index, other in enumerate(self._pairs):
             if index != self._chosen:
-                holes = (other.entry, other.exit)
                 self.wrong_hole |= any(
-                    crossing(before, now, hole, inward=True) is not None for hole in holes
+                    crossing(before, now, hole, inward=True) for hole in (other.entry, other.exit)
                 )
 
 
-def crossing(before: Point, now: Point, hole: Hole, *, inward: bool) -> float | None:
-    """Return how far from the hole's centre [m] the way from `before` to `now` crosses its plane,
-    or None.
-
-    None as well where it crosses outside the opening or in the other direction.
-    """
-    cosine, sine = math.cos(hole.tilt), math.sin(hole.tilt)
-    x, _, z = hole.centre
-    start, end = (
-        sine * (before[0] - x) + cosine * (before[2] - z),
-        sine * (now[0] - x) + cosine * (now[2] - z),
-    )
-    if not (start > 0.0 >= end if inward else start <= 0.0 < end):
-        return None
-    share = start / (start - end)
-    dx, dy, dz = (b + share * (n - b) - c for b, n, c in zip(before, now, hole.centre, strict=True))
-    up = cosine * dx - sine * dz
-    return math.hypot(up, dy) if abs(up) < OPENING / 2 and abs(dy) < OPENING / 2 else None
-
-
-class Plate:
-    """A force plate under the phantom: what needle and instruments press it with.
+class ForcePlate:
+    """A force plate under the phantom: the force of needle and instruments on it.
 
     Contact forces are not part of a state that ends with MuJoCo's position stage, and computing
     them in place would change the state's warm start. They are computed on data of the plate's own.
@@ -130,9 +110,11 @@ class Plate:
     """
 
     def __init__(self, model: mujoco.MjModel):
-        self._model, self._scratch = model, mujoco.MjData(model)
+        self._model = model
+        self._scratch = mujoco.MjData(model)
         self._state = np.empty(mujoco.mj_stateSize(model, STATE))
-        phantom, needle_id = model.body("phantom").id, model.body("needle").id
+        phantom = model.body("phantom").id
+        needle_id = model.body("needle").id
         of_geom = model.geom_bodyid
         self._tissue = of_geom == phantom
         # The thread hangs on the needle and is not meant; every other moving body is part of an
@@ -162,8 +144,7 @@ class Plate:
         for index in np.flatnonzero(self._touching(data)):
             contact = data.contact[int(index)]
             mujoco.mj_contactForce(self._model, data, int(index), wrench)
-            sign = (
-                1.0 if self._tissue[contact.geom[1]] else -1.0
-            )  # MuJoCo's force is that on the second geom
+            # MuJoCo's force is that on the second geom.
+            sign = 1.0 if self._tissue[contact.geom[1]] else -1.0
             net += sign * (contact.frame.reshape(3, 3).T @ wrench[:3])
         return net

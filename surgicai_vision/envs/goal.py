@@ -47,7 +47,7 @@ class GoalSuturingEnv(SuturingEnv):
         self, achieved_goal: Goals, desired_goal: Goals, info: Infos | None = None
     ) -> NDArray[np.bool_]:
         """Return whether the time of the present episode is over; no goal changes that."""
-        is_over = self._truncates and self.simulation.memory.steps >= self.config.max_steps
+        is_over = self._truncates and self.simulation.task_state.steps >= self.config.max_steps
         return np.full(np.shape(achieved_goal)[:-1], is_over)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:

@@ -48,13 +48,15 @@ class Grasp(Subtask):
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Put the needle on the tissue, both arms at home."""
         simulation.pose_needle(poses.flat(lying_needle(rng)))
-        simulation.memory.grasp_angle = rng.uniform(*stitch.grasps(*GRASP_ANGLES))
+        simulation.task_state.grasp_angle = rng.uniform(*stitch.grasps(*GRASP_ANGLES))
         simulation.settle(20)
         return True
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the jaws' grasp frame and the grasp frame on the needle."""
-        return simulation.grasp(PSM2), grasp_goal(simulation, PSM2, simulation.memory.grasp_angle)
+        return simulation.grasp(PSM2), grasp_goal(
+            simulation, PSM2, simulation.task_state.grasp_angle
+        )
 
 
 def grasp_goal(simulation: Simulation, arm: str, angle: float) -> Pose:

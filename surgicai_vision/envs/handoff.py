@@ -46,7 +46,7 @@ class Handoff(Subtask):
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the inserted needle with PSM2, PSM1 at home."""
         needle_pose = inserted_needle(stitch, rng)
-        simulation.memory.passed = 2.0
+        simulation.task_state.holes_passed = 2
         held = hold_needle(
             simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch), STRAIGHT
         )

@@ -1,97 +1,122 @@
-"""Passage: did the needle go through both holes, in travel direction, through the openings?
+"""Hole crossing: did the needle go through both holes, in travel direction, inside the openings?
 
-Tests that must agree, so that tunnelling or teleporting never counts. In time: the tip crosses the
-entry's plane inwards, then the exit's plane outwards, each inside the opening; from then on the
-needle stays in the exit's opening until the whole of it is beyond; and the tip never moves further
-than `JUMP` in one control step. In space: the needle's polyline crosses both planes inside the
-openings now.
+Two conditions must agree, so that tunnelling or teleporting never counts.
+
+* In time: the tip crosses the entry's plane inwards, then the exit's plane outwards, each inside
+  the opening; from then on the needle stays in the exit's opening until the whole of it is beyond;
+  and the tip never moves further than `JUMP` in one control step.
+* In space: the needle's arc crosses both planes inside the openings now.
 """
 
 import math
+from typing import Protocol
 
-from surgicai_vision.envs.simulation import Simulation
-from surgicai_vision.envs.task_state import Memory
+from surgicai_vision.envs.task_state import TaskState
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.holes import OPENING, Hole, HolePair
+from surgicai_vision.scene.kinematics import Pose
 
 JUMP = 0.004
 """Furthest the tip can move in one control step [m]: eight times the default step size."""
-OUT = 3.0
-"""`Memory.passed` of a needle whose base has left the exit too."""
+OUT = 3
+"""`TaskState.holes_passed` of a needle whose base has left the exit too."""
 EJECTED = 5.0
-"""A way in one control step [m] that no fall explains: the contact solver shot the needle away (250
-m/s).
-"""
+"""A distance in one control step [m] that no fall explains: the contact solver shot the needle away
+(250 m/s)."""
 
 Point = tuple[float, float, float]
 
 
-def watch(simulation: Simulation, memory: Memory, pair: HolePair) -> None:
-    """Update `memory.passed` with the tip's move since the last measurement."""
-    now = simulation.needle_point(needle.TIP_ANGLE)
-    before = (memory.tip_x, memory.tip_y, memory.tip_z)
-    memory.tip_x, memory.tip_y, memory.tip_z = now
-    if math.dist(now, before) > JUMP:
-        memory.passed = memory.passed if memory.passed == OUT else 0.0
-        if math.dist(now, before) > EJECTED:
-            memory.diverged = 1.0
-    elif memory.passed == 0.0 and _passes(before, now, pair.entry, inward=True):
-        memory.passed = 1.0
-    elif memory.passed == 1.0:
-        if _passes(before, now, pair.exit, inward=False):
-            memory.passed = 2.0
-        elif _passes(before, now, pair.entry, inward=False):
-            memory.passed = 0.0
-    elif memory.passed >= 2.0:
-        if _passes(before, now, pair.exit, inward=True):
-            memory.passed = 1.0
-        elif memory.passed == 2.0 and not leaves(simulation, pair.exit):
-            memory.passed = OUT if is_out(simulation, pair) else 0.0
+class NeedlePose(Protocol):
+    """Where a needle is; `Simulation` measures it."""
+
+    radius: float
+    """Of the needle's arc [m]."""
+
+    def needle(self) -> Pose:
+        """Return T_world_needle."""
+
+    def needle_point(self, angle: float) -> Point:
+        """Return the needle's point at `angle` [rad] in world [m]."""
 
 
-def remember_tip(simulation: Simulation, memory: Memory) -> None:
-    """Start watching from the tip's present place."""
-    memory.tip_x, memory.tip_y, memory.tip_z = simulation.needle_point(needle.TIP_ANGLE)
+def update(now: NeedlePose, state: TaskState, pair: HolePair) -> None:
+    """Update `state.holes_passed` with the tip's move since the last control step."""
+    before = state.needle_tip
+    tip = now.needle_point(needle.TIP_ANGLE)
+    state.needle_tip = tip
+    passed = state.holes_passed
+    moved = math.dist(tip, before)
+    if moved > JUMP:
+        if passed != OUT:
+            state.holes_passed = 0
+        if moved > EJECTED:
+            state.has_diverged = True
+    elif passed == 0:
+        if crossing(before, tip, pair.entry, inward=True):
+            state.holes_passed = 1
+    elif passed == 1:
+        if crossing(before, tip, pair.exit, inward=False):
+            state.holes_passed = 2
+        elif crossing(before, tip, pair.entry, inward=False):
+            state.holes_passed = 0
+    elif crossing(before, tip, pair.exit, inward=True):
+        state.holes_passed = 1
+    elif passed == 2 and not leaves(now, pair.exit):
+        state.holes_passed = OUT if is_out(now, pair) else 0
 
 
-def in_both(simulation: Simulation, pair: HolePair) -> bool:
-    """Say whether the needle lies in both openings now."""
-    return enters(simulation, pair.entry) and leaves(simulation, pair.exit)
+def remember_tip(now: NeedlePose, state: TaskState) -> None:
+    """Watch the needle's tip from its present place on."""
+    state.needle_tip = now.needle_point(needle.TIP_ANGLE)
 
 
-def enters(simulation: Simulation, hole: Hole) -> bool:
-    """Say whether the needle, from base to tip, crosses the hole's plane inwards inside the opening
-    now.
+def crossing(before: Point, now: Point, hole: Hole, *, inward: bool) -> tuple[float, float] | None:
+    """Return where the way from `before` to `now` crosses a hole's plane inside its opening.
+
+    Args:
+        before: where the way begins, in world [m].
+        now: where it ends.
+        hole: the hole.
+        inward: True for ways into the tissue, False for ways out of it.
+
+    Returns:
+        (x, y) in the hole's frame [m], or None where the way does not cross the opening in this
+        direction.
     """
-    return _crosses(simulation, hole, inward=True)
+    cosine, sine = hole.slope
+    x, y, z = hole.centre
+    start = sine * (before[0] - x) + cosine * (before[2] - z)
+    end = sine * (now[0] - x) + cosine * (now[2] - z)
+    if not (start > 0.0 >= end if inward else start <= 0.0 < end):
+        return None
+    share = start / (start - end)
+    return _in_opening(
+        before[0] + share * (now[0] - before[0]) - x,
+        before[1] + share * (now[1] - before[1]) - y,
+        before[2] + share * (now[2] - before[2]) - z,
+        hole,
+    )
 
 
-def leaves(simulation: Simulation, hole: Hole) -> bool:
-    """Say whether the needle, from base to tip, crosses the hole's plane outwards inside the
-    opening now.
-    """
-    return _crosses(simulation, hole, inward=False)
+def in_both(now: NeedlePose, pair: HolePair) -> bool:
+    """Return True if the needle lies in both openings."""
+    return enters(now, pair.entry) and leaves(now, pair.exit)
 
 
-def _crosses(simulation: Simulation, hole: Hole, *, inward: bool) -> bool:
-    """Do what `holes.crossing` does on a fine polyline, in closed form for every control step.
-
-    Along the arc the height over the plane is a + R (c sin θ - b cos θ) = a + reach sin(θ - φ); it
-    rises through 0 at one angle and falls through it at one.
-    """
-    height, reach, phase = _heights(simulation, hole)
-    if abs(height) >= reach:
-        return False
-    rising = math.asin(height / reach)
-    angle = math.remainder(phase + (math.pi + rising if inward else -rising), 2 * math.pi)
-    if not 0.0 <= angle <= needle.TIP_ANGLE:
-        return False
-    return _within(simulation.needle_point(angle), hole)
+def enters(now: NeedlePose, hole: Hole) -> bool:
+    """Return True if the needle, from base to tip, crosses the opening inwards."""
+    return _crosses(now, hole, inward=True)
 
 
-def is_out(simulation: Simulation, pair: HolePair) -> bool:
-    """Say whether the whole needle is beyond the exit's plane: its lowest point is."""
-    height, reach, phase = _heights(simulation, pair.exit)
+def leaves(now: NeedlePose, hole: Hole) -> bool:
+    """Return True if the needle, from base to tip, crosses the opening outwards."""
+    return _crosses(now, hole, inward=False)
+
+
+def is_out(now: NeedlePose, pair: HolePair) -> bool:
+    """Return True if the whole needle is beyond the exit's plane: its lowest point is."""
+    height, reach, phase = _heights(now, pair.exit)
     low = math.remainder(phase - math.pi / 2, 2 * math.pi)
     lowest = (
         -1.0
@@ -101,41 +126,47 @@ def is_out(simulation: Simulation, pair: HolePair) -> bool:
     return height + reach * lowest > 0.0
 
 
-def _heights(simulation: Simulation, hole: Hole) -> tuple[float, float, float]:
-    """Return a [m], reach [m] and φ [rad]: a + reach sin(θ - φ) is the height of the needle's point
-    at θ.
+def _crosses(now: NeedlePose, hole: Hole, *, inward: bool) -> bool:
+    """Return True if the needle's arc crosses the opening; in closed form, for every control step.
+
+    Along the arc the height over the plane is a + R (c sin θ - b cos θ) = a + reach sin(θ - φ); it
+    rises through 0 at one angle and falls through it at one.
+    """
+    height, reach, phase = _heights(now, hole)
+    if abs(height) >= reach:
+        return False
+    rising = math.asin(height / reach)
+    angle = math.remainder(phase + (math.pi + rising if inward else -rising), 2 * math.pi)
+    if not 0.0 <= angle <= needle.TIP_ANGLE:
+        return False
+    px, py, pz = now.needle_point(angle)
+    x, y, z = hole.centre
+    return _in_opening(px - x, py - y, pz - z, hole) is not None
+
+
+def _heights(now: NeedlePose, hole: Hole) -> tuple[float, float, float]:
+    """Return a [m], reach [m] and φ [rad] of the height of the needle's point at θ.
+
+    The height over the hole's plane is a + reach sin(θ - φ).
     """
     cosine, sine = hole.slope
     x, _, z = hole.centre
-    px, _, pz, r0, r1, _, _, _, _, r6, r7, _ = simulation.needle()
-    b, c = sine * r0 + cosine * r6, sine * r1 + cosine * r7
-    return (
-        sine * (px - x) + cosine * (pz - z),
-        simulation.radius * math.hypot(b, c),
-        math.atan2(b, c),
-    )
+    px, _, pz, r0, r1, _, _, _, _, r6, r7, _ = now.needle()
+    b = sine * r0 + cosine * r6
+    c = sine * r1 + cosine * r7
+    height = sine * (px - x) + cosine * (pz - z)
+    return height, now.radius * math.hypot(b, c), math.atan2(b, c)
 
 
-def _within(point: Point, hole: Hole) -> bool:
-    """Say whether a point of the hole's plane lies in the opening."""
-    (cosine, sine), (x, y, z), (qx, qy, qz) = hole.slope, hole.centre, point
-    return abs(cosine * (qx - x) - sine * (qz - z)) < OPENING / 2 and abs(qy - y) < OPENING / 2
+def _in_opening(dx: float, dy: float, dz: float, hole: Hole) -> tuple[float, float] | None:
+    """Return (x, y) in the hole's frame of a point of its plane, or None outside the opening.
 
-
-def _passes(before: Point, now: Point, hole: Hole, inward: bool) -> bool:
-    """Say whether the way from `before` to `now` crosses the hole's plane inside the opening."""
+    Args:
+        dx: from the hole's centre to the point, in world [m].
+        dy: the same along y.
+        dz: the same along z.
+        hole: the hole.
+    """
     cosine, sine = hole.slope
-    x, _, z = hole.centre
-    start, end = (
-        sine * (before[0] - x) + cosine * (before[2] - z),
-        sine * (now[0] - x) + cosine * (now[2] - z),
-    )
-    if not (start > 0.0 >= end if inward else start <= 0.0 < end):
-        return False
-    share = start / (start - end)
-    at = (
-        before[0] + share * (now[0] - before[0]),
-        before[1] + share * (now[1] - before[1]),
-        before[2] + share * (now[2] - before[2]),
-    )
-    return _within(at, hole)
+    up = cosine * dx - sine * dz
+    return (up, dy) if abs(up) < OPENING / 2 and abs(dy) < OPENING / 2 else None

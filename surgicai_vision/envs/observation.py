@@ -39,6 +39,7 @@ from surgicai_vision.scene.rotations import (
     matrix_to_rotvec_flat,
     matrix_to_rpy_flat,
     multiply_flat,
+    transpose_flat,
 )
 
 _TWENTY_ONE = struct.Struct("21f").pack_into
@@ -77,7 +78,7 @@ class ObservationConfig:
 
     @property
     def visual(self) -> bool:
-        """Say whether it holds images."""
+        """Return True if it holds images."""
         return self.obs_type in ("pixels", "pixels_agent_pos")
 
     @property
@@ -120,17 +121,18 @@ def seven(arm: str, pose: Pose, jaw: float, scale: float = 1.0) -> list[float]:
     Roll is in (-2π, 0] as in the released code; yaw is unwrapped about the arm's start, half a turn
     either way.
     """
-    roll, pitch, yaw = matrix_to_rpy_flat(pose[3:])
-    home = STARTS[arm][5]
+    x, y, z = poses.position(pose)
+    roll, pitch, yaw = matrix_to_rpy_flat(poses.rotation(pose))
+    home = STARTS[arm].yaw
     yaw = home + (yaw - home + pi) % (2 * pi) - pi
-    return [pose[0] * scale, pose[1] * scale, pose[2] * scale, roll, pitch, yaw, jaw]
+    return [x * scale, y * scale, z * scale, roll, pitch, yaw, jaw]
 
 
 def state_vector(arm: str, now: Pose, goal: Pose, jaw: float) -> np.ndarray:
     """Return the 21 values of obs_type "state"; poses in the arm's base."""
-    current, wanted = seven(arm, now, jaw, 100.0), seven(arm, goal, 0.0, 100.0)
-    r = now[3:]
-    turn = multiply_flat(goal[3:], (r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
+    current = seven(arm, now, jaw, 100.0)
+    wanted = seven(arm, goal, 0.0, 100.0)
+    turn = multiply_flat(poses.rotation(goal), transpose_flat(poses.rotation(now)))
     error = [b - a for a, b in zip(current[:3], wanted[:3], strict=True)]
     return np.array(
         [*current, *wanted, *error, *matrix_to_rotvec_flat(turn), -jaw], dtype=np.float32
@@ -199,7 +201,7 @@ def state_vector_in_world(
         to_base = poses.invert(base)
         goal = poses.compose(desired, poses.relative(achieved, tip))
         return state_vector(arm, poses.compose(to_base, tip), poses.compose(to_base, goal), jaw)
-    home = STARTS[arm][5] - pi
+    home = STARTS[arm].yaw - pi
     seen = np.empty(21, np.float32)
     _TWENTY_ONE(
         seen, 0, px * 100.0, py * 100.0, pz * 100.0,
@@ -221,24 +223,17 @@ def _roll(sine: float, cosine: float) -> float:
 
 
 def goal_vector(pose: Pose, jaw: float, met: bool) -> np.ndarray:
-    """Return x y z [m], rotation vector [rad], jaw [rad] of a pose in world, and whether demands
-    are met, (8,).
-    """
-    return np.array(
-        [*pose[:3], *matrix_to_rotvec_flat(pose[3:]), jaw, float(met)], dtype=np.float32
-    )
+    """Return a pose in world as x y z [m], rotation vector, jaw [rad] and demands met or not, (8,)."""
+    turn = matrix_to_rotvec_flat(poses.rotation(pose))
+    return np.array([*poses.position(pose), *turn, jaw, met], dtype=np.float32)
 
 
 def goal_errors(achieved: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance [m] and geodesic angle [rad] between goal vectors of shape (8,) or (batch,
-    8).
-    """
+    """Return distance [m] and geodesic angle [rad] between goal vectors, (8,) or (batch, 8)."""
     from scipy.spatial.transform import Rotation
 
-    one, other = (
-        np.atleast_2d(achieved).astype(np.float64),
-        np.atleast_2d(desired).astype(np.float64),
-    )
+    one = np.atleast_2d(achieved).astype(np.float64)
+    other = np.atleast_2d(desired).astype(np.float64)
     distance = np.linalg.norm(one[:, :3] - other[:, :3], axis=1)
     turn = (
         Rotation.from_rotvec(other[:, 3:6]) * Rotation.from_rotvec(one[:, 3:6]).inv()

@@ -1,5 +1,7 @@
-"""Poses in plain floats: composition and inversion of the twelve-float poses of
-`scene.kinematics`.
+"""Poses in plain floats: parts, composition and inversion of the poses of `scene.kinematics`.
+
+A pose is twelve floats: the position, then the rotation row by row. No other module of the envs
+knows the places of these numbers.
 """
 
 from math import sqrt
@@ -8,7 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from surgicai_vision.scene.kinematics import Pose
-from surgicai_vision.scene.rotations import geodesic_angle_flat, multiply_flat
+from surgicai_vision.scene.rotations import (
+    Flat9,
+    Vector,
+    geodesic_angle_flat,
+    multiply_flat,
+    transpose_flat,
+)
 
 IDENTITY: Pose = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -27,24 +35,48 @@ def square(pose: Pose) -> NDArray[np.float64]:
     return matrix
 
 
-def compose(a: Pose, b: Pose) -> Pose:
-    """Return the product a · b."""
-    x, y, z = b[0], b[1], b[2]
+def position(pose: Pose) -> Vector:
+    """Return the origin of a pose [m]."""
+    return pose[:3]
+
+
+def rotation(pose: Pose) -> Flat9:
+    """Return the rotation matrix of a pose, row by row."""
+    return pose[3:]
+
+
+def z_axis(pose: Pose) -> Vector:
+    """Return the z axis of a pose, the last column of its rotation."""
+    return pose[5], pose[8], pose[11]
+
+
+def shifted_along_z(pose: Pose, distance: float) -> Pose:
+    """Return a pose shifted by `distance` [m] along its own z axis."""
+    x, y, z, r0, r1, r2, r3, r4, r5, r6, r7, r8 = pose
+    return (
+        x + distance * r2, y + distance * r5, z + distance * r8,
+        r0, r1, r2, r3, r4, r5, r6, r7, r8,
+    )  # fmt: skip
+
+
+def transform(a: Pose, point: Vector) -> Vector:
+    """Return a point of the frame of `a` in the parent's frame [m]."""
+    x, y, z = point
     return (
         a[0] + a[3] * x + a[4] * y + a[5] * z,
         a[1] + a[6] * x + a[7] * y + a[8] * z,
         a[2] + a[9] * x + a[10] * y + a[11] * z,
-        *multiply_flat(a[3:], b[3:]),
     )
+
+
+def compose(a: Pose, b: Pose) -> Pose:
+    """Return the product a · b."""
+    return (*transform(a, b[:3]), *multiply_flat(a[3:], b[3:]))
 
 
 def invert(a: Pose) -> Pose:
     """Return the inverse of a rigid transform."""
-    x, y, z, r0, r1, r2, r3, r4, r5, r6, r7, r8 = a
-    return (
-        -(r0 * x + r3 * y + r6 * z), -(r1 * x + r4 * y + r7 * z), -(r2 * x + r5 * y + r8 * z),
-        r0, r3, r6, r1, r4, r7, r2, r5, r8,
-    )  # fmt: skip
+    return (*inverse_origin(a), *transpose_flat(a[3:]))
 
 
 def relative(a: Pose, b: Pose) -> Pose:
@@ -55,22 +87,20 @@ def relative(a: Pose, b: Pose) -> Pose:
         r0 * x + r3 * y + r6 * z,
         r1 * x + r4 * y + r7 * z,
         r2 * x + r5 * y + r8 * z,
-        *multiply_flat((r0, r3, r6, r1, r4, r7, r2, r5, r8), b[3:]),
+        *multiply_flat(transpose_flat(a[3:]), b[3:]),
     )
 
 
-def inverse_origin(a: Pose) -> tuple[float, float, float]:
-    """Return where the parent's origin lies in the frame of `a`."""
+def inverse_origin(a: Pose) -> Vector:
+    """Return where the parent's origin lies in the frame of `a` [m]."""
     x, y, z, r0, r1, r2, r3, r4, r5, r6, r7, r8 = a
     return -(r0 * x + r3 * y + r6 * z), -(r1 * x + r4 * y + r7 * z), -(r2 * x + r5 * y + r8 * z)
 
 
-def gap(a: Pose, point: tuple[float, float, float], b: Pose) -> float:
+def gap(a: Pose, point: Vector, b: Pose) -> float:
     """Return how far `a` puts a point of its frame from the origin of `b` [m]."""
-    x, y, z = point
-    u = a[0] + a[3] * x + a[4] * y + a[5] * z - b[0]
-    v = a[1] + a[6] * x + a[7] * y + a[8] * z - b[1]
-    w = a[2] + a[9] * x + a[10] * y + a[11] * z - b[2]
+    x, y, z = transform(a, point)
+    u, v, w = x - b[0], y - b[1], z - b[2]
     return sqrt(u * u + v * v + w * w)
 
 

@@ -35,7 +35,7 @@ class Pullout(Subtask):
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the inserted needle with PSM1, PSM2 drawn back with open jaws."""
         needle_pose = inserted_needle(stitch, rng)
-        simulation.memory.passed = 2.0
+        simulation.task_state.holes_passed = 2
         away = draw_psm2_grasp(rng, needle_pose, stitch)
         away[:3, 3] -= RETREAT * away[:3, 2]
         simulation.pose_arm(PSM2, simulation.to_base(PSM2, poses.flat(away)), RELEASED_JAW)

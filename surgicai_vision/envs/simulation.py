@@ -1,13 +1,10 @@
-"""Simulation: one scene in motion. Physics, commands of both arms, measured poses and contacts, the
-whole state.
+"""Simulation: one scene in motion, with commands, measured poses, contacts and the whole state.
 
-Interface:
-    Simulation(scene)                     owns a MjData
-    .advance(arm, action) -> bool         one control step; False when the physics diverged
-    .tip(arm) .grasp(arm) .needle()       measured poses in world, twelve floats
-    (`scene.kinematics.Pose`) .touching(arm) -> (bool, bool)        does the left, the right jaw pad
-    touch the needle .get_state() / .set_state(vector)     everything: MuJoCo's integration state
-    and `memory`
+* `Simulation(scene)` owns a MjData.
+* `advance(arm, action, step)`: one control step; False when the physics diverged.
+* `tip(arm)`, `grasp(arm)`, `needle()`: measured poses in world (`scene.kinematics.Pose`).
+* `touching(arm)`: whether the left and the right jaw pad touch the needle.
+* `get_state()`, `set_state(vector)`: everything: MuJoCo's integration state and the task state.
 
 A control step is ten physics steps of 2 ms, cut so that it *ends* with MuJoCo's position and
 velocity stages (`mj_step1`): measured poses, contacts and images belong to the state they are read
@@ -29,8 +26,8 @@ from surgicai_vision.core.config import LATENCY_LIMIT
 from surgicai_vision.core.errors import InputError, UnreachablePose
 from surgicai_vision.envs import attach, control, poses, randomisation
 from surgicai_vision.envs.attach import Welds
-from surgicai_vision.envs.control import Command, StepSize
-from surgicai_vision.envs.task_state import Memory
+from surgicai_vision.envs.control import COMMAND_SIZE, Command, StepSize
+from surgicai_vision.envs.task_state import TaskState
 from surgicai_vision.scene import Scene, kinematics, needle
 from surgicai_vision.scene.arm import GRASP_DEPTH
 from surgicai_vision.scene.kinematics import Pose
@@ -51,16 +48,13 @@ step.
 """
 
 
-COMMAND_SIZE = 12 + 1 + 6
-"""Numbers of an arm's command: pose, jaw, joints."""
-_COMMANDS = Memory.SIZE
+_COMMANDS = TaskState.SIZE
 _DRAWS = _COMMANDS + COMMAND_SIZE * len(names.ARMS)
 _WELDS = _DRAWS + randomisation.SIZE
 _QUEUE = _WELDS + attach.SIZE
 USED = _QUEUE + 7 * LATENCY_LIMIT
-"""What the user data hold, in this order: memory, commands, an episode's randomisation, welds,
-waiting actions.
-"""
+"""What the user data hold, in this order: task state, commands, an episode's randomisation, welds,
+waiting actions."""
 
 
 class Simulation:
@@ -89,7 +83,7 @@ class Simulation:
         self._servos = {
             arm: self._ctrl.itemsize * scene.arms[arm].actuators.start for arm in names.ARMS
         }
-        self.memory = Memory()
+        self.task_state = TaskState()
         self.commands: dict[str, Command] = {}
         self._read: dict[str, Pose] | None = None
         self.bases = {arm: poses.flat(kinematics.base_in_world(arm)) for arm in names.ARMS}
@@ -108,9 +102,11 @@ class Simulation:
         """Put everything at home: both arms at their start, the needle flat at its home."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.time = CLOCK_START
-        self.memory = Memory()
+        self.task_state = TaskState()
         for arm in names.ARMS:
-            self.pose_arm(arm, poses.flat(kinematics.start_in_base(arm)), kinematics.STARTS[arm][6])
+            self.pose_arm(
+                arm, poses.flat(kinematics.start_in_base(arm)), kinematics.STARTS[arm].jaw
+            )
         if self._own:
             self.data.userdata[_DRAWS:_WELDS] = self.draws
         if self._welds:
@@ -173,8 +169,9 @@ class Simulation:
     def pose_needle(self, pose: Pose) -> None:
         """Put the needle at a pose in world, at rest."""
         free = self.scene.needle_qpos.start
-        self.data.qpos[free : free + 3] = pose[:3]
-        self.data.qpos[free + 3 : free + 7] = matrix_to_quaternion_flat(pose[3:])
+        self.data.qpos[free : free + 3] = poses.position(pose)
+        turn = matrix_to_quaternion_flat(poses.rotation(pose))
+        self.data.qpos[free + 3 : free + 7] = turn
 
     def to_base(self, arm: str, pose: Pose) -> Pose:
         """Return a pose in world as one in the arm's base."""
@@ -212,7 +209,7 @@ class Simulation:
         self.command(
             arm, control.follow(self.commands[arm], action, step, self.bases[arm], self._instrument)
         )
-        if self.memory.release > 0:
+        if self.task_state.release_steps > 0:
             self._let_go()
         due = data.time + self._control_time
         mujoco.mj_step2(self.model, data)
@@ -256,12 +253,13 @@ class Simulation:
 
     def _let_go(self) -> None:
         """Open PSM2's jaw, then draw the tool back along its axis."""
-        memory, command = self.memory, self.commands[names.PSM2]
-        memory.release -= 1
+        command = self.commands[names.PSM2]
+        self.task_state.release_steps -= 1
         jaw = min(command.jaw + RELEASE_JAW, 0.5)
         back = [0.0] * 7
         if jaw >= 0.5:
-            back[:3] = [-command.pose[5], -command.pose[8], -command.pose[11]]
+            x, y, z = poses.z_axis(command.pose)
+            back[:3] = [-x, -y, -z]
         step = StepSize(RELEASE_SHIFT, 0.0, 0.0)
         moved = control.follow(
             command, back, step, self.bases[names.PSM2], self.scene.config.instrument
@@ -294,13 +292,7 @@ class Simulation:
 
     def grasp(self, arm: str) -> Pose:
         """Return T_world_grasp: the tip's frame shifted to the jaws' grasp point."""
-        tip = self.tip(arm)
-        return (
-            tip[0] + GRASP_DEPTH * tip[5],
-            tip[1] + GRASP_DEPTH * tip[8],
-            tip[2] + GRASP_DEPTH * tip[11],
-            *tip[3:],
-        )
+        return poses.shifted_along_z(self.tip(arm), GRASP_DEPTH)
 
     def needle(self) -> Pose:
         """Return T_world_needle, measured."""
@@ -343,7 +335,8 @@ class Simulation:
     def needle_point(self, angle: float) -> tuple[float, float, float]:
         """Return the needle's point at `angle` [rad] in world [m]."""
         x, y, z, r0, r1, _, r3, r4, _, r6, r7, _ = self.needle()
-        along, across = -self.radius * math.cos(angle), self.radius * math.sin(angle)
+        along = -self.radius * math.cos(angle)
+        across = self.radius * math.sin(angle)
         return (
             x + r0 * along + r1 * across,
             y + r3 * along + r4 * across,
@@ -390,12 +383,10 @@ class Simulation:
     # -- state -------------------------------------------------------------------------------------
 
     def get_state(self) -> NDArray[np.float64]:
-        """Return everything as one vector: MuJoCo's integration state, commands and memory inside
-        its user data.
-        """
-        values = [*self.memory.pack()]
+        """Return everything as one vector: MuJoCo's integration state with its user data."""
+        values = self.task_state.pack()
         for arm in names.ARMS:
-            values += [*self.commands[arm].pose, self.commands[arm].jaw, *self.commands[arm].joints]
+            values += self.commands[arm].pack()
         self.data.userdata[: len(values)] = values
         if self._welds:
             self.data.userdata[_WELDS:_QUEUE] = self._welds.pack()
@@ -420,14 +411,10 @@ class Simulation:
             raise InputError("The state holds numbers that are not finite.")
         mujoco.mj_setState(self.model, self.data, vector, STATE)
         values = self.data.userdata.tolist()
-        self.memory = Memory.unpack(values)
+        self.task_state = TaskState.unpack(values)
         for index, arm in enumerate(names.ARMS):
             start = _COMMANDS + COMMAND_SIZE * index
-            pose, joints = (
-                tuple(values[start : start + 12]),
-                tuple(values[start + 13 : start + COMMAND_SIZE]),
-            )
-            self.commands[arm] = Command(pose, values[start + 12], joints)
+            self.commands[arm] = Command.unpack(values[start : start + COMMAND_SIZE])
         draws = tuple(values[_DRAWS:_WELDS])
         if draws != self.draws:
             self.randomise(draws)

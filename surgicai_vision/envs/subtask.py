@@ -4,7 +4,7 @@ One file a subtask; this is what they share.
 
 A subtask says which arm moves, how an episode starts, which measured pose must meet which goal, and
 what else success needs. It keeps no state: everything an episode remembers is in the simulation's
-`Memory`.
+`TaskState`.
 """
 
 import math

@@ -1,6 +1,4 @@
-"""Success: the judge of a task. Everything it says is from the measured state, never from the
-command.
-"""
+"""Success: whether a task is solved, judged from the measured state, never from the command."""
 
 from typing import Any
 
@@ -23,32 +21,33 @@ def measure(
     simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str, target: Target
 ) -> Info:
     """Return the info dict of the present state under the tolerances of `preset`."""
-    memory = simulation.memory
+    state = simulation.task_state
     achieved, desired = target
     contact = simulation.holds(subtask.arm)
-    distance, turn = poses.distance(achieved, desired), poses.angle(achieved, desired)
-    diverged = memory.diverged > 0.0
+    distance = poses.distance(achieved, desired)
+    turn = poses.angle(achieved, desired)
     tolerance = subtask.tolerances[preset]
-    near = distance <= tolerance.distance and turn <= tolerance.angle and not diverged
+    near = distance <= tolerance.distance and turn <= tolerance.angle and not state.has_diverged
     return {
         "is_success": near and _meets_demands(simulation, subtask, stitch, preset, contact),
         "d_trans": distance,
         "d_angle": turn,
         "contact": contact,
-        "phase": int(memory.phase),
-        "holes_passed": min(int(memory.passed), 2),
+        "phase": state.phase,
+        "holes_passed": min(state.holes_passed, 2),
         "needle_slip": _slip(simulation, subtask.arm, contact),
-        "physics_error": diverged,
-        "tip_path": memory.tip_path,
+        "physics_error": state.has_diverged,
+        "tip_path": state.tip_path,
     }
 
 
 def meets_demands(simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str) -> bool:
-    """Say whether what success needs besides the pose holds now: contact, holes passed, needle out,
-    no divergence.
+    """Return True if what success needs besides the pose holds: contact, holes, needle out.
+
+    After a physics error nothing holds.
     """
     contact = simulation.holds(subtask.arm)
-    return simulation.memory.diverged == 0.0 and _meets_demands(
+    return not simulation.task_state.has_diverged and _meets_demands(
         simulation, subtask, stitch, preset, contact
     )
 
@@ -56,8 +55,9 @@ def meets_demands(simulation: Simulation, subtask: Subtask, stitch: Stitch, pres
 def _meets_demands(
     simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str, contact: bool
 ) -> bool:
-    """Say whether what success needs besides the pose holds."""
-    demands, passed = subtask.demands[preset], simulation.memory.passed
+    """Return True if what success needs besides the pose holds."""
+    demands = subtask.demands[preset]
+    passed = simulation.task_state.holes_passed
     if demands.contact and not contact:
         return False
     if demands.holes and not (
@@ -70,20 +70,19 @@ def _meets_demands(
 
 
 def _slip(simulation: Simulation, arm: str, contact: bool) -> NDArray[np.float64]:
-    """Return how far the needle moved in the active jaws since they first held it, (2,) [m,
-    rad].
-    """
-    memory = simulation.memory
+    """Return how far the needle moved in the active jaws since they held it, (2,) [m, rad]."""
+    state = simulation.task_state
     if not contact:
-        memory.held = 0.0
+        state.is_held = False
         return np.zeros(2)
-    grasp, lying = simulation.grasp(arm), simulation.needle()
-    if memory.held == 0.0:
-        memory.held, memory.hold = 1.0, poses.relative(grasp, lying)
+    grasp = simulation.grasp(arm)
+    lying = simulation.needle()
+    if not state.is_held:
+        state.is_held = True
+        state.hold = poses.relative(grasp, lying)
         return np.zeros(2)
-    # The point then grasped is where the needle has `inverse_origin(hold)`; rotations leave its
-    # way's length alone.
-    way = poses.gap(lying, poses.inverse_origin(memory.hold), grasp)
-    return np.array(
-        (way, geodesic_angle_flat(lying[3:], multiply_flat(grasp[3:], memory.hold[3:])))
-    )
+    # The point then grasped lies at `inverse_origin(hold)` in the needle's frame; a rotation does
+    # not change the length of its way.
+    shift = poses.gap(lying, poses.inverse_origin(state.hold), grasp)
+    held = multiply_flat(poses.rotation(grasp), poses.rotation(state.hold))
+    return np.array((shift, geodesic_angle_flat(poses.rotation(lying), held)))

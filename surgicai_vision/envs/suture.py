@@ -3,7 +3,7 @@
 The present subtask's success must hold for `DWELL` control steps before the next one begins: the
 paper's tolerances are met before a subtask is finished (an insertion counts 5 mm before its goal),
 and the next one needs it finished. When the pull-out begins PSM2 lets go by itself, as in the
-released code. A high-level policy may choose another subtask by `begin`.
+released code. A high-level policy may choose another subtask by `enter`.
 """
 
 from surgicai_vision.core.config import DWELL
@@ -18,34 +18,31 @@ class Suture(SuturingEnv):
     """All five subtasks in a row; `is_success` is the whole procedure's."""
 
     def _progress(self, info: Info) -> bool:
-        """Begin the next subtask, and say so, when the present one's success has held."""
-        memory = self.simulation.memory
+        """Go on to the next subtask when the present one's success has held; return if so."""
+        state = self.simulation.task_state
         info["subtask_success"] = info["is_success"]
-        memory.dwell = memory.dwell + 1.0 if info["is_success"] else 0.0
-        last = int(memory.phase) == len(self._subtasks) - 1
-        if info["is_success"] and memory.phase == memory.done:
-            memory.done += 1.0
-        info["progress"] = int(memory.done)
-        info["is_success"] = bool(last and info["is_success"])
-        if last or memory.dwell < DWELL:
+        state.dwell = state.dwell + 1 if info["is_success"] else 0
+        is_last = state.phase == len(self._subtasks) - 1
+        if info["is_success"] and state.phase == state.done:
+            state.done += 1
+        info["progress"] = state.done
+        info["is_success"] = is_last and info["is_success"]
+        if is_last or state.dwell < DWELL:
             return False
-        self._enter(int(memory.phase) + 1)
+        self._make_present(state.phase + 1)
         return True
 
     def _meets_demands(self) -> bool:
-        """Say so of the last subtask alone: it is the one whose success is the whole's."""
-        return (
-            int(self.simulation.memory.phase) == len(self._subtasks) - 1
-            and super()._meets_demands()
-        )
+        """Return True only in the last subtask, whose success is that of the whole."""
+        return self.phase == len(self._subtasks) - 1 and super()._meets_demands()
 
     @property
     def dwell(self) -> int:
-        """Control steps for which the present subtask's success has held."""
-        return int(self.simulation.memory.dwell)
+        """Return the control steps for which the present subtask's success has held."""
+        return self.simulation.task_state.dwell
 
-    def begin(self, phase: int) -> None:
-        """Begin a subtask by choice, as a high-level policy does: its arm moves from now on.
+    def enter(self, phase: int) -> None:
+        """Make a subtask the present one, as a high-level policy does: its arm moves from now on.
 
         Args:
             phase: index in `names.SUBTASKS`; that of the present subtask changes nothing.
@@ -55,14 +52,15 @@ class Suture(SuturingEnv):
                 f"There is no subtask {phase}; allowed: 0 to {len(self._subtasks) - 1}."
             )
         if phase != self.phase:
-            self._enter(phase)
+            self._make_present(phase)
 
-    def _enter(self, phase: int) -> None:
-        """Make a subtask the present one; what lies behind is kept as it is."""
-        memory = self.simulation.memory
-        memory.phase = float(phase)
-        memory.dwell = memory.held = 0.0
+    def _make_present(self, phase: int) -> None:
+        """Make a subtask the present one; the progress so far is kept."""
+        state = self.simulation.task_state
+        state.phase = phase
+        state.dwell = 0
+        state.is_held = False
         if self.config.randomisation.latency:
             self.simulation.drop_waiting()
-        memory.release = float(RELEASE_STEPS) if phase == PULLOUT_PHASE else 0.0
+        state.release_steps = RELEASE_STEPS if phase == PULLOUT_PHASE else 0
         self._remember_tool()

@@ -1,77 +1,85 @@
-"""Memory: what an episode must remember beyond the physics, so that one vector is its whole state.
+"""Task state: what an episode must remember beyond the physics.
 
-Fields are plain floats; `pack` and `unpack` turn them into the start of MuJoCo's user data and
-back.
+`pack` and `unpack` turn it into the start of MuJoCo's user data and back, so that one vector is the
+whole state of an episode.
 """
 
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, cast
 
 from surgicai_vision.envs.poses import IDENTITY
 from surgicai_vision.scene.kinematics import Pose
+from surgicai_vision.scene.rotations import Vector
+
+ORIGIN: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass
-class Memory:
+class TaskState:
     """The running record of one episode.
 
     Attributes:
         phase: index of the present subtask in `names.SUBTASKS`, -1 in another task.
         steps: control steps taken.
-        tip_path: length of the active tip's way so far [m].
-        passed: hole planes passed by the tip in travel direction, 0..2; 3 when the base is out as
-            well.
+        tip_path: length of the active tip's path so far [m].
+        holes_passed: hole planes that the needle's tip passed in travel direction, 0 to 2;
+            `hole_crossing.OUT` when the base has left the exit as well.
         grasp_angle: needle angle of this episode's grasp goal [rad].
-        held: 1 when `hold` is set.
-        dwell: control steps the present subtask's success has held (whole procedure).
-        release: control steps PSM2 goes on letting go.
-        diverged: 1 after a physics error.
-        tip_x, tip_y, tip_z: needle tip at the last measurement, world [m].
+        is_held: the active jaws hold the needle, first as in `hold`.
+        dwell: control steps for which the present subtask's success has held (whole procedure).
+        release_steps: control steps for which PSM2 goes on letting go.
+        has_diverged: a physics error happened.
+        needle_tip: the needle's tip after the last control step, in world [m].
+        tool_tip: the active tool's tip after the last control step, in world [m].
         hold: T_grasp_needle when the active jaws first held the needle.
-        goal: the subtask's fixed goal in world, where it has one.
         done: subtasks that succeeded in their order (whole procedure).
     """
 
-    phase: float = 0.0
-    steps: float = 0.0
+    phase: int = 0
+    steps: int = 0
     tip_path: float = 0.0
-    passed: float = 0.0
+    holes_passed: int = 0
     grasp_angle: float = 0.0
-    held: float = 0.0
-    dwell: float = 0.0
-    release: float = 0.0
-    diverged: float = 0.0
-    tip_x: float = 0.0
-    tip_y: float = 0.0
-    tip_z: float = 0.0
-    tool_x: float = 0.0
-    tool_y: float = 0.0
-    tool_z: float = 0.0
+    is_held: bool = False
+    dwell: int = 0
+    release_steps: int = 0
+    has_diverged: bool = False
+    needle_tip: Vector = ORIGIN
+    tool_tip: Vector = ORIGIN
     hold: Pose = IDENTITY
-    goal: Pose = IDENTITY
-    done: float = 0.0
+    done: int = 0
 
-    SIZE: ClassVar[int] = 16 + 2 * 12
-    """Numbers of a record; what else is in MuJoCo's user data follows it: see `simulation`."""
+    SIZE: ClassVar[int] = 10 + 2 * len(ORIGIN) + len(IDENTITY)
+    """Numbers of a packed state; `simulation` says what follows it in MuJoCo's user data."""
 
     def pack(self) -> list[float]:
-        """Return all fields as `SIZE` floats."""
-        values: list[float] = []
-        for item in fields(self):
-            value = getattr(self, item.name)
-            values += value if isinstance(value, tuple) else [value]
-        return values
+        """Return the state as `SIZE` numbers."""
+        return [
+            *(self.phase, self.steps, self.tip_path, self.holes_passed, self.grasp_angle),
+            *(self.is_held, self.dwell, self.release_steps, self.has_diverged, self.done),
+            *self.needle_tip,
+            *self.tool_tip,
+            *self.hold,
+        ]
 
     @classmethod
-    def unpack(cls, values: list[float]) -> "Memory":
-        """Return the record that `pack` wrote at the start of `values`."""
-        record, start = cls(), 0
-        for item in fields(cls):
-            length = len(item.default) if isinstance(item.default, tuple) else 0
-            setattr(
-                record,
-                item.name,
-                tuple(values[start : start + length]) if length else values[start],
-            )
-            start += length or 1
-        return record
+    def unpack(cls, values: Sequence[float]) -> "TaskState":
+        """Return the state that `pack` wrote at the start of `values`."""
+        phase, steps, tip_path, holes_passed, grasp_angle = values[:5]
+        is_held, dwell, release_steps, has_diverged, done = values[5:10]
+        return cls(
+            phase=int(phase),
+            steps=int(steps),
+            tip_path=tip_path,
+            holes_passed=int(holes_passed),
+            grasp_angle=grasp_angle,
+            is_held=bool(is_held),
+            dwell=int(dwell),
+            release_steps=int(release_steps),
+            has_diverged=bool(has_diverged),
+            needle_tip=cast(Vector, tuple(values[10:13])),
+            tool_tip=cast(Vector, tuple(values[13:16])),
+            hold=cast(Pose, tuple(values[16 : cls.SIZE])),
+            done=int(done),
+        )

@@ -1,4 +1,4 @@
-"""Posing: put an env into a foreign state, for replaying motions that were recorded elsewhere.
+"""Teleport: put an env into a given state, to replay motions that were recorded elsewhere.
 
 A replay is kinematic: tools and needle stand where the recording had them, at rest, and commands
 match. Images, observations and measurements are those of that state; nothing is claimed about the
@@ -28,7 +28,7 @@ def pose_scene(
     """Set a kinematic state: arms, needle, no velocity, commands to match.
 
     Args:
-        env: the env; its episode memory (goal, progress) stays as it is.
+        env: the env; its task state (progress) stays as it is.
         psm1: T_base_tip (4, 4) and jaw [rad] of PSM1; None leaves it where it is.
         psm2: the same of PSM2.
         T_world_needle: pose of the needle in world (4, 4); None leaves it.
@@ -47,12 +47,12 @@ def pose_scene(
         simulation.pose_needle(poses.flat(T_world_needle))
     simulation.data.qvel[:] = 0.0
     simulation.refresh()
-    hole_crossing.remember_tip(simulation, simulation.memory)
+    hole_crossing.remember_tip(simulation, simulation.task_state)
 
 
 def home(arm: str) -> ArmPose:
     """Return an arm's pose at the start of an episode."""
-    return start_in_base(arm), STARTS[arm][6]
+    return start_in_base(arm), STARTS[arm].jaw
 
 
 def holding(env: SuturingEnv, arm: str, T_world_needle: Matrix, angle: float) -> ArmPose:

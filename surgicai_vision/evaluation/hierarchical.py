@@ -251,7 +251,7 @@ class ChainAgent(Agent):
         """Ask the high-level policy wherever it is due, and begin what it says."""
         for state, env in zip(states, envs, strict=True):
             if self._has_grasped(state, env):
-                env.begin(GRASP + 1)
+                env.enter(GRASP + 1)
         asked = [
             row
             for row, state in enumerate(states)
@@ -267,7 +267,7 @@ class ChainAgent(Agent):
                 state.decisions += 1
                 self._low[choice].restart(slots[row])
             if self._may_act(state):
-                env.begin(state.subtask)
+                env.enter(state.subtask)
 
     def _is_asked(self, state: _Progress, env: Any) -> bool:
         if state.subtask < 0 or state.steps >= self.chain.steps:

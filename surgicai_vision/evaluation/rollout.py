@@ -163,21 +163,21 @@ class _Slot:
     states: list[NDArray[np.float64]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        from surgicai_vision.envs.episode_monitor import Gauge
+        from surgicai_vision.envs.episode_monitor import EpisodeMonitor
 
         self.env = env_of(self.agent, self.task_config)
-        self.gauge = Gauge(self.env)
+        self.monitor = EpisodeMonitor(self.env)
 
     def begin(self, seed: int) -> None:
         """Start the episode of `seed`."""
         self.seed, self.steps, self.states = seed, 0, []
         self.ended = self.diverged = self.touched = False
         self.error = ""
-        self.gauge.forget()
+        self.monitor.clear()
         try:
             self.observation, self.info = self.env.reset(seed=seed)
             self.touched = bool(self.info.get("contact"))
-            self.gauge.begin()
+            self.monitor.reset()
             self.agent.reset(self.index, self.env, seed)
         except PhysicsError as error:
             self.info, self.ended, self.error = {}, True, str(error)
@@ -193,7 +193,7 @@ class _Slot:
         except PhysicsError as error:
             terminated, truncated, self.error, self.diverged = True, False, str(error), True
         else:
-            self.gauge.look(self.info)
+            self.monitor.update(self.info)
         if self.info.get("physics_error"):
             self.error, self.diverged = self.error or "the physics diverged", True
         self.steps += 1
@@ -209,9 +209,9 @@ class _Slot:
         assert self.seed is not None
         contact = bool(self.info.get("contact", False))
         success = bool(self.info.get("is_success", False)) and not self.error
-        gauge = self.gauge
-        held = not self.error and gauge.held()
-        failure = failure_kind(self.error, self.diverged, self.touched, gauge.wrong_hole, held)
+        monitor = self.monitor
+        held = not self.error and monitor.is_held()
+        failure = failure_kind(self.error, self.diverged, self.touched, monitor.wrong_hole, held)
         row = EpisodeMetrics(
             task=self.task_config.task,
             policy=self.agent.name,
@@ -226,11 +226,11 @@ class _Slot:
             grasp=self.task_config.scene.grasp,
             failure="" if success else failure,
             stages=int(self.info.get("progress", success)),
-            entry_mm=1e3 * gauge.entry_error,
-            exit_mm=1e3 * gauge.exit_error,
-            slip_mm=1e3 * gauge.slip,
-            slip_deg=math.degrees(gauge.turn),
-            tissue_force_n=gauge.tissue_force,
+            entry_mm=1e3 * monitor.entry_error,
+            exit_mm=1e3 * monitor.exit_error,
+            slip_mm=1e3 * monitor.slip,
+            slip_deg=math.degrees(monitor.turn),
+            tissue_force_n=monitor.tissue_force,
         )
         self.seed = None
         return Episode(row, self._film())

@@ -1,5 +1,4 @@
-"""Holes: where the stitch goes in and out of each phantom layout, and the test that a needle
-passed.
+"""Holes: where the stitch goes in and out of each phantom layout.
 
 A hole's frame has +z along the outward normal of its flank and +y along the wound (world y); x runs
 up the flank at the entry and down it at the exit. World frame, metres.
@@ -94,34 +93,3 @@ PAIRS: dict[str, tuple[HolePair, ...]] = {
     "3dmed_straight": _symmetric((10.0, 9.8, 10.1, 10.9), 1.25, (0.0, 0.0, 0.0, 0.0)),
 }
 """Layout → its four hole pairs."""
-
-
-def crossing(polyline: np.ndarray, hole: Hole, inward: bool) -> np.ndarray | None:
-    """Return where a needle's polyline passes a hole's plane in the travel direction, or None.
-
-    Args:
-        polyline: points from base to tip in world, shape (n, 3) [m].
-        hole: the hole.
-        inward: True where the needle enters the tissue (entry), False where it leaves it (exit).
-
-    Returns:
-        The crossing nearest to the hole's centre, (x, y) in the hole's frame [m].
-    """
-    local = (polyline - np.asarray(hole.centre)) @ hole.rotation
-    before, after = local[:-1], local[1:]
-    passes = (
-        (before[:, 2] > 0) & (after[:, 2] <= 0)
-        if inward
-        else (before[:, 2] <= 0) & (after[:, 2] > 0)
-    )
-    if not passes.any():
-        return None
-    start, end = before[passes], after[passes]
-    share = start[:, 2] / (start[:, 2] - end[:, 2])
-    points = start[:, :2] + share[:, None] * (end[:, :2] - start[:, :2])
-    return points[np.argmin((points**2).sum(axis=1))]
-
-
-def inside(point: np.ndarray | None) -> bool:
-    """Say whether a crossing lies within the opening."""
-    return point is not None and bool(np.all(np.abs(point) < OPENING / 2))

@@ -137,12 +137,26 @@ BASES = MappingProxyType(
 )
 """Arm → position [m] and roll, pitch, yaw [rad] of its base in world (SurgicAI's scene)."""
 
-PSM1_START = (0.04629208, 0.00752399, -0.08173992, -3.598019, -0.05762508, 1.2738742, 0.8)
-PSM2_START = (-0.03721037, 0.01213105, -0.08036895, -2.7039163, 0.07693613, 2.0361109, 0.8)
-"""Tip at the start of an episode in the arm's own base: x y z [m], roll pitch yaw, jaw [rad]
-(released code).
-"""
-STARTS = MappingProxyType({PSM1: PSM1_START, PSM2: PSM2_START})
+
+class Start(NamedTuple):
+    """The tip at the start of an episode, in the arm's own base [m, rad]."""
+
+    x: float
+    y: float
+    z: float
+    roll: float
+    pitch: float
+    yaw: float
+    jaw: float
+
+
+STARTS = MappingProxyType(
+    {
+        PSM1: Start(0.04629208, 0.00752399, -0.08173992, -3.598019, -0.05762508, 1.2738742, 0.8),
+        PSM2: Start(-0.03721037, 0.01213105, -0.08036895, -2.7039163, 0.07693613, 2.0361109, 0.8),
+    }
+)
+"""Arm → its start (released code)."""
 
 
 def limits(instrument: str = DEFAULT) -> NDArray[np.float64]:
@@ -159,7 +173,8 @@ def base_in_world(arm: str) -> NDArray[np.float64]:
 def start_in_base(arm: str) -> NDArray[np.float64]:
     """Return T_base_tip (4, 4) at the start of an episode."""
     start = STARTS[check_name("arm", arm, STARTS)]
-    return _matrix(start[:3], rpy_to_matrix(*start[3:6]))
+    rotation = rpy_to_matrix(start.roll, start.pitch, start.yaw)
+    return _matrix((start.x, start.y, start.z), rotation)
 
 
 def forward(q6: ArrayLike, instrument: str = DEFAULT) -> NDArray[np.float64]:

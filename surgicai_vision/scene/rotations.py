@@ -41,10 +41,10 @@ def matrix_to_rpy_flat(m: Sequence[float]) -> Vector:
     The tools point down in their base frames, at a roll of about ±π; the range (-2π, 0] puts the
     cut elsewhere.
     """
-    r00, r10, r20, r21, r22 = m[0], m[3], m[6], m[7], m[8]
+    r00, _, _, r10, r11, r12, r20, r21, r22 = m
     cos_pitch = sqrt(r00 * r00 + r10 * r10)
     if cos_pitch < GIMBAL:
-        roll, yaw = atan2(-m[5], m[4]), 0.0
+        roll, yaw = atan2(-r12, r11), 0.0
     else:
         roll, yaw = atan2(r21, r22), atan2(r10, r00)
     if roll > 0.0:
@@ -125,6 +125,12 @@ def multiply_flat(a: Sequence[float], b: Sequence[float]) -> Flat9:
         a3 * b0 + a4 * b3 + a5 * b6, a3 * b1 + a4 * b4 + a5 * b7, a3 * b2 + a4 * b5 + a5 * b8,
         a6 * b0 + a7 * b3 + a8 * b6, a6 * b1 + a7 * b4 + a8 * b7, a6 * b2 + a7 * b5 + a8 * b8,
     )  # fmt: skip
+
+
+def transpose_flat(a: Flat9) -> Flat9:
+    """Return the transposed matrix, of a rotation its inverse."""
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = a
+    return a0, a3, a6, a1, a4, a7, a2, a5, a8
 
 
 def geodesic_angle_flat(a: Sequence[float], b: Sequence[float]) -> float:

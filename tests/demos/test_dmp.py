@@ -244,9 +244,9 @@ def test_an_insertion_is_cut_at_the_entry_and_a_pull_out_at_the_exit(demonstrate
         measured, env = fit.demo_poses(demo), envs.make(demo.config)
         cut = fit.CARRY_PHASES[task][0].end(measured)
         env.set_state_vector(demo.state[min(cut + 6, len(demo))])
-        assert env.simulation.memory.passed == holes
+        assert env.simulation.task_state.holes_passed == holes
         env.set_state_vector(demo.state[max(cut - 4, 0)])
-        assert env.simulation.memory.passed < holes
+        assert env.simulation.task_state.holes_passed < holes
 
 
 def test_reset_begins_anew_and_the_same_start_gives_the_same_actions(demonstrated):

@@ -27,7 +27,7 @@ from surgicai_vision.scene import kinematics, needle
 
 GOAL = np.array([5.549, 1.060, -12.890, -3.215, -0.919, 1.614, 0.0])
 """A handoff goal of PSM1 like SurgicAI's [cm, rad]."""
-START = np.array([*np.multiply(kinematics.PSM1_START[:3], 100), *kinematics.PSM1_START[3:]])
+START = np.array([*np.multiply(kinematics.STARTS["psm1"][:3], 100), *kinematics.STARTS["psm1"][3:]])
 
 
 def transitions(episodes=2, step="shipped", start=START, goal=GOAL, close=True):

@@ -25,7 +25,7 @@ from surgicai_vision.training.train import train
 def grasp(env: envs.SuturingEnv, seed: int, goal: float | None = None) -> tuple[bool, np.ndarray]:
     env.reset(seed=seed)
     if goal is not None:
-        env.simulation.memory.grasp_angle = math.radians(goal)
+        env.simulation.task_state.grasp_angle = math.radians(goal)
     actor, actions, ended, info = SearchExpert(env), [], False, {}
     while not ended:
         actions.append(actor.action())

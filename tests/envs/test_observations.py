@@ -93,7 +93,7 @@ def test_proprioception_does_not_know_the_needle(task):
     seen, _ = env.reset(seed=0)
     qpos = env.data.qpos.copy()
     qpos[env.scene.needle_qpos.start : env.scene.needle_qpos.start + 3] += (0.012, 0.004, 0.006)
-    env.simulation.memory.grasp_angle += 0.1
+    env.simulation.task_state.grasp_angle += 0.1
     env.set_state(qpos, env.data.qvel)
     moved = env.observe()
     assert np.array_equal(moved["agent_pos"], seen["agent_pos"])

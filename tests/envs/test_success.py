@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 from episodes import make, play
+from needle_polyline import crosses
 
 from surgicai_vision.core import names
 from surgicai_vision.demos.expert import Expert
@@ -34,7 +35,7 @@ def drag(env, path):
     """
     for pose in path:
         put(env, pose)
-        hole_crossing.watch(env.simulation, env.simulation.memory, env.stitch.pair)
+        hole_crossing.update(env.simulation, env.simulation.task_state, env.stitch.pair)
     return env.measure()
 
 
@@ -231,7 +232,7 @@ def test_a_needle_drawn_back_does_not_count():
 
 
 def test_the_closed_form_is_the_naive_test():
-    """`passage` equals the crossing of a fine polyline, for needles anywhere about the holes."""
+    """`hole_crossing` equals the crossing of a fine polyline, for needles anywhere about the holes."""
     env = start("pullout")
     simulation, pair = env.simulation, env.stitch.pair
     rng, found = np.random.default_rng(0), np.zeros((3, 2), int)
@@ -243,8 +244,8 @@ def test_the_closed_form_is_the_naive_test():
         env.simulation.refresh()
         line = pose[:3, 3] + needle.polyline(2001) @ pose[:3, :3].T
         beyond = ((line - pair.exit.centre) @ pair.exit.rotation)[:, 2]
-        enters = holes.inside(holes.crossing(line, pair.entry, inward=True))
-        leaves = holes.inside(holes.crossing(line, pair.exit, inward=False))
+        enters = crosses(line, pair.entry, inward=True)
+        leaves = crosses(line, pair.exit, inward=False)
         out = bool((beyond > 0).all())
         assert hole_crossing.enters(simulation, pair.entry) == enters
         assert hole_crossing.leaves(simulation, pair.exit) == leaves
@@ -267,7 +268,7 @@ def jaws_at_the_grasp(task, jaw, measured, needle_shift=(0.0, 0.0, 0.0)):
     env = start(task)
     simulation, (arm, angle) = env.simulation, GRASPS[task]
     pose = env.stitch.inserted() if task == "handoff" else poses.square(simulation.needle())
-    angle = simulation.memory.grasp_angle if angle is None else angle
+    angle = simulation.task_state.grasp_angle if angle is None else angle
     tip = simulation.to_base(arm, poses.flat(pose @ grasp_in_needle(arm, angle)))
     simulation.pose_arm(arm, tip, jaw, measured)
     put(env, shifted(pose, pose[:3, :3] @ needle_shift))
@@ -321,7 +322,7 @@ def moved_world(monkeypatch):
 
 
 def carry_over(source, target, shift):
-    """Give `target` the tools, needle and memory of `source`, all moved by `shift` [m, world]."""
+    """Give `target` the tools, needle and task state of `source`, all moved by `shift` [m, world]."""
     one, other = source.simulation, target.simulation
     for arm in names.ARMS:
         tip = poses.square(one.tip(arm))
@@ -330,7 +331,7 @@ def carry_over(source, target, shift):
             arm, other.to_base(arm, poses.flat(tip)), one.commands[arm].jaw, one.jaw(arm)
         )
     put(target, shifted(poses.square(one.needle()), shift))
-    other.memory = dataclasses.replace(one.memory)
+    other.task_state = dataclasses.replace(one.task_state)
 
 
 @pytest.mark.parametrize("task", names.SUBTASKS)

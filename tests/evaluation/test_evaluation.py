@@ -69,24 +69,24 @@ class FakeEnv:
         self.closed = True
 
 
-class FakeGauge:
+class FakeMonitor:
     """Measures what the fake env's count says."""
 
     def __init__(self, env):
         self.env = env
-        self.forget()
+        self.clear()
 
-    def forget(self):
+    def clear(self):
         self.entry_error = self.exit_error = np.nan
         self.slip = self.turn = self.tissue_force = 0.0
         self.wrong_hole = False
 
-    begin = forget
+    reset = clear
 
-    def held(self):
+    def is_held(self):
         return self.env._info()["contact"]
 
-    def look(self, info):
+    def update(self, info):
         self.entry_error = 5e-4
         self.slip, self.turn, self.tissue_force = (
             1e-4 * self.env.count,
@@ -98,7 +98,7 @@ class FakeGauge:
 @pytest.fixture
 def fake_envs(monkeypatch):
     made = []
-    monkeypatch.setattr(episode_monitor, "Gauge", FakeGauge)
+    monkeypatch.setattr(episode_monitor, "EpisodeMonitor", FakeMonitor)
 
     def make(config, **_):
         made.append(FakeEnv(config))

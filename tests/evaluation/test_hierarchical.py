@@ -141,12 +141,12 @@ def test_begin_changes_the_arm_and_earns_nothing() -> None:
     env.reset(seed=names.TEST_SEED)
     both, first = env.both_arms(), env.agent_pos()
     np.testing.assert_array_equal(both[7:], first)
-    env.begin(4)
+    env.enter(4)
     np.testing.assert_array_equal(env.agent_pos(), both[:7])
     _, _, _, _, info = env.step(np.zeros(7, np.float32))
     assert (info["phase"], info["progress"], info["is_success"]) == (4, 0, False)
     with pytest.raises(InputError, match="no subtask 5"):
-        env.begin(5)
+        env.enter(5)
 
 
 def test_trained_policies_are_chained_in_any_batch(tmp_path: Path) -> None:

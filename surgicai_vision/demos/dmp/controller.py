@@ -156,7 +156,7 @@ class DmpController(Demonstrator):
 
     def _grasp_pose(self, world: WorldState) -> Matrix:
         """Return T_world_tip of the grasp, at the episode's angle or else the demonstrated one."""
-        angle = world.memory.grasp_angle or self.fit.grasp_angle
+        angle = world.task_state.grasp_angle or self.fit.grasp_angle
         return world.needle @ grasp_in_needle(world.arm, angle)
 
 

@@ -205,7 +205,7 @@ class Track:
         arms: arm → its motion; other arms are at their start.
         needle: T_world_needle (T + 1, 4, 4).
         grasp_angle: the needle's point that is grasped [rad], where the task has one.
-        passed: `Memory.passed` in each state, (T + 1,), or None: as the task's start has it.
+        passed: `TaskState.holes_passed` in each state, (T + 1,), or None: as the task's start has it.
     """
 
     arms: Mapping[str, Motion]
@@ -264,10 +264,10 @@ class Replay:
         for index, needle_pose in enumerate(track.needle):
             poses = {arm: (tip[index], float(jaw[index])) for arm, (tip, jaw) in arms.items()}
             pose_scene(env, **poses, T_world_needle=needle_pose)
-            memory = env.simulation.memory
-            memory.grasp_angle = track.grasp_angle or memory.grasp_angle
+            state = env.simulation.task_state
+            state.grasp_angle = track.grasp_angle or state.grasp_angle
             if track.passed is not None:
-                memory.passed = float(track.passed[index])
+                state.holes_passed = int(track.passed[index])
             infos.append(env.measure())
             states.append(env.get_state())
         return np.stack(states), infos

@@ -19,7 +19,6 @@ is inserted, not placed.
 
 import itertools
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,8 +30,7 @@ from surgicai_vision.demos.imports.rosbag.resample import RATE, Recording
 from surgicai_vision.envs import hole_crossing, poses
 from surgicai_vision.envs.geometry import Stitch, needle_frame
 from surgicai_vision.envs.insert import START_SHIFT, START_TURN
-from surgicai_vision.envs.simulation import Simulation
-from surgicai_vision.envs.task_state import Memory
+from surgicai_vision.envs.task_state import TaskState
 from surgicai_vision.scene import kinematics, needle
 from surgicai_vision.scene.arm import GRASP_DEPTH
 from surgicai_vision.scene.holes import HolePair
@@ -216,7 +214,7 @@ def sustained(event: np.ndarray) -> np.ndarray:
 
 
 class _NeedleAlone:
-    """A needle without a simulation: what `envs.hole_crossing` needs of one."""
+    """A needle without a simulation, a `hole_crossing.NeedlePose`."""
 
     radius = needle.RADIUS
 
@@ -232,24 +230,24 @@ class _NeedleAlone:
 
 
 def holes_passed(needle_poses: np.ndarray, pair: HolePair) -> np.ndarray:
-    """Return `Memory.passed` of each needle pose (N, 4, 4), as an episode would have it, (N,).
+    """Return `TaskState.holes_passed` of each needle pose (N, 4, 4) in an episode, (N,).
 
     A needle that is out and comes back to the entry begins the next stitch, with none passed.
     """
-    memory = Memory()
+    state = TaskState()
     passed = []
     for index, pose in enumerate(needle_poses):
-        seen = cast(Simulation, _NeedleAlone(poses.flat(pose)))
+        seen = _NeedleAlone(poses.flat(pose))
         if index == 0:
-            hole_crossing.remember_tip(seen, memory)
-            memory.passed = 2.0 if hole_crossing.in_both(seen, pair) else 0.0
+            hole_crossing.remember_tip(seen, state)
+            state.holes_passed = 2 if hole_crossing.in_both(seen, pair) else 0
         else:
-            hole_crossing.watch(seen, memory, pair)
-            tip = np.array([memory.tip_x, memory.tip_y, memory.tip_z]) - pair.entry.centre
+            hole_crossing.update(seen, state, pair)
+            tip = np.array(state.needle_tip) - pair.entry.centre
             before = tip @ pair.entry.rotation[:, 2] > 0.0 and np.linalg.norm(tip) < START_SHIFT
-            if memory.passed == hole_crossing.OUT and before:
-                memory.passed = 0.0
-        passed.append(memory.passed)
+            if state.holes_passed == hole_crossing.OUT and before:
+                state.holes_passed = 0
+        passed.append(state.holes_passed)
     return np.array(passed)
 
 

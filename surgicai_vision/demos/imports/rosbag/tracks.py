@@ -25,7 +25,7 @@ CLOSED = ("place", "insert", "pullout")
 MAX_GRIP_ERROR = 0.005
 """Furthest an inferred needle may be outside the jaws that hold it [m]: the paper lets place and
 insert end that far from their goals."""
-START_JAW = kinematics.PSM1_START[6]
+START_JAW = kinematics.STARTS[names.PSM1].jaw
 """Jaw of an arm that does not hold the needle and whose jaw was not recorded [rad]."""
 
 

@@ -1,4 +1,4 @@
-"""The gauge: it measures what happened, in known cases, and changes nothing."""
+"""The episode monitor: it measures what happened, in known cases, and changes nothing."""
 
 import math
 
@@ -9,7 +9,8 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.envs.episode_monitor import Gauge, Plate, crossing
+from surgicai_vision.envs.episode_monitor import EpisodeMonitor, ForcePlate
+from surgicai_vision.envs.hole_crossing import crossing
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.holes import OPENING, PAIRS
 
@@ -20,9 +21,9 @@ INFO = {"needle_slip": (0.0, 0.0)}
 def started(task="grasp", seed=names.TEST_SEED, **options):
     env = envs.make(TaskConfig(task, **options))
     env.reset(seed=seed)
-    gauge = Gauge(env)
-    gauge.begin()
-    return env, gauge
+    monitor = EpisodeMonitor(env)
+    monitor.reset()
+    return env, monitor
 
 
 def test_a_lying_needle_weighs_what_it_weighs():
@@ -30,7 +31,7 @@ def test_a_lying_needle_weighs_what_it_weighs():
     for _ in range(60):
         env.step(NO_ACTION)
     weight = env.model.body("needle").mass[0] * 9.81
-    assert Plate(env.model).force(env.data) == pytest.approx(weight, rel=0.02)
+    assert ForcePlate(env.model).force(env.data) == pytest.approx(weight, rel=0.02)
 
 
 def test_a_needle_in_the_air_presses_nothing():
@@ -40,48 +41,48 @@ def test_a_needle_in_the_air_presses_nothing():
     pose[2] += 0.05
     env.simulation.pose_needle(tuple(pose))
     env.simulation.refresh()
-    assert Plate(env.model).force(env.data) == 0.0
+    assert ForcePlate(env.model).force(env.data) == 0.0
 
 
 def test_an_instrument_that_is_driven_into_the_tissue_presses_it():
-    env, gauge = started()
+    env, monitor = started()
     down = env.simulation.bases[names.PSM2]
     # World's -z in the arm's base: the third row of R_world_base, turned round.
     action = np.array([*(-np.array(down[9:12])), 0, 0, 0, 0], np.float32)
     for _ in range(env.config.max_steps):
-        gauge.look(env.step(action)[4])
-    assert gauge.tissue_force > 1.0
+        monitor.update(env.step(action)[4])
+    assert monitor.tissue_force > 1.0
 
 
-def test_looking_changes_nothing():
-    (plain, _), (watched, gauge) = started("insert"), started("insert")
+def test_monitoring_changes_nothing():
+    (plain, _), (watched, monitor) = started("insert"), started("insert")
     ones = np.ones(7, np.float32)
     for _ in range(60):
         plain.step(ones)
-        gauge.look(watched.step(ones)[4])
-    assert gauge.tissue_force > 0.001
+        monitor.update(watched.step(ones)[4])
+    assert monitor.tissue_force > 0.001
     np.testing.assert_array_equal(watched.get_state(), plain.get_state())
 
 
 def test_the_expert_goes_through_the_middle_of_both_holes():
-    env, gauge = started("insert")
+    env, monitor = started("insert")
     expert = Expert(env)
     for _ in range(env.config.max_steps):
         *_, ended, _, info = env.step(expert.action())
-        gauge.look(info)
+        monitor.update(info)
         if ended:
             break
     assert info["is_success"]
-    assert 0 < gauge.entry_error < 1e-3 and 0 < gauge.exit_error < 1e-3
-    assert 0 < gauge.slip < 1e-3 and gauge.turn > 0
-    assert not gauge.wrong_hole
-    gauge.begin()
-    assert math.isnan(gauge.entry_error) and gauge.slip == 0.0
+    assert 0 < monitor.entry_error < 1e-3 and 0 < monitor.exit_error < 1e-3
+    assert 0 < monitor.slip < 1e-3 and monitor.turn > 0
+    assert not monitor.wrong_hole
+    monitor.reset()
+    assert math.isnan(monitor.entry_error) and monitor.slip == 0.0
 
 
-def lead_tip(gauge, *points):
+def lead_tip(monitor, *points):
     """Move the needle's tip along points in world [m], a millimetre a step."""
-    env = gauge._env
+    env = monitor._env
     simulation = env.simulation
     pose = np.array(simulation.needle())
     here = np.array(simulation.needle_point(needle.TIP_ANGLE))
@@ -92,7 +93,7 @@ def lead_tip(gauge, *points):
             pose[:3] += goal - tip
             simulation.pose_needle(tuple(pose))
             simulation.refresh()
-            gauge.look(INFO)
+            monitor.update(INFO)
         here = np.array(point)
 
 
@@ -103,53 +104,53 @@ def through(hole, inward, off=(0.0, 0.0)):
     return ends if inward else ends[::-1]
 
 
-def test_passages_are_measured_from_the_holes_centre():
-    _, gauge = started()
+def test_crossings_are_measured_from_the_holes_centre():
+    _, monitor = started()
     pair = PAIRS["simple"][0]
-    lead_tip(gauge, *through(pair.entry, True, (3e-4, 4e-4)))
-    assert gauge.entry_error == pytest.approx(5e-4, abs=1e-6)
-    assert math.isnan(gauge.exit_error)
-    lead_tip(gauge, *through(pair.exit, False, (-1e-3, 0.0)))
-    assert gauge.exit_error == pytest.approx(1e-3, abs=1e-6)
-    assert not gauge.wrong_hole
+    lead_tip(monitor, *through(pair.entry, True, (3e-4, 4e-4)))
+    assert monitor.entry_error == pytest.approx(5e-4, abs=1e-6)
+    assert math.isnan(monitor.exit_error)
+    lead_tip(monitor, *through(pair.exit, False, (-1e-3, 0.0)))
+    assert monitor.exit_error == pytest.approx(1e-3, abs=1e-6)
+    assert not monitor.wrong_hole
 
 
 def test_another_stitchs_hole_is_the_wrong_one_until_the_right_exit():
-    _, gauge = started()
+    _, monitor = started()
     pairs = PAIRS["simple"]
-    lead_tip(gauge, *through(pairs[2].entry, True))
-    assert gauge.wrong_hole and math.isnan(gauge.entry_error)
+    lead_tip(monitor, *through(pairs[2].entry, True))
+    assert monitor.wrong_hole and math.isnan(monitor.entry_error)
     lead_tip(
-        gauge,
+        monitor,
         *through(pairs[2].entry, False),
         *through(pairs[0].entry, True),
         *through(pairs[0].exit, False),
     )
-    assert not gauge.wrong_hole
+    assert not monitor.wrong_hole
 
 
 def test_the_exit_from_outside_is_the_wrong_hole():
-    _, gauge = started()
-    lead_tip(gauge, *through(PAIRS["simple"][0].exit, True))
-    assert gauge.wrong_hole
+    _, monitor = started()
+    lead_tip(monitor, *through(PAIRS["simple"][0].exit, True))
+    assert monitor.wrong_hole
 
 
 def test_the_holes_of_the_chosen_pair_are_the_right_ones():
-    _, gauge = started(scene=SceneConfig(hole_pair=3))
-    lead_tip(gauge, *through(PAIRS["simple"][2].entry, True))
-    assert gauge.entry_error == pytest.approx(0.0, abs=1e-6)
-    assert not gauge.wrong_hole
+    _, monitor = started(scene=SceneConfig(hole_pair=3))
+    lead_tip(monitor, *through(PAIRS["simple"][2].entry, True))
+    assert monitor.entry_error == pytest.approx(0.0, abs=1e-6)
+    assert not monitor.wrong_hole
 
 
 def test_holes_move_with_a_shifted_phantom():
-    env, gauge = started(randomisation=RandomisationConfig(phantom_shift=5.0))
-    lead_tip(gauge, *through(env.stitch.pair.entry, True))
-    assert gauge.entry_error == pytest.approx(0.0, abs=1e-6)
+    env, monitor = started(randomisation=RandomisationConfig(phantom_shift=5.0))
+    lead_tip(monitor, *through(env.stitch.pair.entry, True))
+    assert monitor.entry_error == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_jump_is_no_passage():
-    _, gauge = started()
-    simulation = gauge._env.simulation
+def test_a_jump_is_no_crossing():
+    _, monitor = started()
+    simulation = monitor._env.simulation
     for point in through(PAIRS["simple"][0].entry, True) * 1.0 + np.array(
         [[0, 0, 2e-3], [0, 0, -2e-3]]
     ):
@@ -157,14 +158,16 @@ def test_a_jump_is_no_passage():
         pose[:3] += point - np.array(simulation.needle_point(needle.TIP_ANGLE))
         simulation.pose_needle(tuple(pose))
         simulation.refresh()
-        gauge.look(INFO)
-    assert math.isnan(gauge.entry_error)
+        monitor.update(INFO)
+    assert math.isnan(monitor.entry_error)
 
 
 def test_crossing_has_a_direction_and_an_opening():
     hole = PAIRS["simple"][0].entry
     out, into = through(hole, True)
-    assert crossing(tuple(out), tuple(into), hole, inward=True) == pytest.approx(0.0, abs=1e-9)
+    assert crossing(tuple(out), tuple(into), hole, inward=True) == pytest.approx(
+        (0.0, 0.0), abs=1e-9
+    )
     assert crossing(tuple(out), tuple(into), hole, inward=False) is None
     assert crossing(tuple(into), tuple(out), hole, inward=True) is None
     beside = through(hole, True, (0.0, 0.51 * OPENING))
@@ -173,12 +176,13 @@ def test_crossing_has_a_direction_and_an_opening():
 
 def test_the_thread_does_not_press():
     bare, threaded = (
-        Plate(envs.make(TaskConfig(scene=SceneConfig(thread=count))).model) for count in (0, 10)
+        ForcePlate(envs.make(TaskConfig(scene=SceneConfig(thread=count))).model)
+        for count in (0, 10)
     )
     assert threaded._model.ngeom > bare._model.ngeom
     assert threaded._presses.sum() == bare._presses.sum()
 
 
 def test_the_needle_is_held_by_either_arm():
-    held = {task: started(task)[1].held() for task in ("grasp", "place", "handoff", "pullout")}
+    held = {task: started(task)[1].is_held() for task in ("grasp", "place", "handoff", "pullout")}
     assert held == {"grasp": False, "place": True, "handoff": True, "pullout": True}
