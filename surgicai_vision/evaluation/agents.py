@@ -1,7 +1,6 @@
 """Agents: the expert, the baselines, blind replay, and a policy with its frozen encoder."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, final
 
@@ -19,6 +18,7 @@ from surgicai_vision.evaluation.agent import (
     Observation,
     frame_of,
 )
+from surgicai_vision.training.threads import one_thread
 
 if TYPE_CHECKING:
     from encoders.base import Encoder
@@ -255,16 +255,3 @@ def _image(observation: Observation, view: str) -> NDArray[np.uint8]:
 
         return grey(frame_of(observation, view))
     return frame_of(observation, view)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch compute with one thread: processes share the cores, and sums keep their order."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

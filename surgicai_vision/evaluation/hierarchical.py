@@ -34,9 +34,10 @@ from surgicai_vision.core.config import DWELL, TaskConfig, digest, to_mapping
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.evaluation import lerobot_agent
 from surgicai_vision.evaluation.agent import Actions, Agent, Env, FeatureTable, Observation
-from surgicai_vision.evaluation.agents import BASELINES, PolicyAgent, one_thread
+from surgicai_vision.evaluation.agents import BASELINES, PolicyAgent
 from surgicai_vision.evaluation.policy_spec import Subject, checkpoint_subject, policy_agent
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
+from surgicai_vision.training.threads import one_thread
 
 ORDER = "order"
 GRASP = names.SUBTASKS.index("grasp")

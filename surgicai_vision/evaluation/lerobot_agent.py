@@ -33,9 +33,9 @@ from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, chec
 from surgicai_vision.core.files import read_json, sha256_file
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.evaluation.agent import Actions, Agent, Env, Observation, frame_of
-from surgicai_vision.evaluation.agents import one_thread
 from surgicai_vision.evaluation.policy_spec import Subject
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
+from surgicai_vision.training.threads import one_thread
 
 CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
 PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")

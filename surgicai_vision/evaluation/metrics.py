@@ -14,7 +14,7 @@ from surgicai_vision.core import names
 from surgicai_vision.evaluation.statistics import clopper_pearson, mean_and_std
 
 KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
-"""Kinds of failure, see `failure_kind`."""
+"""Kinds of failure, see `failure_kind`, in the order in which charts stack them."""
 
 ON_SUCCESSES = (("trajectory_length_mm", "trajectory_length_mm"), ("time_steps", "steps"))
 """Key of a summary → column it averages over the successes."""

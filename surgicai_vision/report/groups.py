@@ -14,12 +14,10 @@ from typing import Any
 import numpy as np
 
 from surgicai_vision.evaluation import statistics
+from surgicai_vision.evaluation.metrics import KINDS
 from surgicai_vision.report import text
 from surgicai_vision.report.experiment_key import Condition, order
 from surgicai_vision.report.reader import Collected, Missing, Result
-
-KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
-"""Kinds of failure in the order in which charts stack them."""
 
 MEASURES = (
     ("d_trans_mm", "position error", "mm", "distance to the goal when the episode ends"),

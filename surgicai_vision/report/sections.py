@@ -6,10 +6,11 @@ from markupsafe import Markup
 
 from surgicai_vision.core import names
 from surgicai_vision.core.tasks import task_names
+from surgicai_vision.evaluation.metrics import KINDS
 from surgicai_vision.evaluation.statistics import clopper_pearson
 from surgicai_vision.report import charts, paper, text
 from surgicai_vision.report.experiment_key import Condition
-from surgicai_vision.report.groups import KINDS, MEASURES, Group, of_task
+from surgicai_vision.report.groups import MEASURES, Group, of_task
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.paper_comparison import beside_paper, our_text, paper_text
 

@@ -12,11 +12,12 @@ from typing import Any
 
 from surgicai_vision.core import files
 from surgicai_vision.evaluation import statistics
+from surgicai_vision.evaluation.metrics import KINDS
 from surgicai_vision.evaluation.storage import parquet_bytes
 from surgicai_vision.report import text
 from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.formats import latex, markdown
-from surgicai_vision.report.groups import KINDS, MEASURES, Group, measured
+from surgicai_vision.report.groups import MEASURES, Group, measured
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.paper_comparison import paper_rate
 from surgicai_vision.report.reader import REFERENCES, Result

@@ -25,8 +25,8 @@ import io
 import json
 import math
 import pickle
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,7 @@ from surgicai_vision.training.checkpoint import (
     write_checkpoint,
 )
 from surgicai_vision.training.data import cuts, over_places, split, with_clock
+from surgicai_vision.training.threads import one_thread
 
 REQUEST, STATE = "training.json", "training_state.pt"
 STATE_EVERY = 5  # epochs between training states: a broken-off training loses at most these
@@ -113,7 +114,7 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / REQUEST, request)
     _keep_memory()
-    with torch.random.fork_rng(devices=[]), _one_thread():
+    with torch.random.fork_rng(devices=[]), one_thread():
         checkpoint = _Training(task, start, torch.device(device)).run(
             out, save_every, progress, log
         )
@@ -130,19 +131,6 @@ def _keep_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(MMAP_THRESHOLD, 1 << 30)
         mallopt(TRIM_THRESHOLD, (1 << 31) - 1)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute with one thread: the network is small (threads cost more than they save, seventeen
-    times more on busy cores), and sums keep their order whatever the machine.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @dataclass(frozen=True)
