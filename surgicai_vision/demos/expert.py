@@ -39,12 +39,18 @@ from surgicai_vision.scene.rotations import matrix_to_rotvec, rotvec_to_matrix
 
 Matrix = NDArray[np.float64]
 
-HOVER, HANDOFF_BACK = 0.010, 0.009
-"""Where the jaws line up before they go in: above the needle, before the handoff grasp [m]."""
-OPEN_ABOVE, OPEN_HANDOFF = 0.35, 0.18
-"""Jaw angles [rad] wide enough for the needle and narrow enough for its neighbours."""
-ALIGNED, ALIGNED_ANGLE = 0.0006, math.radians(4.0)
-CLOSING, CLOSING_ANGLE = 0.002, math.radians(20.0)
+HOVER = 0.010
+"""Height over the needle at which the jaws line up before they go in [m]."""
+HANDOFF_BACK = 0.009
+"""Distance before the handoff grasp at which the jaws line up [m]."""
+OPEN_ABOVE = 0.35
+OPEN_HANDOFF = 0.18
+"""Jaw angles wide enough for the needle and narrow enough for its neighbours [rad]."""
+ALIGNED = 0.0006
+ALIGNED_ANGLE = math.radians(4.0)
+"""Off by less than this the jaws are lined up [m, rad]."""
+CLOSING = 0.002
+CLOSING_ANGLE = math.radians(20.0)
 """Off by less than this, jaws that are closing go on closing [m, rad]."""
 CLEAR = 0.004
 """Height of the needle's lowest point over the tissue at which it may turn and travel [m]."""

@@ -21,14 +21,7 @@ from typing import TYPE_CHECKING, Any
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, check_name
-from surgicai_vision.core.executor import (
-    Job,
-    RunContext,
-    building,
-    job,
-    run,
-    work_folder,
-)
+from surgicai_vision.core.executor import Job, RunContext, building, job, run, work_folder
 from surgicai_vision.core.files import (
     check_output,
     code_version,

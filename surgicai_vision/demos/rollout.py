@@ -85,6 +85,78 @@ class Disturbance:
 UNDISTURBED = Disturbance()
 
 
+class EpisodeRecorder:
+    """Records one episode step by step, with every state on the way.
+
+    Args:
+        env: the env, at its start state.
+        seed: seed of the start.
+        demonstrator: who demonstrates, as it is stored.
+
+    Attributes:
+        info: the info of the last step.
+        observation: the observation after it.
+        truncated: whether it was the last one within the episode's limit.
+    """
+
+    def __init__(self, env: "SuturingEnv", seed: int, demonstrator: str):
+        self.seed = seed
+        self.info: dict[str, Any] = {}
+        self.observation: Any = None
+        self.truncated = False
+        self._env = env
+        self._demonstrator = demonstrator
+        self._states = [env.get_state()]
+        self._rows: list[tuple[Any, ...]] = []
+
+    def __len__(self) -> int:
+        """Return the control steps so far."""
+        return len(self._rows)
+
+    @property
+    def success(self) -> bool:
+        """Return True if the last step met the task."""
+        return bool(self.info.get("is_success"))
+
+    @property
+    def is_physical(self) -> bool:
+        """Return True unless the physics diverged."""
+        return not self.info.get("physics_error")
+
+    def step(self, action: NDArray[np.float32], label: NDArray[np.float32] | None = None) -> bool:
+        """Take a step and return True if the env ended the episode.
+
+        Args:
+            action: the executed action (7,).
+            label: the demonstrator's action (7,) where it is another one.
+        """
+        phase = self._env.phase
+        self.observation, reward, terminated, self.truncated, self.info = self._env.step(action)
+        self._states.append(self._env.get_state())
+        success, contact = self.info["is_success"], self.info["contact"]
+        label = action if label is None else label
+        self._rows.append((label, action, phase, reward, success, contact))
+        return bool(terminated or self.truncated)
+
+    def demo(self, with_executed: bool = False) -> Demo:
+        """Return the episode as a demonstration, with the executed actions beside the labels."""
+        labels, actions, phases, rewards, successes, contacts = zip(*self._rows, strict=True)
+        return Demo(
+            config=self._env.config,
+            seed=self.seed,
+            demonstrator=self._demonstrator,
+            scene_hash=self._env.scene.hash,
+            code_version=code_version(),
+            state=np.stack(self._states).astype(np.float64),
+            action=np.stack(labels).astype(np.float32),
+            phase=np.asarray(phases, dtype=np.int8),
+            reward=np.asarray(rewards, dtype=np.float32),
+            success=np.asarray(successes, dtype=bool),
+            contact=np.asarray(contacts, dtype=bool),
+            executed=np.stack(actions) if with_executed else None,
+        )
+
+
 @dataclass(frozen=True)
 class Rollout:
     """One episode.
@@ -129,40 +201,23 @@ def rollout(
     if behaviour:
         behaviour.reset(env, seed, rng)
 
-    states = [env.get_state()]
-    rows: list[tuple[Any, ...]] = []
-    info: dict[str, Any] = {}
+    recorder = EpisodeRecorder(env, seed, name)
     steps_left = env.config.max_steps if demonstrator.persists else post_success_steps
     ended = False
     succeeded = False
     while not ended:
-        phase = env.phase
         label = np.asarray(demonstrator.action(), dtype=np.float32)
         executed = behaviour.action(env, observation) if behaviour else None
         if executed is None:
             executed = disturbance.disturb(label, deviation, rng) if deviation else label
-        observation, reward, _, truncated, info = env.step(executed)
-        states.append(env.get_state())
-        rows.append((label, executed, phase, reward, info["is_success"], info["contact"]))
+        recorder.step(executed, label)
+        observation = recorder.observation
         steps_left -= succeeded
-        succeeded = succeeded or bool(info["is_success"])
-        ended = (succeeded and steps_left <= 0) or truncated or info["physics_error"]
+        succeeded = succeeded or recorder.success
+        finished = succeeded and steps_left <= 0
+        ended = finished or recorder.truncated or not recorder.is_physical
 
-    labels, actions, phases, rewards, successes, contacts = zip(*rows, strict=True)
-    demo = Demo(
-        config=env.config,
-        seed=seed,
-        demonstrator=name,
-        scene_hash=env.scene.hash,
-        code_version=code_version(),
-        state=np.stack(states).astype(np.float64),
-        action=np.stack(labels),
-        phase=np.asarray(phases, dtype=np.int8),
-        reward=np.asarray(rewards, dtype=np.float32),
-        success=np.asarray(successes, dtype=bool),
-        contact=np.asarray(contacts, dtype=bool),
-        executed=np.stack(actions) if disturbance.noise or behaviour else None,
-    )
-    if info["physics_error"]:
+    demo = recorder.demo(with_executed=bool(disturbance.noise or behaviour))
+    if not recorder.is_physical:
         return Rollout(demo, False, "physics error")
-    return Rollout(demo, succeeded, "" if succeeded else f"no success in {len(labels)} steps")
+    return Rollout(demo, succeeded, "" if succeeded else f"no success in {len(demo)} steps")

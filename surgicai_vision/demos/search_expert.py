@@ -42,7 +42,8 @@ class SearchExpert(Demonstrator):
     SECOND_ATTEMPT_STEP = 100
     """Control step of the second attempt, since the expert's own grasp takes 70 to 85. Another
     follows every `CLOCK_PERIOD`, in which the clock that policies have goes round once."""
-    OPENING_STEPS, OPEN_JAW = 8, 0.22
+    OPENING_STEPS = 8
+    OPEN_JAW = 0.22
     """Control steps for which the jaws open before another attempt, and how far [rad], to slide
     along the needle.
 

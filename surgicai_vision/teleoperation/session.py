@@ -14,14 +14,9 @@ A session has no clock: the same inputs give the same files.
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from surgicai_vision.core import names
-from surgicai_vision.core.files import code_version
-from surgicai_vision.demos.store import Demo
+from surgicai_vision.demos.rollout import EpisodeRecorder
 from surgicai_vision.envs.base import SuturingEnv
-from surgicai_vision.envs.success import Info
 from surgicai_vision.teleoperation.input_mapping import InputMapping
 from surgicai_vision.teleoperation.inputs import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
 from surgicai_vision.teleoperation.recordings import DEMONSTRATOR, Recordings
@@ -86,61 +81,6 @@ class Status:
     contact: bool
     view: str
     fine: bool
-
-
-class Attempt:
-    """One episode under way.
-
-    Args:
-        env: the env, at its start state.
-        seed: of the start.
-    """
-
-    def __init__(self, env: SuturingEnv, seed: int):
-        self._env = env
-        self.seed = seed
-        self._states = [env.get_state()]
-        self._rows: list[tuple[NDArray[np.float32], int, float, bool, bool]] = []
-        self.info: Info = {}
-
-    def __len__(self) -> int:
-        """Return the control steps so far."""
-        return len(self._rows)
-
-    @property
-    def success(self) -> bool:
-        """Return True if the last step met the task."""
-        return bool(self.info.get("is_success"))
-
-    @property
-    def is_physical(self) -> bool:
-        """Return True unless the physics diverged; such an attempt is never kept."""
-        return not self.info.get("physics_error")
-
-    def step(self, action: np.ndarray) -> bool:
-        """Take one step; return True if the episode is over."""
-        phase = self._env.phase
-        _, reward, terminated, truncated, self.info = self._env.step(action)
-        self._states.append(self._env.get_state())
-        self._rows.append((action, phase, reward, self.info["is_success"], self.info["contact"]))
-        return bool(terminated or truncated)
-
-    def demo(self) -> Demo:
-        """Return the episode as a demonstration."""
-        action, phase, reward, success, contact = zip(*self._rows, strict=True)
-        return Demo(
-            config=self._env.config,
-            seed=self.seed,
-            demonstrator=DEMONSTRATOR,
-            scene_hash=self._env.scene.hash,
-            code_version=code_version(),
-            state=np.stack(self._states).astype(np.float64),
-            action=np.stack(action).astype(np.float32),
-            phase=np.asarray(phase, dtype=np.int8),
-            reward=np.asarray(reward, dtype=np.float32),
-            success=np.asarray(success, dtype=bool),
-            contact=np.asarray(contact, dtype=bool),
-        )
 
 
 class Session:
@@ -309,7 +249,7 @@ class Session:
         """Wait at the start of `seed`."""
         self.env.reset(seed=seed)
         self._mapping.reset()
-        self._attempt = Attempt(self.env, seed)
+        self._attempt = EpisodeRecorder(self.env, seed, DEMONSTRATOR)
         self._attempt.info = self.env.measure()
         self._was_released = False
         self._state = WAITING

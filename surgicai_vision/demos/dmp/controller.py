@@ -26,13 +26,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.names import SUTURE
 from surgicai_vision.demos.demonstrator import Demonstrator
-from surgicai_vision.demos.dmp.fit import (
-    CARRY_PHASES,
-    CarryPhase,
-    SubtaskFit,
-    as_pose,
-    fit_subtask,
-)
+from surgicai_vision.demos.dmp.fit import CARRY_PHASES, CarryPhase, SubtaskFit, as_pose, fit_subtask
 from surgicai_vision.demos.dmp.primitive import Execution
 from surgicai_vision.demos.expert import (
     ALIGNED,

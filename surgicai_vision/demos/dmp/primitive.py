@@ -41,9 +41,11 @@ from surgicai_vision.core.errors import InputError
 Array = NDArray[np.float64]
 
 ALPHA = 25.0
-BETA, GAMMA = ALPHA / 4, ALPHA / 3
+BETA = ALPHA / 4
+GAMMA = ALPHA / 3
 KERNELS = 80
-PAUSE_SPEED, PAUSE_TURN_RATE = 0.2e-3, math.radians(0.1)
+PAUSE_SPEED = 0.2e-3
+PAUSE_TURN_RATE = math.radians(0.1)
 """Slower than both a sample is a pause [m/s, rad/s] (Zhou et al., ISMR 2024)."""
 MIN_SAMPLES = 5
 """Samples that a shape needs; from fewer only the way from start to goal is learned."""

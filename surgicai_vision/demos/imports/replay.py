@@ -122,7 +122,9 @@ def _grasp(task: str) -> np.ndarray:
     The jaws come down the normal of the needle's plane; PSM1 closes along -radial, PSM2 along
     +radial.
     """
-    angle, sign = (GRASP_ANGLE, 1.0) if task == "grasp" else (HANDOFF_ANGLE, -1.0)
+    is_grasp = task == "grasp"
+    angle = GRASP_ANGLE if is_grasp else HANDOFF_ANGLE
+    sign = 1.0 if is_grasp else -1.0
     pose = np.eye(4)
     y = sign * needle.radial(angle)
     z = np.array([0.0, 0.0, -1.0])
@@ -136,10 +138,12 @@ def _needle_at_goal(task: str) -> np.ndarray:
     pair = PAIRS["simple"][0]
     # Columns: radial, tangent and normal of the needle's point, in the hole's frame.
     if task == "place":
-        hole, angle = pair.entry.pose, needle.TIP_ANGLE
+        hole = pair.entry.pose
+        angle = needle.TIP_ANGLE
         target = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     else:
-        hole, angle = pair.exit.pose, INSERT_ANGLE
+        hole = pair.exit.pose
+        angle = INSERT_ANGLE
         target = np.array([[-1.0, 0, 0, INSERT_DEPTH], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     point = np.eye(4)
     point[:3, 0] = -needle.radial(angle)
@@ -153,9 +157,8 @@ def grip_error(episode: Episode, task: str) -> float:
     if task not in ("place", "insert"):
         return 0.0
     base = kinematics.base_in_world(names.ACTIVE_ARM[task])
-    x, y, z = (np.linalg.inv(needle_path(episode, task)[0]) @ base @ pose_matrix(episode.pose[0]))[
-        :3, 3
-    ]
+    tip = base @ pose_matrix(episode.pose[0])
+    x, y, z = (np.linalg.inv(needle_path(episode, task)[0]) @ tip)[:3, 3]
     radial = abs(np.hypot(x, y) - needle.RADIUS) - RADIAL_SLACK
     return float(max(radial, DEPTHS[0] - z, z - DEPTHS[1], 0.0))
 
@@ -260,7 +263,8 @@ class Replay:
                 np.broadcast_to(tip, track.needle.shape),
                 np.full(len(track.needle), jaw),
             )
-        states, infos = [], []
+        states = []
+        infos = []
         for index, needle_pose in enumerate(track.needle):
             poses = {arm: (tip[index], float(jaw[index])) for arm, (tip, jaw) in arms.items()}
             pose_scene(env, **poses, T_world_needle=needle_pose)

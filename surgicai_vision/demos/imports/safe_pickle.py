@@ -33,47 +33,20 @@ MAX_DEPTH = 16
 _NUMPY = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248])")
 
 _STRINGS = (
-    "STRING",
-    "BINSTRING",
-    "SHORT_BINSTRING",
-    "UNICODE",
-    "SHORT_BINUNICODE",
-    "BINUNICODE",
+    "STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "SHORT_BINUNICODE", "BINUNICODE",
     "BINUNICODE8",
-)
-_OPCODES = frozenset(
-    (
-        *_STRINGS,
-        *("PROTO", "FRAME", "STOP", "MARK", "POP", "POP_MARK", "DUP"),
-        *(
-            "NONE",
-            "NEWTRUE",
-            "NEWFALSE",
-            "INT",
-            "BININT",
-            "BININT1",
-            "BININT2",
-            "LONG",
-            "LONG1",
-            "LONG4",
-        ),
-        *("FLOAT", "BINFLOAT", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
-        *(
-            "EMPTY_LIST",
-            "LIST",
-            "APPEND",
-            "APPENDS",
-            "EMPTY_TUPLE",
-            "TUPLE",
-            "TUPLE1",
-            "TUPLE2",
-            "TUPLE3",
-        ),
-        *("EMPTY_DICT", "DICT", "SETITEM", "SETITEMS"),
-        *("GET", "BINGET", "LONG_BINGET", "PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"),
-        *("GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD"),
-    )
-)
+)  # fmt: skip
+_OPCODES = frozenset((
+    *_STRINGS,
+    "PROTO", "FRAME", "STOP", "MARK", "POP", "POP_MARK", "DUP",
+    "NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4",
+    "FLOAT", "BINFLOAT", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8",
+    "EMPTY_LIST", "LIST", "APPEND", "APPENDS",
+    "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3",
+    "EMPTY_DICT", "DICT", "SETITEM", "SETITEMS",
+    "GET", "BINGET", "LONG_BINGET", "PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE",
+    "GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD",
+))  # fmt: skip
 """Instructions a pickle of arrays and containers needs; those that make instances, extensions or
 persistent objects are not among them."""
 
@@ -115,7 +88,8 @@ class _Dtype:
     __slots__ = ("code", "order")
 
     def __init__(self, code: str):
-        self.code, self.order = code, "="
+        self.code = code
+        self.order = "="
 
     def __setstate__(self, state: Any) -> None:
         plain = (
@@ -226,7 +200,8 @@ def _inspect(content: bytes) -> None:
     """List the pickle's instructions without running them; refuse what is not `ADMITTED`."""
     strings: list[str] = []
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
-        name, text = opcode.name, str(argument)
+        name = opcode.name
+        text = str(argument)
         if name not in _OPCODES:
             if name in ("INST", "PERSID", "BINPERSID"):
                 _refuse(f"it names '{text}', and only numpy arrays are admitted")

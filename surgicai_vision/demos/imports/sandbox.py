@@ -44,28 +44,11 @@ MAX_WRITTEN = 2**30
 """Limit of the child's one file [byte]."""
 
 REFUSED = (
-    "socket.",
-    "subprocess.",
-    "os.system",
-    "os.exec",
-    "os.fork",
-    "os.posix_spawn",
-    "os.spawn",
-    "ctypes.",
-    "pty.",
-    "os.chmod",
-    "os.kill",
-    "os.link",
-    "os.mkdir",
-    "os.remove",
-    "os.rename",
-    "os.rmdir",
-    "os.symlink",
-    "os.truncate",
-    "shutil.",
-    "tempfile.",
-)
-"""Audit events (by their beginning) that end the child."""
+    "socket.", "subprocess.", "os.system", "os.exec", "os.fork", "os.posix_spawn", "os.spawn",
+    "ctypes.", "pty.", "os.chmod", "os.kill", "os.link", "os.mkdir", "os.remove", "os.rename",
+    "os.rmdir", "os.symlink", "os.truncate", "shutil.", "tempfile.",
+)  # fmt: skip
+"""Prefixes of the audit events that end the child."""
 
 
 def read_sandboxed(path: Path, kind: str = "surgicai", **options: JSON) -> dict[str, np.ndarray]:

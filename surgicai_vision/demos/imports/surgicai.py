@@ -24,13 +24,7 @@ from surgicai_vision.core.errors import BadFile, InputError, UnreachablePose, ch
 from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output, code_version, sha256_file, whole_folder
 from surgicai_vision.core.progress import Progress, silent
-from surgicai_vision.demos.imports.replay import (
-    Episode,
-    Replay,
-    fitting_step,
-    grip_error,
-    trimmed,
-)
+from surgicai_vision.demos.imports.replay import Episode, Replay, fitting_step, grip_error, trimmed
 from surgicai_vision.demos.imports.sandbox import read_sandboxed
 from surgicai_vision.demos.record import finished
 from surgicai_vision.demos.store import MARKER, list_demos, read_marker, write_demo, write_marker
@@ -155,7 +149,8 @@ def split(arrays: Mapping[str, np.ndarray]) -> list[Episode]:
     start = 0
     for number, end in enumerate(ends):
         rows = slice(start, end + 1)
-        before, after = arrays["observation"][rows], arrays["next_observation"][rows]
+        before = arrays["observation"][rows]
+        after = arrays["next_observation"][rows]
         if not np.allclose(after[:-1, :7], before[1:, :7], atol=1e-4):
             raise BadFile(
                 f"The recording jumps inside episode {number}: "

@@ -177,9 +177,9 @@ def _times(arrays: Arrays, config: BagConfig) -> dict[str, np.ndarray]:
 def _distinct(times: np.ndarray, values: np.ndarray, begin: int) -> tuple[np.ndarray, np.ndarray]:
     """Return increasing times since `begin` [ns] and their values, of a repeated time the last."""
     order = np.argsort(times, kind="stable")
-    since, values = (times[order] - begin).astype(np.float64), values[order]
+    since = (times[order] - begin).astype(np.float64)
     last = np.append(np.diff(since) > 0, True)
-    return since[last], values[last]
+    return since[last], values[order][last]
 
 
 def _covered(times: np.ndarray, grid: np.ndarray, gap: float) -> np.ndarray:

@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.demos.dmp.primitive import PAUSE_SPEED, PAUSE_TURN_RATE
 from surgicai_vision.demos.imports.rosbag.config import NOTHING, BagConfig
 from surgicai_vision.demos.imports.rosbag.resample import RATE, Recording
 from surgicai_vision.envs import hole_crossing, poses
@@ -37,22 +38,27 @@ from surgicai_vision.scene.holes import HolePair
 from surgicai_vision.scene.kinematics import Pose
 from surgicai_vision.scene.rotations import geodesic_angle
 
-HOLD_JAW, HOLD_REACH, STILL = 0.2, 0.003, 0.02
-"""An arm holds the needle with its finger below this angle [rad], the needle this near its grasp
-point [m], and the finger not closing by more than this in the next 0.2 s [rad]."""
+HOLD_JAW = 0.2
+"""An arm that holds the needle has its finger below this angle [rad]."""
+HOLD_REACH = 0.003
+"""An arm that holds the needle has it this near its grasp point [m]."""
+STILL = 0.02
+"""The finger of an arm that holds the needle closes by less than this in the next 0.2 s [rad]."""
 SUSTAINED = 5
 """Samples an event must last: 0.1 s."""
 SHORTEST = 10
 """Samples of the shortest segment that is taken: 0.2 s."""
-ARRIVED, ARRIVED_TURN = 0.0005, np.radians(2.0)
+ARRIVED = 0.0005
+ARRIVED_TURN = np.radians(2.0)
 """The needle has arrived when it is this near to where PSM1 takes it [m, rad]."""
-SLOW, SLOW_TURN, SLOW_JAW = 0.2e-3, np.radians(0.1), np.radians(1.0)
-"""Below these speeds an arm rests [m/s, rad/s]; the first two are the paper's."""
+PAUSE_JAW_RATE = np.radians(1.0)
+"""A jaw that is slower rests [rad/s]."""
 WINDOW = 5
 """Speeds are taken over this many samples to either side, 0.2 s in all: less would be the sensors'
 noise.
 """
-DRIFT, DRIFT_TURN = 0.25e-3, np.radians(1.0)
+DRIFT = 0.25e-3
+DRIFT_TURN = np.radians(1.0)
 """A resting arm's sample is kept once it has crept this far from the last one kept: half a step."""
 
 
@@ -294,9 +300,9 @@ def moving(tip: np.ndarray, jaw: np.ndarray) -> np.ndarray:
     speed = np.linalg.norm(tip[after, :3, 3] - tip[before, :3, 3], axis=1) / time
     turning = (turns[after] * turns[before].inv()).magnitude() / time
     active = (
-        (speed >= SLOW)
-        | (turning >= SLOW_TURN)
-        | (np.abs(jaw[after] - jaw[before]) / time >= SLOW_JAW)
+        (speed >= PAUSE_SPEED)
+        | (turning >= PAUSE_TURN_RATE)
+        | (np.abs(jaw[after] - jaw[before]) / time >= PAUSE_JAW_RATE)
     )
     kept = [0]
     for index in range(1, count):
