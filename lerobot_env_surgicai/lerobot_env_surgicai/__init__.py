@@ -1,8 +1,7 @@
-"""LeRobot plug-in: importing it registers env type `surgicai`, policy type `surgicai_bc` and the
-gymnasium ids.
+"""LeRobot plug-in: importing it registers the env `surgicai` and the policy `surgicai_bc`.
 
-`lerobot-train` and `lerobot-eval` import every distribution called `lerobot_env_…`, and so does a
-worker process that is handed an env of ours; nothing else is needed.
+The gymnasium ids come with them. `lerobot-train` and `lerobot-eval` import every distribution
+called `lerobot_env_…`, and so does a worker process that is handed an env of ours.
 """
 
 from lerobot_env_surgicai.configuration_surgicai_bc import SurgicaiBcConfig

@@ -1,13 +1,13 @@
 """`surgicai_bc`: behaviour cloning on frozen features, as a LeRobot policy: its settings."""
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
-from lerobot.configs import FeatureType, NormalizationMode
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.optim import AdamConfig
 from lerobot.utils.constants import OBS_STATE
 
+from policies.base import Recipe
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names, check_camera
 from surgicai_vision.core.errors import InputError
@@ -65,15 +65,15 @@ class SurgicaiBcConfig(PreTrainedConfig):
             check_camera(view)
         self.recipe()
 
-    def recipe(self) -> Any:
+    def recipe(self) -> Recipe:
         """Return the same settings as a recipe of `bc`."""
-        changes = {
-            "hidden": self.hidden,
-            "batch_norm": self.batch_norm,
-            "proprioception": self.proprioception,
-            "learning_rate": self.learning_rate,
-        }
-        return policies.load_recipe("bc", "paper", changes)
+        return replace(
+            policies.load_recipe("bc", "paper"),
+            hidden=tuple(self.hidden),
+            batch_norm=self.batch_norm,
+            proprioception=self.proprioception,
+            learning_rate=self.learning_rate,
+        )
 
     def validate_features(self) -> None:
         """Keep the inputs this policy takes and drop the rest (depth, segmentation, other views).
@@ -82,7 +82,7 @@ class SurgicaiBcConfig(PreTrainedConfig):
             InputError: the dataset or env lacks one of them, or acts otherwise than we do.
         """
         # mypy skips its base
-        given: dict[str, Any] = self.input_features or {}  # type: ignore[has-type]
+        given: dict[str, PolicyFeature] = self.input_features or {}  # type: ignore[has-type]
         kept = {key: given[key] for key in self._wanted(given) if key in given}
         missing = [key for key in self._wanted(given) if key not in given]
         if missing or not kept:
@@ -96,7 +96,7 @@ class SurgicaiBcConfig(PreTrainedConfig):
             )
         self.input_features = kept
 
-    def _wanted(self, given: dict[str, Any]) -> list[str]:
+    def _wanted(self, given: dict[str, PolicyFeature]) -> list[str]:
         """Return the keys of the inputs, images first."""
         state = [OBS_STATE] if self.proprioception else []
         if not self.encoder:

@@ -1,7 +1,6 @@
 """EncodeViews: the step between env and policy that turns images into frozen features."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
@@ -15,8 +14,9 @@ from surgicai_vision.core import names
 @ProcessorStepRegistry.register("surgicai_encode_views")
 @dataclass
 class EncodeViews(ObservationProcessorStep):
-    """Replace the views' images by their features, `observation.environment_state` (B, views ×
-    dim).
+    """Replace the views' images by their features.
+
+    They are `observation.environment_state`, (B, views × dim).
 
     Attributes:
         encoder: the encoder's name.
@@ -30,7 +30,7 @@ class EncodeViews(ObservationProcessorStep):
     weights: str | None = None
     sha256: str = ""
 
-    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+    def observation(self, observation: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Return the observation with features in place of images."""
         encoder = load_encoder(self.encoder, self.weights, "global")
         check_identity(encoder, self.sha256, "", "The policy")
@@ -41,7 +41,7 @@ class EncodeViews(ObservationProcessorStep):
             OBS_ENV_STATE: features,
         }
 
-    def get_config(self) -> dict[str, Any]:
+    def get_config(self) -> dict[str, object]:
         """Return the arguments of this step."""
         return {
             "encoder": self.encoder,

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
@@ -21,7 +22,6 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
-from numpy.typing import NDArray
 
 from lerobot_env_surgicai.encoding import EncodeViews
 from surgicai_vision.core import names
@@ -31,7 +31,8 @@ from surgicai_vision.core.tasks import env_id
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.features import encoders
 
-AGENT_POS, FEATURES = "agent_pos", "environment_state"
+AGENT_POS = "agent_pos"
+FEATURES = "environment_state"
 TASK_FIELDS = tuple(field.name for field in dataclasses.fields(TaskConfig))
 
 
@@ -99,7 +100,8 @@ class SurgicaiEnv(EnvConfig):
         features: dict[str, Any] = {}
         if self.dataset:
             dataset = open_dataset(Path(self.dataset))
-            config, image_size = dataset.config, dataset.image_size
+            config = dataset.config
+            image_size = dataset.image_size
             features = dataset.meta.get("features") or {}
             cameras = list(features.get("views", dataset.views))
         for key in TASK_FIELDS:
@@ -108,7 +110,8 @@ class SurgicaiEnv(EnvConfig):
         self.cameras = list(self.cameras or cameras)
         self.image_size = self.image_size or image_size
         if self.encoder is None and features:
-            self.encoder, self.encoder_sha256 = features["encoder"], features["weights_sha256"]
+            self.encoder = features["encoder"]
+            self.encoder_sha256 = features["weights_sha256"]
         self.dataset = None
 
     @property
@@ -127,8 +130,9 @@ class SurgicaiEnv(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Return the arguments of `gymnasium.make`; its step limit gives LeRobot
-        `_max_episode_steps`.
+        """Return the arguments of `gymnasium.make`.
+
+        Its step limit gives LeRobot `_max_episode_steps`.
         """
         config = to_mapping(self.task_config())
         del config["task"], config["max_steps"]
@@ -190,7 +194,7 @@ class NestImages(gymnasium.ObservationWrapper):
             {"pixels": spaces.Dict(images), AGENT_POS: flat[AGENT_POS]}
         )
 
-    def observation(self, observation: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    def observation(self, observation: dict[str, np.ndarray]) -> dict[str, object]:
         """Return the observation with its images under "pixels"."""
         images = {view: frame for view, frame in observation.items() if view != AGENT_POS}
         return {"pixels": images, AGENT_POS: observation[AGENT_POS]}

@@ -3,11 +3,12 @@
 import functools
 import hashlib
 from collections.abc import Mapping, Sequence
-from typing import Any, final
+from typing import Protocol, final
 
 import numpy as np
 import torch
 
+from encoders.base import Encoder
 from surgicai_vision.core import names
 from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError
@@ -15,15 +16,23 @@ from surgicai_vision.features import encoders
 from surgicai_vision.training.checkpoint import SEEN
 
 
+class FrameEncoder(Protocol):
+    """What encodes frames: an encoder, or a `FeatureMemory` of one."""
+
+    def __call__(self, frames: np.ndarray) -> np.ndarray:
+        """Return the features (B, dim) float32 of images (B, H, W, 3) uint8."""
+
+
 @functools.lru_cache(maxsize=2)
-def load_encoder(name: str, weights: str | None, pool: str) -> Any:
+def load_encoder(name: str, weights: str | None, pool: str) -> Encoder:
     """Load a frozen encoder, once a process for each choice."""
     return encoders.load_encoder(name, pool, encoders.WeightsSource.of(weights))
 
 
-def identity(encoder: Any) -> str:
-    """sha256 (hex) over an encoder's weights, preprocessing and pool: what a policy trained on it
-    depends on.
+def identity(encoder: Encoder) -> str:
+    """Return a sha256 (hex) of what a policy trained on an encoder depends on.
+
+    It is over the weights, the preprocessing and the pool.
     """
     card = to_mapping(encoder.card)
     plain = {
@@ -34,30 +43,31 @@ def identity(encoder: Any) -> str:
     return digest(plain)
 
 
-def check_identity(encoder: Any, weights_sha256: str, wanted: str, where: str) -> None:
+def check_identity(encoder: Encoder, weights_sha256: str, wanted: str, where: str) -> None:
     """Refuse an encoder other than the one a policy was trained on; `wanted` is its `identity`."""
     if weights_sha256 and encoder.weights_sha256 != weights_sha256:
         raise InputError(
-            f"{where} was trained on encoder '{encoder.card.name}' with weights sha256 {weights_sha256}, got "
-            f"{encoder.weights_sha256}; hand over the same file."
+            f"{where} was trained on encoder '{encoder.card.name}' with weights sha256 "
+            f"{weights_sha256}, got {encoder.weights_sha256}; hand over the same file."
         )
     if wanted and identity(encoder) != wanted:
         raise InputError(
-            f"{where} was trained on encoder '{encoder.card.name}' with another preprocessing or pool; "
-            "use the version of surgicai-vision it was trained with."
+            f"{where} was trained on encoder '{encoder.card.name}' with another preprocessing or "
+            "pool; use the version of surgicai-vision it was trained with."
         )
 
 
 def as_uint8(images: torch.Tensor) -> np.ndarray:
-    """Return (B, 3, H, W) float images in [0, 1] as (B, H, W, 3) uint8; exact for images that were
-    uint8.
+    """Return (B, 3, H, W) float images in [0, 1] as (B, H, W, 3) uint8.
+
+    Images that were uint8 come back exactly.
     """
     rounded = (images.detach().float() * 255).round().clamp(0, 255).to(torch.uint8)
     return rounded.permute(0, 2, 3, 1).contiguous().cpu().numpy()
 
 
 @final
-class Remembered:
+class FeatureMemory:
     """An encoder that encodes an image once: LeRobot shows every image anew in each epoch.
 
     An image is known by the hash of its bytes, so another dataset or an augmented image is never
@@ -69,8 +79,10 @@ class Remembered:
         limit: bytes of features to keep; images beyond it are encoded each time.
     """
 
-    def __init__(self, encoder: Any, limit: int = 2 << 30):
-        self._encoder, self._rows, self._left = encoder, dict[bytes, np.ndarray](), limit
+    def __init__(self, encoder: FrameEncoder, limit: int = 2 << 30):
+        self._encoder = encoder
+        self._rows: dict[bytes, np.ndarray] = {}
+        self._left = limit
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
         """Return the features (B, dim) float32 of images (B, H, W, 3) uint8."""
@@ -85,13 +97,16 @@ class Remembered:
             fresh = dict(zip(new, rows, strict=True))
             for key, row in fresh.items():
                 if self._left >= row.nbytes:
-                    self._rows[key], self._left = row.copy(), self._left - row.nbytes
+                    self._rows[key] = row.copy()
+                    self._left -= row.nbytes
         return np.stack([fresh[key] if key in fresh else self._rows[key] for key in keys]).astype(
             np.float32
         )
 
 
-def encode(encoder: Any, batch: Mapping[str, torch.Tensor], views: Sequence[str]) -> np.ndarray:
+def encode(
+    encoder: FrameEncoder, batch: Mapping[str, torch.Tensor], views: Sequence[str]
+) -> np.ndarray:
     """Return the features of the views side by side, (B, views × dim) float32."""
     return np.concatenate(
         [encoder(as_uint8(batch[names.image_key(view)])) for view in views], axis=1

@@ -6,6 +6,7 @@ whenever the policy is loaded.
 """
 
 import copy
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,19 @@ import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import SafetensorError
-from torch import Tensor
+from torch import Tensor, nn
 
+from encoders.base import Encoder
 from lerobot_env_surgicai.configuration_surgicai_bc import SurgicaiBcConfig
-from lerobot_env_surgicai.images import Remembered, check_identity, encode, identity, load_encoder
+from lerobot_env_surgicai.images import (
+    FeatureMemory,
+    FrameEncoder,
+    check_identity,
+    encode,
+    identity,
+    load_encoder,
+)
+from policies.base import Policy
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.training import policies
@@ -35,11 +45,11 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
     name = "surgicai_bc"
     memoryless = True
 
-    def __init__(self, config: SurgicaiBcConfig, **_: Any):
+    def __init__(self, config: SurgicaiBcConfig, **_: object):
         super().__init__(config)
         config.validate_features()
-        self._encoder: Any = None
-        self._training_encoder: Any = None
+        self._encoder: Encoder | None = None
+        self._training_encoder: FeatureMemory | None = None
         visual: tuple[tuple[int, ...], ...] = ()
         if config.encoder:
             self._encoder = load_encoder(
@@ -48,19 +58,17 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
             check_identity(
                 self._encoder, config.encoder_sha256, config.encoder_identity, "surgicai_bc"
             )
-            config.encoder_sha256, config.encoder_identity = (
-                self._encoder.weights_sha256,
-                identity(self._encoder),
-            )
-            self._training_encoder = Remembered(self._encoder)
+            config.encoder_sha256 = self._encoder.weights_sha256
+            config.encoder_identity = identity(self._encoder)
+            self._training_encoder = FeatureMemory(self._encoder)
             visual = (self._encoder.shape,) * len(config.views)
         self.network = policies.policy_plugin("bc").make(config.recipe(), visual)
-        self._acting: Any = None
+        self._acting: Policy | None = None
 
     @classmethod
     def from_pretrained(
         cls, pretrained_name_or_path: str | Path, *, strict: bool = True, **arguments: Any
-    ) -> Any:
+    ) -> "SurgicaiBcPolicy":
         """Load a policy; unlike LeRobot's own, a tensor that is missing or unexpected is an error.
 
         Raises:
@@ -75,7 +83,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
                 f"{pretrained_name_or_path} holds no whole weights of surgicai_bc ({reason})."
             ) from None
 
-    def get_optim_params(self) -> Any:
+    def get_optim_params(self) -> Iterator[nn.Parameter]:
         """Return the parameters that are trained: the network's."""
         return self.network.parameters()
 
@@ -108,35 +116,36 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
         return loss, {"mse": loss.item()}
 
     @torch.no_grad()
-    def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_: object) -> Tensor:
         """Return a chunk of one action, (B, 1, 7)."""
         return self.select_action(batch)[:, None]
 
     @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
+    def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
         """Return the action (B, 7); it does not depend on what else is in the batch."""
-        if self._acting is None:
+        acting = self._acting
+        if acting is None:
             # `act` computes in float64 on the CPU, and so may not have its weights moved or trained
             # under it.
             acting = copy.deepcopy(self.network).cpu().eval()
             object.__setattr__(self, "_acting", acting)  # not a submodule: it must not be saved
         poses = batch[OBS_STATE].float().cpu().numpy()
-        return torch.from_numpy(self._acting.act(self._features(batch, self._encoder), poses)).to(
+        return torch.from_numpy(acting.act(self._features(batch, self._encoder), poses)).to(
             batch[OBS_STATE].device
         )
 
-    def _features(self, batch: dict[str, Tensor], encoder: Any) -> np.ndarray | None:
+    def _features(
+        self, batch: dict[str, Tensor], encoder: FrameEncoder | None
+    ) -> np.ndarray | None:
         """Return the views' features side by side (B, F) float32; None without images."""
         if encoder is None:
             return None
         for view in self.config.views:
-            trained, given = (
-                self.config.input_features[names.image_key(view)].shape,
-                batch[names.image_key(view)],
-            )
+            trained = self.config.input_features[names.image_key(view)].shape
+            given = batch[names.image_key(view)]
             if tuple(given.shape[1:]) != tuple(trained):
                 raise InputError(
-                    f"surgicai_bc was trained on images of {tuple(trained)}, got {tuple(given.shape[1:])}; "
-                    f"give --env.image_size={trained[-1]}."
+                    f"surgicai_bc was trained on images of {tuple(trained)}, "
+                    f"got {tuple(given.shape[1:])}; give --env.image_size={trained[-1]}."
                 )
         return encode(encoder, batch, self.config.views)

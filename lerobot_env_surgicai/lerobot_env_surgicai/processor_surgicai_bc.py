@@ -1,9 +1,7 @@
 """`surgicai_bc`: LeRobot's standard pre- and post-processing, safe for inputs that never vary."""
 
-from typing import Any
-
 import torch
-from lerobot.processor import make_default_pre_post_processors
+from lerobot.processor import PolicyProcessorPipeline, make_default_pre_post_processors
 from lerobot.utils.constants import OBS_STATE
 
 from lerobot_env_surgicai.configuration_surgicai_bc import SurgicaiBcConfig
@@ -12,10 +10,11 @@ SMALLEST_STD = 1e-6  # a component that varies less is constant, and only its me
 
 
 def make_surgicai_bc_pre_post_processors(
-    config: SurgicaiBcConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
-) -> tuple[Any, Any]:
-    """Return the pipelines around the policy: state to mean 0 and std 1, images and actions as they
-    are.
+    config: SurgicaiBcConfig, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
+) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+    """Return the pipelines around the policy.
+
+    The state is brought to mean 0 and std 1; images and actions stay as they are.
     """
     statistics = dict(dataset_stats or {})
     if "std" in statistics.get(OBS_STATE, {}):

@@ -282,7 +282,7 @@ def test_training_moves_the_network_and_never_the_encoder(trained: Path) -> None
 
 
 def test_training_encodes_a_image_once_and_forgets_beyond_its_limit() -> None:
-    from lerobot_env_surgicai.images import Remembered
+    from lerobot_env_surgicai.images import FeatureMemory
 
     encoded: list[int] = []
 
@@ -291,7 +291,7 @@ def test_training_encodes_a_image_once_and_forgets_beyond_its_limit() -> None:
         return images.reshape(len(images), -1)[:, :4].astype(np.float16).astype(np.float32) / 3
 
     images = np.random.default_rng(0).integers(0, 256, (6, 8, 8, 3), np.uint8)
-    memory = Remembered(encoder)
+    memory = FeatureMemory(encoder)
     batches = [[0, 1, 2], [2, 1, 3], [3, 3, 0], [4, 4, 5]]
     wanted = [encoder(images[rows]).astype(np.float16).astype(np.float32) for rows in batches]
     encoded.clear()
@@ -302,7 +302,7 @@ def test_training_encodes_a_image_once_and_forgets_beyond_its_limit() -> None:
     changed_one[0, 7, 7, 2] ^= 1
     memory(changed_one)
     assert encoded[-1] == 1, "an image that differs in one bit is another"
-    small = Remembered(encoder, limit=8)
+    small = FeatureMemory(encoder, limit=8)
     encoded.clear()
     for _ in range(2):
         small(images[:3])
