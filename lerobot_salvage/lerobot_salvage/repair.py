@@ -28,7 +28,7 @@ from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.check import CheckReport
 from surgicai_vision.dataset.lerobot_files import LeRobotFiles
-from surgicai_vision.dataset.metadata import INDEX_FEATURES, EpisodeRow, video_path, write_metadata
+from surgicai_vision.dataset.metadata import INDEX_FEATURES, EpisodeMetadata, video_path, write_metadata
 from surgicai_vision.dataset.writer import DataFiles
 
 EXCHANGE = 2
@@ -110,11 +110,11 @@ def _checked(path: Path) -> CheckReport | None:
 
 def _write(
     files: LeRobotFiles, made: Path, scratch: Path, claimed: int, progress: Progress
-) -> list[EpisodeRow]:
+) -> list[EpisodeMetadata]:
     """Write the verified prefix as the folder `made`; return its episodes' rows."""
     verifier = Verifier(files)
     features = {key: row for key, row in files.features.items() if key not in INDEX_FEATURES}
-    rows: list[EpisodeRow] = []
+    rows: list[EpisodeMetadata] = []
     digests: list[str] = []
     with whole_folder(made) as folder, tempfile.TemporaryDirectory(dir=scratch) as mended:
         data = DataFiles(folder, features, files.fps)
@@ -139,13 +139,13 @@ def _write(
     return rows
 
 
-def _append(data: DataFiles, number: int, episode: Verified) -> EpisodeRow:
+def _append(data: DataFiles, number: int, episode: Verified) -> EpisodeMetadata:
     """Write one episode."""
     row = data.append(number, episode.table, episode.statistics)
-    return EpisodeRow(row.start, row.stop, row.file, row.statistics, episode.tasks, episode.videos)
+    return EpisodeMetadata(row.start, row.stop, row.file, row.statistics, episode.tasks, episode.videos)
 
 
-def _texts(tasks: Mapping[int, str], rows: Sequence[EpisodeRow]) -> list[str]:
+def _texts(tasks: Mapping[int, str], rows: Sequence[EpisodeMetadata]) -> list[str]:
     """Return the sentence of every task index."""
     if tasks:
         return [tasks.get(index, f"task {index}") for index in range(max(tasks) + 1)]
@@ -154,7 +154,7 @@ def _texts(tasks: Mapping[int, str], rows: Sequence[EpisodeRow]) -> list[str]:
 
 
 def _meta(
-    ours: Mapping[str, Any], rows: Sequence[EpisodeRow], digests: Sequence[str], claimed: int
+    ours: Mapping[str, Any], rows: Sequence[EpisodeMetadata], digests: Sequence[str], claimed: int
 ) -> dict[str, Any]:
     """Return `meta/surgicai.json` of the prefix; it is the result of no request any more."""
     return {

@@ -56,6 +56,11 @@ class PhysicsError(SurgicaiError):
     """The simulation diverged or was started from an impossible state."""
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's text, or its type's name where it has none."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
 def check_name(kind: str, given: str, allowed: Iterable[str]) -> str:
     """Return `given` if it is one of `allowed`, else raise `UnknownName`."""
     names = tuple(allowed)

@@ -2,10 +2,10 @@
 
     from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 
-`rendering` turns states into images (one job an episode), `writing` assembles the episodes with
-LeRobot's own metadata writer, `reading` opens a dataset without torch, `checking` verifies one,
-`repairing` keeps the longest verified prefix of a broken one, `viewing` makes one of fewer views or
-of videos.
+`render` turns states into images (one job an episode), `writer` assembles the episodes with
+LeRobot's metadata, `reader` opens a dataset without torch, `subset` selects some of its frames,
+`check` verifies one, `convert` takes some of its views or stores them as videos, `hub` shares one.
+Repair of a broken one: the distribution lerobot_salvage.
 """
 
 from surgicai_vision.dataset.check import CheckReport, check_dataset
@@ -20,7 +20,7 @@ __all__ = [
     "DatasetSummary",
     "RenderedDataset",
     "check_dataset",
+    "convert_dataset",
     "open_dataset",
     "render_demos",
-    "convert_dataset",
 ]

@@ -1,32 +1,29 @@
-"""Check a dataset, ours or anyone's: counts, order, images, numbers, statistics and the digest,
-every frame of it.
+"""Check a dataset of ours: every frame of it, and all that is said about them.
 
     report = check_dataset(Path("dataset"))
     report.ok, report.problems        # each problem one line
 
-What is checked: `meta/surgicai.json`, LeRobot's `meta/info.json`, `meta/episodes` and
-`meta/stats.json` agree with the data and with each other; index columns are gapless and in order;
-every number is finite; every image decodes, has its size, is not of one colour and is not the one
-before it while the arm or the needle moved; depth is positive; the digest over the decoded content
-is the one recorded when it was rendered. Of another LeRobot dataset, everything that is not ours
-alone; its digest is that over its files.
+`meta/surgicai.json` and LeRobot's `meta/info.json`, `meta/episodes` and `meta/stats.json` must
+agree with the data and with each other. Index columns are gapless and in order, and every number is
+finite. Every image decodes, has its size, is not of one colour and differs from the one before it
+where the arm or the needle moved; depth is positive. The digest of the decoded content is the one
+recorded when it was rendered.
 """
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.errors import BadFile, first_line
 from surgicai_vision.core.files import read_json
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset import schema
-from surgicai_vision.dataset.lerobot_files import INFO
+from surgicai_vision.dataset.lerobot_files import EPISODES, INFO
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.rules import ImageWatch, episode_problems, number_problems
 from surgicai_vision.dataset.stats import column_statistics
@@ -34,15 +31,18 @@ from surgicai_vision.dataset.stats import column_statistics
 MOST_PROBLEMS = 50
 """Problems listed; the rest is counted."""
 STATISTICS_TOLERANCE = 1e-4
-"""Largest deviation of a column's statistics from the recomputed ones, relative to the largest
-value.
-"""
+"""Largest deviation of a column's statistics, relative to the column's largest value."""
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What a check found: frames and episodes read, the digest of the content, and one line a
-    problem.
+    """What a check found.
+
+    Attributes:
+        frames: number of frames that were read.
+        episodes: number of episodes that were read.
+        digest: of the content.
+        problems: one line each.
     """
 
     frames: int
@@ -52,7 +52,7 @@ class CheckReport:
 
     @property
     def ok(self) -> bool:
-        """Say whether there is no problem."""
+        """True if there is no problem."""
         return not self.problems
 
 
@@ -74,12 +74,7 @@ def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
     dataset = open_dataset(path)
     problems: list[str] = []
     columns = dataset.columns()
-    keys = [
-        key
-        for key, _, _ in schema.image_keys(
-            dataset.views, dataset.has_depth, dataset.has_segmentation
-        )
-    ]
+    keys = dataset.image_keys
     _check_order(dataset, columns, problems)
     problems.extend(number_problems(columns))
     _check_lerobot(dataset, columns, keys, problems)
@@ -115,14 +110,12 @@ def _check_order(
         problems.append("episode_index: episodes are not 0, 1, 2, … in order.")
     if len(bounds) != dataset.meta.get("episodes"):
         problems.append(
-            f"episodes: {len(bounds)} in the data, {dataset.meta.get('episodes')} in {names.META_FILE}."
+            f"episodes: {len(bounds)} in the data, {dataset.meta.get('episodes')} in "
+            f"{names.META_FILE}."
         )
     for number, (start, stop) in enumerate(bounds):
-        problems.extend(
-            episode_problems(
-                number, {key: rows[start:stop] for key, rows in columns.items()}, dataset.fps
-            )
-        )
+        episode = {key: rows[start:stop] for key, rows in columns.items()}
+        problems.extend(episode_problems(number, episode, dataset.fps))
 
 
 def _check_lerobot(
@@ -135,16 +128,11 @@ def _check_lerobot(
     try:
         info = read_json(dataset.path / "meta/info.json")
         statistics = read_json(dataset.path / "meta/stats.json")
-        table = pa.concat_tables(
-            pq.read_table(
-                file, columns=["episode_index", "length", "dataset_from_index", "dataset_to_index"]
-            )
-            for file in sorted(dataset.path.glob("meta/episodes/chunk-*/file-*.parquet"))
-        )
+        counts = ["episode_index", "length", "dataset_from_index", "dataset_to_index"]
+        files = sorted(dataset.path.glob(EPISODES))
+        table = pa.concat_tables(pq.read_table(file, columns=counts) for file in files)
     except (BadFile, OSError, pa.ArrowException) as error:
-        problems.append(
-            f"LeRobot's metadata cannot be read ({(str(error).splitlines() or [''])[0]})."
-        )
+        problems.append(f"LeRobot's metadata cannot be read ({first_line(error)}).")
         return
     bounds = dataset.bounds()
     if (info.get("total_frames"), info.get("total_episodes")) != (dataset.length, len(bounds)):
@@ -162,7 +150,7 @@ def _check_lerobot(
     )
 
 
-def _check_statistics(key: str, recorded: Any, values: np.ndarray, problems: list[str]) -> None:
+def _check_statistics(key: str, recorded: object, values: np.ndarray, problems: list[str]) -> None:
     """Check a column's recorded statistics against its values."""
     if not isinstance(recorded, dict):
         problems.append(f"meta/stats.json: no statistics of {key}.")

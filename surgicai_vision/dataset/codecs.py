@@ -1,6 +1,6 @@
 """Image codecs, lossless: RGB and segmentation as PNG, depth as float32 TIFF in metres."""
 
-from typing import Any
+from collections.abc import Buffer
 
 import cv2
 import numpy as np
@@ -18,12 +18,14 @@ level 6 is 6 % smaller and takes seven times as long."""
 
 
 def encode(frame: np.ndarray) -> bytes:
-    """Encode (H, W, 3) uint8 RGB as PNG, (H, W, 1) uint8 as PNG of three equal channels, float32 as
-    TIFF.
+    """Encode an image.
+
+    Args:
+        frame: (H, W, 3) uint8 becomes an RGB PNG, (H, W, 1) uint8 a PNG of three equal channels,
+            (H, W, 1) float32 a TIFF.
     """
     if frame.dtype == np.float32:
-        # Uncompressed TIFF: the parquet column around it is compressed, which is faster and
-        # smaller.
+        # Uncompressed: compressing the parquet column around it is faster and smaller.
         done, content = cv2.imencode(".tiff", frame, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
     else:
         image = (
@@ -36,28 +38,29 @@ def encode(frame: np.ndarray) -> bytes:
     return content.tobytes()
 
 
-DEPTH_NEAR, DEPTH_FAR = 0.02, 0.22
-"""Depths that a grey image tells apart [m], in steps of 0.8 mm: all of the needle, the instruments
-and the phantom's middle in every camera (measured: 0.029 to 0.163 m)."""
+DEPTH_NEAR = 0.02
+DEPTH_FAR = 0.22
+"""Nearest and farthest depth that a grey image shows [m], in steps of 0.8 mm.
+
+The needle, the instruments and the phantom's middle are within them in every camera (measured:
+0.029 to 0.163 m).
+"""
 
 
 def grey(depth: np.ndarray) -> np.ndarray:
-    """Return depth (…, 1) float32 [m] as an image (…, 3) uint8 of three equal channels, near is
-    dark.
-    """
+    """Return depth (…, 1) float32 [m] as a grey image (…, 3) uint8; near is dark."""
     share = (depth - DEPTH_NEAR) * (255 / (DEPTH_FAR - DEPTH_NEAR))
     return np.repeat(np.clip(np.rint(share), 0, 255).astype(np.uint8), 3, axis=-1)
 
 
-def decode(content: Any, where: str) -> np.ndarray:
+def decode(content: Buffer | None, where: str) -> np.ndarray:
     """Decode the buffer of an image to (H, W, 3) uint8 RGB or (H, W, 1) float32.
 
     Raises:
         BadFile: not an image; `where` says which.
     """
-    frame = (
-        cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
-    )
+    data = np.frombuffer(content or b"", np.uint8)
+    frame = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     if frame is None:
         raise BadFile(f"{where}: its image cannot be decoded.")
     if frame.ndim == 2:

@@ -1,12 +1,12 @@
-"""Make a dataset from a dataset, without rendering: fewer views, or videos in the place of images.
+"""Make a dataset from a dataset: fewer views, or videos in the place of images.
 
     convert_dataset(Path("dataset"), Path("dataset-back"), views=("back",))
     made = convert_dataset(Path("dataset"), Path("dataset-h264"), video="h264")
     made.video_error                # view → mean absolute error of its pixels, out of 255
 
-Columns, depth, segmentation and, without `video`, the images are taken over byte by byte. A video
-loses something: every frame is decoded again and compared with its image, and what was lost is
-written into `meta/surgicai.json`.
+Nothing is rendered. Columns, depth, segmentation and, without `video`, the images are copied byte
+by byte. A video is lossy: every frame is decoded again and compared with its image, and the error
+is written into `meta/surgicai.json`.
 """
 
 import dataclasses
@@ -15,7 +15,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, check_name
@@ -27,11 +26,13 @@ from surgicai_vision.dataset.lerobot_files import LeRobotFiles
 from surgicai_vision.dataset.metadata import (
     FILES_PER_CHUNK,
     INDEX_FEATURES,
-    EpisodeRow,
+    EpisodeMetadata,
+    Features,
     row_statistics,
     write_metadata,
 )
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
+from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.video import CODECS, PIXELS
 from surgicai_vision.dataset.video_jobs import Encoded, Place, encode_views
 from surgicai_vision.dataset.writer import DataFiles
@@ -65,7 +66,7 @@ def convert_dataset(
     video: str | None = None,
     context: RunContext = RunContext(),
 ) -> DatasetSummary:
-    """Write `out`: the views `views` of the dataset `path`, as videos where `video` says so.
+    """Write some views of a dataset as a new dataset, as videos if `video` names a codec.
 
     Args:
         path: a dataset of ours.
@@ -111,22 +112,23 @@ def check_video(video: str | None) -> None:
         check_name("video codec", video, CODECS)
 
 
-def finished(out: Path, request: Mapping[str, Any], started: float) -> DatasetSummary:
-    """Return the summary of a finished dataset if it is the one asked for; `OutputExists` if it is
-    another.
+def finished(out: Path, request: Table, started: float) -> DatasetSummary:
+    """Return the summary of a finished dataset.
+
+    Raises:
+        OutputExists: it is not the one that was requested.
     """
     meta = read_json(out / names.META_FILE)
     if meta.get("request") != request:
         raise OutputExists(
-            f"--out {out} holds a dataset of other demonstrations or options (see {out / names.META_FILE}); "
-            "give another folder."
+            f"--out {out} holds a dataset of other demonstrations or options (see "
+            f"{out / names.META_FILE}); give another folder."
         )
     # Left by a run that was killed after its last step.
     shutil.rmtree(work_folder(out), ignore_errors=True)
     seconds = time.monotonic() - started
-    return DatasetSummary(
-        meta["frames"], meta["episodes"], seconds, meta["digest"], meta.get("video_error", {})
-    )
+    errors = meta.get("video_error", {})
+    return DatasetSummary(meta["frames"], meta["episodes"], seconds, meta["digest"], errors)
 
 
 def write_converted(
@@ -134,46 +136,49 @@ def write_converted(
     out: Path,
     views: Sequence[str],
     video: str | None,
-    changes: Mapping[str, Any],
+    changes: Table,
     store: Path,
     context: RunContext,
     progress: Progress,
 ) -> None:
-    """Write the folder `out`, whole; `changes` go into its `meta/surgicai.json`, jobs in `store`
-    make videos.
+    """Write the new dataset, whole.
+
+    Args:
+        dataset: the dataset to convert.
+        out: folder to make.
+        views: some of its views.
+        video: codec, or None for images as they are.
+        changes: replace values of its `meta/surgicai.json`.
+        store: folder of the results of the jobs that make videos.
+        context: workers and engine.
+        progress: counts frames.
     """
     files = LeRobotFiles(dataset.path)
     if len(files.rows) != int(dataset.meta["episodes"]):
-        raise BadFile(f"{dataset.path} is damaged ({' '.join(files.problems)}); repair it first.")
-    keys = [
-        key for key, _, _ in schema.image_keys(views, dataset.has_depth, dataset.has_segmentation)
-    ]
+        raise BadFile(
+            f"{dataset.path} is damaged ({' '.join(files.problems)}); repair it first with "
+            "'lerobot-salvage repair'."
+        )
+    shown = schema.image_keys(views, dataset.has_depth, dataset.has_segmentation)
+    keys = [key for key, _, _ in shown]
     features = _features(files, dataset, keys, video)
     with whole_folder(out) as folder:
+        # Where every episode is in the videos, by feature; empty without videos.
         encoded: list[dict[str, Encoded]] = []
         if video:
-            encoded = encode_views(
-                dataset,
-                folder,
-                views,
-                video,
-                store=store,
-                context=context,
-                progress=progress,
-            )
+            encoded = encode_views(dataset, folder, views, video, store, context, progress)
             places = [{key: item.place for key, item in episode.items()} for episode in encoded]
         else:
             places = _copy_videos(files, folder, [key for key in keys if key in dataset.video_keys])
         rows = _write_data(files, folder, features, places)
         write_metadata(folder, features, list(files.tasks.values()), rows, files.info)
-        digest, errors = _look(dataset, keys, rows, encoded, progress)
         meta = {
             **dataset.meta,
             "views": list(views),
             "cameras": {view: dataset.meta["cameras"][view] for view in views},
             "made_from": dataset.meta["digest"],
-            "digest": digest,
-            **({"video": video, "video_error": errors} if video else {}),
+            "digest": _digest(dataset, keys, rows, encoded, progress),
+            **({"video": video, "video_error": _errors(views, encoded, dataset)} if video else {}),
             **changes,
         }
         write_json(folder / names.META_FILE, meta)
@@ -181,9 +186,9 @@ def write_converted(
 
 def _features(
     files: LeRobotFiles, dataset: RenderedDataset, keys: Sequence[str], video: str | None
-) -> dict[str, Any]:
+) -> dict[str, Table]:
     """Return the new dataset's features."""
-    features = {key: files.features[key] for key in keys}
+    features: dict[str, Table] = {key: files.features[key] for key in keys}
     for key, row in files.features.items():
         if row["dtype"] not in ("image", "video") and key not in INDEX_FEATURES:
             features[key] = row
@@ -208,9 +213,9 @@ def _features(
 def _write_data(
     files: LeRobotFiles,
     folder: Path,
-    features: Mapping[str, Any],
+    features: Features,
     places: Sequence[Mapping[str, Place]],
-) -> list[EpisodeRow]:
+) -> list[EpisodeMetadata]:
     """Write the data files; return the episodes' rows."""
     data = DataFiles(folder, features, files.fps)
     rows = []
@@ -232,22 +237,21 @@ def _copy_videos(files: LeRobotFiles, folder: Path, keys: Sequence[str]) -> list
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, target)
         for number, row in enumerate(files.rows):
-            file_number = (
-                row[f"videos/{key}/chunk_index"] * FILES_PER_CHUNK + row[f"videos/{key}/file_index"]
-            )
-            span = (row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"])
-            places[number][key] = (file_number, *span)
+            chunk = row[f"videos/{key}/chunk_index"]
+            file_number = chunk * FILES_PER_CHUNK + row[f"videos/{key}/file_index"]
+            begin = row[f"videos/{key}/from_timestamp"]
+            places[number][key] = (file_number, begin, row[f"videos/{key}/to_timestamp"])
     return places if keys else []
 
 
-def _look(
+def _digest(
     dataset: RenderedDataset,
     keys: Sequence[str],
-    rows: Sequence[EpisodeRow],
+    rows: Sequence[EpisodeMetadata],
     encoded: Sequence[Mapping[str, Encoded]],
     progress: Progress,
-) -> tuple[str, dict[str, float]]:
-    """Return the digest of the content, and each new video's mean absolute error."""
+) -> str:
+    """Return the digest of the new dataset's content."""
     columns = dataset.columns()
     digests = []
     for number, row in enumerate(rows):
@@ -258,14 +262,19 @@ def _look(
                 continue
             for frame in dataset.decoded(key, row.start, row.stop):
                 digest.add(key, frame)
-        digests.append(
-            digest.hexdigest({key: columns[key][row.start : row.stop] for key in schema.COLUMNS})
-        )
+        episode = {key: columns[key][row.start : row.stop] for key in schema.COLUMNS}
+        digests.append(digest.hexdigest(episode))
         if not encoded:
             progress(row.stop, dataset.length, "frames")
+    return schema.dataset_digest(digests)
+
+
+def _errors(
+    views: Sequence[str], encoded: Sequence[Mapping[str, Encoded]], dataset: RenderedDataset
+) -> dict[str, float]:
+    """Return the mean absolute error of each view's video, out of 255."""
     errors = {}
-    for view in dataset.views if encoded else ():
-        if names.image_key(view) in keys:
-            total = sum(episode[names.image_key(view)].error for episode in encoded)
-            errors[view] = round(total / dataset.length, 4)
-    return schema.dataset_digest(digests), errors
+    for view in views:
+        total = sum(episode[names.image_key(view)].error for episode in encoded)
+        errors[view] = round(total / dataset.length, 4)
+    return errors

@@ -10,7 +10,6 @@ the env shows the same.
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -22,12 +21,13 @@ from surgicai_vision.core.files import write_json
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.reader import RenderedDataset
+from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import column_statistics
-from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, assemble
+from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, assemble, column_array
 
 
 def export_features(
-    dataset: RenderedDataset, rows: Sequence[np.ndarray], about: Mapping[str, Any], out: Path
+    dataset: RenderedDataset, rows: Sequence[np.ndarray], about: Table, out: Path
 ) -> None:
     """Write `out`: the columns of `dataset` and its features, no images.
 
@@ -54,7 +54,8 @@ def export_features(
     columns = {key: dataset.columns()[key] for key in schema.COLUMNS}
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as scratch:
-        shards, digests = [], []
+        shards = []
+        digests = []
         for episode in np.unique(dataset.episode_index):
             where = np.flatnonzero(dataset.episode_index == episode)
             part = {key: values[where] for key, values in columns.items()}
@@ -78,12 +79,7 @@ def export_features(
 def _write_shard(folder: Path, columns: Mapping[str, np.ndarray]) -> Path:
     """Write one episode as `assemble` reads it."""
     folder.mkdir()
-    arrays = {}
-    for key, values in columns.items():
-        flat = pa.array(np.ascontiguousarray(values).ravel())
-        arrays[key] = (
-            pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim == 2 else flat
-        )
+    arrays = {key: column_array(values) for key, values in columns.items()}
     pq.write_table(pa.table(arrays), folder / EPISODE_FILE)
     statistics = {key: column_statistics(values) for key, values in columns.items()}
     write_json(folder / SUMMARY_FILE, {"statistics": statistics})

@@ -1,5 +1,4 @@
-"""Share a dataset on the Hugging Face Hub: with a card that says what it is, checked before and
-after.
+"""Share a dataset on the Hugging Face Hub, with a card, checked before and after.
 
     push_dataset(Path("dataset"), "somebody/suturing-grasp")
     pull_dataset("somebody/suturing-grasp", Path("dataset"))
@@ -22,7 +21,6 @@ from surgicai_vision.core.files import check_output
 from surgicai_vision.core.hub import connect, refusals_in_one_line
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.core.tasks import task_text
-from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.check import CheckReport, check_dataset
 from surgicai_vision.dataset.metadata import CODEBASE_VERSION
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
@@ -39,12 +37,7 @@ KEPT = ("meta", "data", "videos")
 def dataset_card(dataset: RenderedDataset, repo: str, licence: str = LICENCE) -> str:
     """Return the card of a dataset, Markdown with the Hub's header."""
     meta = dataset.meta
-    images = [
-        key
-        for key, _, _ in schema.image_keys(
-            dataset.views, dataset.has_depth, dataset.has_segmentation
-        )
-    ]
+    images = dataset.image_keys
     size = f"{dataset.image_size} × {dataset.image_size}"
     lost = "".join(
         f" The video of `{view}` is off by {error:.2f} of 255 on average."
@@ -71,17 +64,18 @@ configs:
 
 {task_text(dataset.task)}
 
-{meta["episodes"]} simulated demonstrations of the task `{dataset.task}` in robotic suturing: {dataset.length} frames
-at {dataset.fps} per second, by {", ".join(meta["demonstrators"])}. LeRobot {CODEBASE_VERSION} format, by surgicai-vision
-({meta["code_version"]}). Images of {size} pixels, {stored}
+{meta["episodes"]} simulated demonstrations of the task `{dataset.task}` in robotic suturing:
+{dataset.length} frames at {dataset.fps} per second, by {", ".join(meta["demonstrators"])}.
+LeRobot {CODEBASE_VERSION} format, by surgicai-vision ({meta["code_version"]}).
+Images of {size} pixels, {stored}
 
 | column | content |
 |---|---|
 {rows}
 {shown}
 
-Lengths in metres, angles in radians, depth in metres. The cameras' intrinsics and poses, the task's configuration and
-the renderer ({", ".join(meta["renderers"])}) are in `{names.META_FILE}`.
+Lengths in metres, angles in radians, depth in metres. The cameras' intrinsics and poses, the task's
+configuration and the renderer ({", ".join(meta["renderers"])}) are in `{names.META_FILE}`.
 Digest of the decoded content: `{meta["digest"]}`.
 
 ```python
@@ -147,10 +141,8 @@ def push_dataset(
         api.create_repo(repo, repo_type="dataset", private=private, exist_ok=True)
         text = f"{dataset.meta['episodes']} episodes of {dataset.task}"
         commit = api.create_commit(repo, operations, commit_message=text, repo_type="dataset")
-        if any(
-            tag.name == CODEBASE_VERSION
-            for tag in api.list_repo_refs(repo, repo_type="dataset").tags
-        ):
+        tags = api.list_repo_refs(repo, repo_type="dataset").tags
+        if any(tag.name == CODEBASE_VERSION for tag in tags):
             api.delete_tag(repo, tag=CODEBASE_VERSION, repo_type="dataset")
         api.create_tag(repo, tag=CODEBASE_VERSION, revision=commit.oid, repo_type="dataset")
     return str(commit.commit_url)
@@ -164,8 +156,9 @@ def pull_dataset(
     progress: Progress | None = None,
     api: "HfApi | None" = None,
 ) -> CheckReport:
-    """Fetch a dataset into the new folder `out` and check it; the same command goes on with what
-    was fetched.
+    """Fetch a dataset of ours into the new folder `out` and check it.
+
+    Called again after a failure, it goes on with what was fetched.
 
     Raises:
         InputError: a bad name.
@@ -187,6 +180,11 @@ def pull_dataset(
                 allow_patterns=[*wanted, CARD],
             )
         shutil.rmtree(fetched / ".cache", ignore_errors=True)  # the Hub client's notes
+        if not (fetched / names.META_FILE).exists():
+            raise BadFile(
+                f"{repo} is not a dataset of surgicai-vision; fetch it with 'hf download {repo} "
+                "--repo-type dataset' and check it with 'lerobot-salvage check DIR'."
+            )
         report = check_dataset(fetched, progress)
         _whole(report, repo)
         if out.exists():

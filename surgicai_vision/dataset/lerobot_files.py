@@ -11,17 +11,21 @@ reading ends where the data does.
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.errors import BadFile, first_line
 from surgicai_vision.core.files import read_json
 from surgicai_vision.dataset.metadata import INDEX_FEATURES, arrow_schema
+from surgicai_vision.dataset.schema import Table
 
-INFO, STATISTICS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
-DATA, EPISODES = "data/chunk-*/file-*.parquet", "meta/episodes/chunk-*/file-*.parquet"
+INFO = "meta/info.json"
+STATISTICS = "meta/stats.json"
+TASKS = "meta/tasks.parquet"
+DATA = "data/chunk-*/file-*.parquet"
+EPISODES = "meta/episodes/chunk-*/file-*.parquet"
 VERSIONS = ("v3.0", "v3.1")
 type OpenFile = Callable[[Path], pq.ParquetFile]
 """Opens a data file; lerobot_salvage gives one that recovers a file without a footer."""
@@ -49,7 +53,8 @@ class LeRobotFiles:
         self.path = Path(path)
         if not (self.path / INFO).is_file():
             raise BadFile(
-                f"{self.path} is no LeRobot dataset: it has no {INFO}, without which nothing can be read."
+                f"{self.path} is no LeRobot dataset: it has no {INFO}, without which nothing can "
+                "be read."
             )
         self.info = read_json(self.path / INFO)
         self.problems: list[str] = []
@@ -64,11 +69,12 @@ class LeRobotFiles:
             version = self.info["codebase_version"]
         except (KeyError, TypeError, ValueError, AttributeError, pa.ArrowException) as error:
             raise BadFile(
-                f"{self.path / INFO} is not that of a LeRobot dataset ({line(error)})."
+                f"{self.path / INFO} is not that of a LeRobot dataset ({first_line(error)})."
             ) from None
         if version not in VERSIONS or not self.fps > 0:
             raise BadFile(
-                f"{self.path / INFO}: version {version!r}, {self.fps:g} fps; read: {', '.join(VERSIONS)}."
+                f"{self.path / INFO}: version {version!r}, {self.fps:g} fps; read: "
+                f"{', '.join(VERSIONS)}."
             )
         self.tasks = self._read_tasks()
         self.rows = self._read_rows()
@@ -101,18 +107,18 @@ class LeRobotFiles:
             )
             return {int(index): str(text) for index, text in pairs}
         except UNREADABLE as error:
-            self.problems.append(f"{TASKS} cannot be read ({line(error)}).")
+            self.problems.append(f"{TASKS} cannot be read ({first_line(error)}).")
             return {}
 
-    def _read_rows(self) -> list[dict[str, Any]]:
+    def _read_rows(self) -> list[Table]:
         """Read `meta/episodes` up to the first row that is missing or not in order."""
-        rows: list[dict[str, Any]] = []
+        rows: list[Table] = []
         files = sorted(self.path.glob(EPISODES))
         try:
             for file in files:
                 rows.extend(pq.ParquetFile(file).read().to_pylist())
         except UNREADABLE as error:
-            self.problems.append(f"meta/episodes cannot be read ({line(error)}).")
+            self.problems.append(f"meta/episodes cannot be read ({first_line(error)}).")
         if not files:
             self.problems.append("meta/episodes is missing.")
         for number, row in enumerate(rows):
@@ -123,11 +129,11 @@ class LeRobotFiles:
                 return rows[:number]
         return rows
 
-    def _read_statistics(self) -> dict[str, Any]:
+    def _read_statistics(self) -> Table:
         try:
             return dict(read_json(self.path / STATISTICS))
         except (BadFile, TypeError, ValueError) as error:
-            self.problems.append(line(error))
+            self.problems.append(first_line(error))
             return {}
 
     def episodes(self, open_file: OpenFile = pq.ParquetFile) -> Iterator[pa.Table]:
@@ -157,7 +163,7 @@ class LeRobotFiles:
                         .combine_chunks()
                     )
             except UNREADABLE as error:
-                self.problems.append(f"{name} cannot be read further ({line(error)}).")
+                self.problems.append(f"{name} cannot be read further ({first_line(error)}).")
                 return
 
 
@@ -173,8 +179,3 @@ def _split(table: pa.Table) -> Iterator[pa.Table]:
     starts = [0, *((numbers[1:] != numbers[:-1]).nonzero()[0] + 1).tolist(), len(table)]
     for start, stop in itertools.pairwise(starts):
         yield table.slice(start, stop - start)
-
-
-def line(error: Exception) -> str:
-    """Return the first line of an error's text."""
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]

@@ -1,11 +1,11 @@
 """LeRobot's v3 metadata, written without importing LeRobot.
 
-Its own writer would do, but importing it takes 11 s on an idle machine (torch, torchvision,
-datasets) where everything else here takes one. `tests/test_dataset.py` holds each of these against
-what lerobot 0.6.1 writes.
+    schema = arrow_schema(features)             # of data files, with Hugging Face's feature types
+    write_metadata(folder, features, tasks, episodes)
 
-    schema = arrow_schema(features)               # of data files, with what `datasets` reads from
-    it write_metadata(folder, features, tasks, episodes)
+Importing LeRobot's own writer takes 11 s on an idle machine (torch, torchvision, datasets), where
+everything else here takes one. `tests/dataset/test_dataset.py` compares each part with what lerobot
+0.6.1 writes.
 """
 
 import json
@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,11 +20,14 @@ import pyarrow.parquet as pq
 
 from surgicai_vision.core import names
 from surgicai_vision.core.files import write_json
+from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import Statistics
 
 CODEBASE_VERSION = "v3.0"
-FILES_PER_CHUNK, DATA_FILE_MB, VIDEO_FILE_MB = 1000, 100, 200
-"""LeRobot's defaults."""
+FILES_PER_CHUNK = 1000
+"""LeRobot's default, as the two below."""
+DATA_FILE_MB = 100
+VIDEO_FILE_MB = 200
 ROBOT_TYPE = "psm"
 
 INDEX_FEATURES: Mapping[str, str] = {
@@ -37,12 +39,13 @@ INDEX_FEATURES: Mapping[str, str] = {
 }
 """Columns LeRobot adds to every dataset → dtype."""
 
-Features = Mapping[str, Mapping[str, Any]]
+Features = Mapping[str, Table]
+"""LeRobot's feature table: key → dtype, shape, names and more."""
 
 
 @dataclass(frozen=True)
-class EpisodeRow:
-    """One episode's row.
+class EpisodeMetadata:
+    """One episode's row of `meta/episodes`.
 
     Attributes:
         start: its first frame in the dataset.
@@ -63,7 +66,7 @@ class EpisodeRow:
     )
 
 
-def all_features(features: Features) -> dict[str, Any]:
+def all_features(features: Features) -> Features:
     """Return the features with the columns LeRobot adds."""
     added = {
         key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in INDEX_FEATURES.items()
@@ -82,11 +85,9 @@ def data_path(file: int) -> str:
 
 
 def arrow_schema(features: Features) -> pa.Schema:
-    """Return the schema of a data file: Arrow types, and the same as Hugging Face's feature
-    types.
-    """
+    """Return the schema of a data file, with Hugging Face's feature types in its metadata."""
     fields: list[pa.Field] = []
-    hub: dict[str, Any] = {}
+    hub: dict[str, Table] = {}
     for key, feature in all_features(features).items():
         if feature["dtype"] != "video":
             kind, hub[key] = _types(feature["dtype"], feature["shape"])
@@ -94,13 +95,12 @@ def arrow_schema(features: Features) -> pa.Schema:
     return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": hub}})})
 
 
-def _types(dtype: str, shape: tuple[int, ...]) -> tuple[Any, dict[str, Any]]:
+def _types(dtype: str, shape: tuple[int, ...]) -> tuple[pa.DataType, Table]:
     """Return a feature's Arrow type and Hugging Face's."""
     if dtype == "image":
         return pa.struct({"bytes": pa.binary(), "path": pa.string()}), {"_type": "Image"}
-    kind = {"bool": pa.bool_(), "string": pa.string()}.get(dtype) or pa.from_numpy_dtype(
-        np.dtype(dtype)
-    )
+    other = {"bool": pa.bool_(), "string": pa.string()}
+    kind = other.get(dtype) or pa.from_numpy_dtype(np.dtype(dtype))
     value = {"dtype": dtype, "_type": "Value"}
     if shape == (1,):
         return kind, value
@@ -115,8 +115,8 @@ def write_metadata(
     folder: Path,
     features: Features,
     tasks: Sequence[str],
-    episodes: Sequence[EpisodeRow],
-    origin: Mapping[str, Any] = MappingProxyType({}),
+    episodes: Sequence[EpisodeMetadata],
+    origin: Table = MappingProxyType({}),
 ) -> None:
     """Write `meta/info.json`, `tasks.parquet`, `episodes/…` and `stats.json` of a dataset.
 
@@ -125,8 +125,7 @@ def write_metadata(
         features: its features, without the columns LeRobot adds.
         tasks: the sentence of every task, in the order of `task_index`.
         episodes: every episode, in order.
-        origin: the `meta/info.json` of the dataset it is made from; what is not counted here is
-            kept.
+        origin: the `meta/info.json` of the dataset it is made from, some of which is kept.
     """
     import pandas
 
@@ -155,22 +154,19 @@ def write_metadata(
     # In the order of the features, which is the order LeRobot shows and policies stack them in.
     (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n")
     index = pandas.Index(list(tasks), name="task")
-    pandas.DataFrame({"task_index": range(len(tasks))}, index=index).to_parquet(
-        meta / "tasks.parquet"
-    )
-    rows = [
-        _row(number, episode.tasks or tasks, episode) for number, episode in enumerate(episodes)
-    ]
-    table = pa.Table.from_pydict({key: [row[key] for row in rows] for key in rows[0]})
-    pq.write_table(table, meta / "episodes/chunk-000/file-000.parquet")
+    table = pandas.DataFrame({"task_index": range(len(tasks))}, index=index)
+    table.to_parquet(meta / "tasks.parquet")
+    rows = [_row(number, tasks, episode) for number, episode in enumerate(episodes)]
+    columns = {key: [row[key] for row in rows] for key in rows[0]}
+    pq.write_table(pa.Table.from_pydict(columns), meta / "episodes/chunk-000/file-000.parquet")
     write_json(meta / "stats.json", aggregate([episode.statistics for episode in episodes]))
 
 
-def _row(index: int, tasks: Sequence[str], episode: EpisodeRow) -> dict[str, Any]:
+def _row(index: int, tasks: Sequence[str], episode: EpisodeMetadata) -> Table:
     """Return an episode's row of `meta/episodes`."""
-    row = {
+    row: dict[str, object] = {
         "episode_index": index,
-        "tasks": list(tasks),
+        "tasks": list(episode.tasks or tasks),
         "length": episode.stop - episode.start,
         "data/chunk_index": episode.file // FILES_PER_CHUNK,
         "data/file_index": episode.file % FILES_PER_CHUNK,
@@ -178,16 +174,16 @@ def _row(index: int, tasks: Sequence[str], episode: EpisodeRow) -> dict[str, Any
         "dataset_to_index": episode.stop,
     }
     for key, (file, begin, end) in episode.videos.items():
-        row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"] = divmod(
-            file, FILES_PER_CHUNK
-        )
-        row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"] = begin, end
+        row[f"videos/{key}/chunk_index"] = file // FILES_PER_CHUNK
+        row[f"videos/{key}/file_index"] = file % FILES_PER_CHUNK
+        row[f"videos/{key}/from_timestamp"] = begin
+        row[f"videos/{key}/to_timestamp"] = end
     for key, statistics in episode.statistics.items():
         row.update({f"stats/{key}/{name}": value for name, value in statistics.items()})
     return {**row, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
 
 
-def row_statistics(row: Mapping[str, Any]) -> dict[str, Statistics]:
+def row_statistics(row: Table) -> dict[str, Statistics]:
     """Return the statistics in an episode's row of `meta/episodes`, by feature."""
     table: dict[str, Statistics] = {}
     for name, value in row.items():
@@ -198,9 +194,7 @@ def row_statistics(row: Mapping[str, Any]) -> dict[str, Statistics]:
 
 
 def aggregate(episodes: Sequence[Mapping[str, Statistics]]) -> dict[str, Statistics]:
-    """Return the statistics of all episodes together; quantiles are means weighted by frames, as
-    LeRobot's.
-    """
+    """Return the statistics of all episodes; quantiles are LeRobot's means weighted by frames."""
     return {key: _aggregate([episode[key] for episode in episodes]) for key in episodes[0]}
 
 

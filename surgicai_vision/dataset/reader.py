@@ -1,4 +1,4 @@
-"""Open a dataset of ours and read it fast, in order, without torch and without LeRobot.
+"""Open a dataset of ours and read it, fast and without torch or LeRobot.
 
     dataset = open_dataset(Path("dataset"))
     dataset.length, dataset.views, dataset.episode_index, dataset.columns()
@@ -13,7 +13,7 @@ import functools
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, final
+from typing import NamedTuple, final
 
 import numpy as np
 import pyarrow as pa
@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import TaskConfig, from_mapping
-from surgicai_vision.core.errors import BadFile, InputError, check_name
+from surgicai_vision.core.errors import BadFile, InputError, check_name, first_line
 from surgicai_vision.core.files import read_json, sha256_file
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.protocol import episode_bounds
@@ -41,6 +41,15 @@ def open_dataset(path: Path) -> "RenderedDataset":
     return RenderedDataset(path)
 
 
+class _RowGroup(NamedTuple):
+    """A row group: its file, its number there, its first frame and number of frames."""
+
+    file: int
+    number: int
+    start: int
+    frames: int
+
+
 @final
 class RenderedDataset:
     """A rendered dataset.
@@ -53,67 +62,46 @@ class RenderedDataset:
         views: cameras, in order.
         image_size: side of the images [px].
         length: number of frames N.
-        fps: frames a second of simulated time; below `names.FPS` where only every so-manieth frame
-            was rendered.
+        fps: frames per second of simulated time; `names.FPS` divided by the frame stride.
         video: codec of the RGB views, None where they are lossless images.
     """
 
     def __init__(self, path: Path):
         self.path = Path(path)
-        if not (self.path / names.META_FILE).is_file():
-            raise BadFile(
-                f"{self.path} is not a dataset of surgicai-vision (no {names.META_FILE} in it); make one with "
-                "'surgicai-vision render-demos'."
-            )
-        self.meta = read_json(self.path / names.META_FILE)
-        if isinstance(self.meta, dict) and self.meta.get("format") != schema.FORMAT:
-            raise BadFile(
-                f"{self.path} was written by another version of surgicai-vision (format "
-                f"{self.meta.get('format', 1)}; this version reads {schema.FORMAT}); render it "
-                "again with 'surgicai-vision render-demos'."
-            )
+        file = self.path / names.META_FILE
+        self.meta = _read_meta(self.path)
         try:
             self.task: str = self.meta["task"]
-            self.config = from_mapping(
-                TaskConfig, self.meta["task_config"], str(self.path / names.META_FILE)
-            )
+            self.config = from_mapping(TaskConfig, self.meta["task_config"], str(file))
             self.views = tuple(str(view) for view in self.meta["views"])
             self.image_size = int(self.meta["image_size"])
-            self.length, self.fps = int(self.meta["frames"]), int(self.meta["fps"])
+            self.length = int(self.meta["frames"])
+            self.fps = int(self.meta["fps"])
             self.video: str | None = self.meta.get("video")
-            self.has_depth, self.has_segmentation = (
-                bool(self.meta["depth"]),
-                bool(self.meta["segmentation"]),
-            )
+            self.has_depth = bool(self.meta["depth"])
+            self.has_segmentation = bool(self.meta["segmentation"])
         except (KeyError, TypeError, ValueError, InputError) as error:
-            raise BadFile(f"{self.path / names.META_FILE} is damaged ({error}).") from None
-        self._files = [
-            _open(file) for file in sorted(self.path.glob("data/chunk-*/file-*.parquet"))
-        ]
-        # (file, row group, first frame, frames) of every row group, in order.
-        self._groups: list[tuple[int, int, int, int]] = []
+            raise BadFile(f"{file} is damaged ({error}).") from None
+        self._paths = sorted(self.path.glob("data/chunk-*/file-*.parquet"))
+        self._files = [_open(path) for path in self._paths]
+        self._cache: dict[tuple[str, int], list[pa.Buffer]] = {}
+        self._groups: list[_RowGroup] = []
         start = 0
-        for index, file in enumerate(self._files):
-            for group in range(file.metadata.num_row_groups):
-                count = file.metadata.row_group(group).num_rows
-                self._groups.append((index, group, start, count))
+        for index, reader in enumerate(self._files):
+            for group in range(reader.metadata.num_row_groups):
+                count = reader.metadata.row_group(group).num_rows
+                self._groups.append(_RowGroup(index, group, start, count))
                 start += count
         if start != self.length:
             raise BadFile(
                 f"{self.path} holds {start} frames; its {names.META_FILE} says {self.length}."
             )
 
-    def __len__(self) -> int:
-        return self.length
-
     @functools.cached_property
     def fingerprint(self) -> str:
-        """sha256 (hex) over the data files and `meta/surgicai.json`."""
+        """Hash (hex) of the data files and `meta/surgicai.json`."""
         total = hashlib.sha256()
-        for file in [
-            *sorted(self.path.glob("data/chunk-*/file-*.parquet")),
-            self.path / names.META_FILE,
-        ]:
+        for file in (*self._paths, self.path / names.META_FILE):
             total.update(f"{file.relative_to(self.path)} {sha256_file(file)}\n".encode())
         return total.hexdigest()
 
@@ -129,6 +117,12 @@ class RenderedDataset:
         return self.views + (depth if self.has_depth else ())
 
     @property
+    def image_keys(self) -> list[str]:
+        """Image columns, in the order of the digest."""
+        keys = schema.image_keys(self.views, self.has_depth, self.has_segmentation)
+        return [key for key, _, _ in keys]
+
+    @property
     def video_keys(self) -> frozenset[str]:
         """Image columns that are videos."""
         return frozenset(map(names.image_key, self.views)) if self.video else frozenset()
@@ -138,17 +132,12 @@ class RenderedDataset:
         return episode_bounds(self.episode_index)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return every column that is no image, (N,) or (N, n): those of `layout.COLUMNS` and
-        LeRobot's.
-        """
-        return {
-            key: self._column(key) for key in (*schema.COLUMNS, "frame_index", "timestamp", "index")
-        }
+        """Return every column that is no image, (N,) or (N, n), by its key."""
+        keys = (*schema.COLUMNS, "frame_index", "timestamp", "index")
+        return {key: self._column(key) for key in keys}
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Return the RGB images of a view, or a depth view's grey ones, (stop - start, H, W, 3)
-        uint8.
-        """
+        """Return the images of one of the `sights`, (stop - start, H, W, 3) uint8 RGB."""
         if names.is_depth_view(view):
             return codecs.grey(self.depth(names.camera_of(view), start, stop))
         return self._images(names.image_key(self._view(view)), start, stop)
@@ -159,9 +148,7 @@ class RenderedDataset:
         return self._images(names.depth_key(self._view(view)), start, stop)
 
     def segmentation(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Return the segmentation images of a view, (stop - start, H, W, 1) uint8, indices in
-        `names.PARTS`.
-        """
+        """Return indices in `names.PARTS` of a view's pixels, (stop - start, H, W, 1) uint8."""
         self._check("segmentation", self.has_segmentation)
         return self._images(names.segmentation_key(self._view(view)), start, stop)[..., :1]
 
@@ -170,35 +157,39 @@ class RenderedDataset:
         if key in self.video_keys:
             yield from self._from_videos(key, start, stop)
             return
-        for position, (_, _, first, count) in enumerate(self._groups):
-            low, high = max(start, first), min(stop, first + count)
+        for position, group in enumerate(self._groups):
+            low = max(start, group.start)
+            high = min(stop, group.start + group.frames)
             content = self._content(key, position) if low < high else []
             for index in range(low, high):
-                yield codecs.decode(content[index - first], f"{self.path}: {key}, frame {index}")
+                where = f"{self.path}: {key}, frame {index}"
+                yield codecs.decode(content[index - group.start], where)
 
     def _from_videos(self, key: str, start: int, stop: int) -> Iterator[np.ndarray]:
         """Yield the frames start … stop - 1 of a video column."""
         for row in self._rows:
             first = row["dataset_from_index"]
-            low, high = max(start, first), min(stop, row["dataset_to_index"])
+            low = max(start, first)
+            high = min(stop, row["dataset_to_index"])
             if low < high:
-                chunk, file = row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]
+                chunk = row[f"videos/{key}/chunk_index"]
+                file = row[f"videos/{key}/file_index"]
                 path = self.path / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
                 begin = round(row[f"videos/{key}/from_timestamp"] * self.fps)
                 yield from read_frames(path, begin + low - first, high - low, self.fps)
 
     @functools.cached_property
-    def _rows(self) -> list[dict[str, Any]]:
+    def _rows(self) -> list[schema.Table]:
         """Where every episode is in the videos."""
         wanted = [f"videos/{key}/{name}" for key in self.video_keys for name in VIDEO_PLACE]
-        rows: list[dict[str, Any]] = []
+        rows: list[schema.Table] = []
         for file in sorted(self.path.glob("meta/episodes/chunk-*/file-*.parquet")):
             try:
                 columns = ["dataset_from_index", "dataset_to_index", *wanted]
                 rows.extend(_open(file).read(columns).select(columns).to_pylist())
             except (KeyError, pa.ArrowException) as error:
                 raise BadFile(
-                    f"{file} does not say where the videos are ({_line(error)})."
+                    f"{file} does not say where the videos are ({first_line(error)})."
                 ) from None
         return rows
 
@@ -238,24 +229,26 @@ class RenderedDataset:
         for index, frame in enumerate(self.decoded(key, start, stop)):
             if frame.shape != shape[1:] or frame.dtype != batch.dtype:
                 raise BadFile(
-                    f"{self.path}: {key}, frame {start + index}: it is {frame.shape} {frame.dtype}; "
-                    f"expected {shape[1:]} {batch.dtype}."
+                    f"{self.path}: {key}, frame {start + index}: it is {frame.shape} "
+                    f"{frame.dtype}; expected {shape[1:]} {batch.dtype}."
                 )
             batch[index] = frame
         return batch
 
     def _content(self, key: str, position: int) -> list[pa.Buffer]:
         """Return the encoded images of one row group; the last few are kept."""
-        cache = self.__dict__.setdefault("_cache", {})
-        if (key, position) not in cache:
-            while len(cache) >= 2 * max(1, len(self.views)):
-                cache.pop(next(iter(cache)))
-            file, group, _, _ = self._groups[position]
-            column = self._read(file, group, f"{key}.bytes", key).combine_chunks()
-            cache[key, position] = [item.as_buffer() for item in pc.struct_field(column, "bytes")]
-        return cache[key, position]
+        if (key, position) not in self._cache:
+            while len(self._cache) >= 2 * max(1, len(self.views)):
+                self._cache.pop(next(iter(self._cache)))
+            group = self._groups[position]
+            column = self._read(group.file, group.number, f"{key}.bytes", key).combine_chunks()
+            content = [item.as_buffer() for item in pc.struct_field(column, "bytes")]
+            self._cache[key, position] = content
+        return self._cache[key, position]
 
-    def _read(self, file: int, group: int | None, column: str, key: str | None = None) -> Any:
+    def _read(
+        self, file: int, group: int | None, column: str, key: str | None = None
+    ) -> pa.ChunkedArray:
         """Read one column of one file or row group."""
         reader = self._files[file]
         try:
@@ -264,8 +257,28 @@ class RenderedDataset:
             return table.column(key or column)
         except (OSError, KeyError, pa.ArrowException) as error:
             raise BadFile(
-                f"{self.path}: column {key or column} cannot be read ({_line(error)})."
+                f"{self.path}: column {key or column} cannot be read ({first_line(error)})."
             ) from None
+
+
+def _read_meta(path: Path) -> schema.Table:
+    """Return the content of `meta/surgicai.json`, or raise `BadFile`."""
+    file = path / names.META_FILE
+    if not file.is_file():
+        raise BadFile(
+            f"{path} is not a dataset of surgicai-vision (no {names.META_FILE} in it); make one "
+            "with 'surgicai-vision render-demos'."
+        )
+    meta = read_json(file)
+    if not isinstance(meta, dict):
+        raise BadFile(f"{file} is damaged (it holds no table).")
+    if meta.get("format") != schema.FORMAT:
+        raise BadFile(
+            f"{path} was written by another version of surgicai-vision (format "
+            f"{meta.get('format', 1)}; this version reads {schema.FORMAT}); render it again with "
+            "'surgicai-vision render-demos'."
+        )
+    return meta
 
 
 def _open(path: Path) -> pq.ParquetFile:
@@ -273,9 +286,4 @@ def _open(path: Path) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(path)
     except (OSError, pa.ArrowException) as error:
-        raise BadFile(f"{path} is not a readable parquet file ({_line(error)}).") from None
-
-
-def _line(error: Exception) -> str:
-    """Return the first line of an error's text."""
-    return (str(error).splitlines() or [type(error).__name__])[0]
+        raise BadFile(f"{path} is not a readable parquet file ({first_line(error)}).") from None

@@ -1,6 +1,4 @@
-"""What a good episode of ours is: one rule for the check of a whole dataset and for the repair of a
-broken one.
-"""
+"""Rules for an episode of ours, for the check of a dataset and the repair of a broken one."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -10,9 +8,7 @@ from surgicai_vision.core import names
 from surgicai_vision.dataset import schema
 
 MOVED = 0.001
-"""An arm or a needle that went further than this between two frames [m] must be seen to have
-moved.
-"""
+"""An arm or a needle that went further between two frames [m] must be seen to have moved."""
 
 
 def episode_problems(number: int, columns: Mapping[str, np.ndarray], fps: float) -> Iterator[str]:
@@ -20,7 +16,7 @@ def episode_problems(number: int, columns: Mapping[str, np.ndarray], fps: float)
 
     Args:
         number: its index in the dataset.
-        columns: its rows of `layout.COLUMNS`, `frame_index` and `timestamp`.
+        columns: its rows of `schema.COLUMNS`, `frame_index` and `timestamp`.
         fps: frames a second.
     """
     count = len(columns["frame_index"])
@@ -38,11 +34,11 @@ def episode_problems(number: int, columns: Mapping[str, np.ndarray], fps: float)
 def number_problems(columns: Mapping[str, np.ndarray]) -> Iterator[str]:
     """Yield which columns hold numbers that are not finite, or actions outside [-1, 1]."""
     for key in schema.COLUMNS:
-        wrong = ~np.isfinite(columns[key].astype(np.float64)).reshape(len(columns[key]), -1).all(
-            axis=1
-        )
+        finite = np.isfinite(columns[key].astype(np.float64)).reshape(len(columns[key]), -1)
+        wrong = ~finite.all(axis=1)
         if wrong.any():
-            yield f"{key}: {wrong.sum()} frames with numbers that are not finite, first {wrong.argmax()}."
+            first = wrong.argmax()
+            yield f"{key}: {wrong.sum()} frames with numbers that are not finite, first {first}."
     if len(columns[names.ACTION]) and np.nanmax(np.abs(columns[names.ACTION])) > 1.0:
         yield f"{names.ACTION}: values outside [-1, 1]."
 
@@ -74,7 +70,8 @@ class ImageWatch:
         self._shown = np.concatenate(
             [rows[names.STATE][:, :3], rows[names.NEEDLE_POSE][:, :3]], axis=1
         )
-        self._size, self._last = size, self._shown[0]
+        self._size = size
+        self._last = self._shown[0]
         self._before: np.ndarray | None = None
 
     def problem(self, index: int, frame: np.ndarray) -> str:
@@ -84,7 +81,8 @@ class ImageWatch:
             if self._watched and np.abs(self._shown[index] - self._last).max() > MOVED:
                 problem = problem or "the image before it again, although something moved"
         else:
-            self._before, self._last = frame, self._shown[index]
+            self._before = frame
+            self._last = self._shown[index]
         return problem
 
 
@@ -94,7 +92,7 @@ def image_problem(frame: np.ndarray, size: int) -> str:
         return f"it is {frame.shape[0]} × {frame.shape[1]}, not {size} × {size}"
     if frame.dtype == np.float32 and not (np.isfinite(frame).all() and frame.min() > 0.0):
         return "depth that is not finite and positive"
-    low, high = frame.min(), frame.max()
-    if low == high:
-        return "black" if high == 0 else "of one colour"
+    highest = frame.max()
+    if frame.min() == highest:
+        return "black" if highest == 0 else "of one colour"
     return ""

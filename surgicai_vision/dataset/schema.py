@@ -1,6 +1,6 @@
-"""Layout of our datasets: which LeRobot features there are, and the hash over what they hold.
+"""Features of our datasets, and the digest of their content.
 
-`features(views, size, …)` is the LeRobot feature table; `episode_digest` hashes one episode's
+`features(views, size, …)` is the LeRobot feature table; `EpisodeDigest` hashes one episode's
 decoded images and columns in a fixed order, and `dataset_digest` the episodes in theirs, so that a
 dataset has one digest however it was compressed, split into files or rendered.
 """
@@ -14,6 +14,9 @@ import numpy as np
 
 from surgicai_vision.core import names
 
+Table = Mapping[str, Any]
+"""A JSON object, as it is read from a file."""
+
 FORMAT = 2
 """Version of `meta/surgicai.json`; surgicai-vision 0.1 wrote none."""
 
@@ -26,9 +29,7 @@ VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         names.PRIVILEGED_STATE: names.PRIVILEGED_NAMES,
     }
 )
-"""float32 columns and the names of their elements; [m], [rad] and unit quaternions;
-privileged_state in [cm].
-"""
+"""float32 columns → names of their elements: [m], [rad], unit quaternions; privileged [cm]."""
 
 SCALARS: Mapping[str, str] = MappingProxyType(
     {
@@ -40,9 +41,7 @@ SCALARS: Mapping[str, str] = MappingProxyType(
         names.SEED: "int64",
     }
 )
-"""One-element columns → dtype. Reward, done, success and contact are those after the frame's
-action.
-"""
+"""One-element columns → dtype; reward, done, success and contact are those after the action."""
 
 COLUMNS = (*VECTORS, *SCALARS)
 """Every column of ours that is no image, in the order of the digest."""
@@ -60,20 +59,18 @@ def image_keys(views: Sequence[str], depth: bool, segmentation: bool) -> list[tu
     return keys
 
 
-def features(
-    views: Sequence[str], size: int, depth: bool, segmentation: bool
-) -> dict[str, dict[str, Any]]:
+def features(views: Sequence[str], size: int, depth: bool, segmentation: bool) -> dict[str, Table]:
     """Return the LeRobot feature table.
 
     A segmentation image is stored as RGB with the part's index in all three channels: LeRobot
     admits one-channel images as depth only.
     """
-    table: dict[str, dict[str, Any]] = {}
+    table: dict[str, Table] = {}
     for key, _, modality in image_keys(views, depth, segmentation):
-        channels = 1 if modality == names.DEPTH else 3
-        table[key] = {"dtype": "image", "shape": (size, size, channels), "names": list(IMAGE_AXES)}
-        if modality == names.DEPTH:
-            table[key]["info"] = {"is_depth_map": True, "depth_unit": "m"}
+        shape = (size, size, 1 if modality == names.DEPTH else 3)
+        image = {"dtype": "image", "shape": shape, "names": list(IMAGE_AXES)}
+        info = {"is_depth_map": True, "depth_unit": "m"}
+        table[key] = image | ({"info": info} if modality == names.DEPTH else {})
     for key, elements in VECTORS.items():
         table[key] = {"dtype": "float32", "shape": (len(elements),), "names": list(elements)}
     for key, dtype in SCALARS.items():
@@ -115,7 +112,7 @@ class EpisodeDigest:
         self._images[key].add(frame)
 
     def take(self, key: str, digest: str) -> None:
-        """Take an image column's digest, of a `ImageDigest`, in the place of its frames."""
+        """Take an image column's `ImageDigest` in the place of its frames."""
         self._known[key] = digest
 
     def hexdigest(self, columns: Mapping[str, np.ndarray]) -> str:
@@ -131,5 +128,5 @@ class EpisodeDigest:
 
 
 def dataset_digest(episodes: Iterable[str]) -> str:
-    """sha256 (hex) over the episodes' digests, in order."""
+    """Return the sha256 (hex) of the episodes' digests, in order."""
     return hashlib.sha256("".join(episodes).encode()).hexdigest()

@@ -1,5 +1,4 @@
-"""Statistics of one episode in LeRobot's form: min, max, mean, std, count and five quantiles per
-feature.
+"""Statistics of one episode in LeRobot's form: min, max, mean, std, count and quantiles.
 
 Images stream through `ImageStatistics` one at a time, so memory is bounded; RGB counts every pixel
 (values in [0, 1] as LeRobot stores them), depth a fixed sixteenth of them [m]. Columns are exact.
@@ -32,9 +31,8 @@ class ImageStatistics:
         self._count += 1
         if frame.dtype == np.uint8:
             for channel in range(3):
-                self._histogram[channel] += cv2.calcHist([frame], [channel], None, [256], [0, 256])[
-                    :, 0
-                ]
+                counts = cv2.calcHist([frame], [channel], None, [256], [0, 256])
+                self._histogram[channel] += counts[:, 0]
         else:
             self._depths.append(frame[::DEPTH_STRIDE, ::DEPTH_STRIDE].ravel())
 

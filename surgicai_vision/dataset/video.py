@@ -6,11 +6,14 @@ A policy reads at random: every second frame is a key frame.
 from collections.abc import Iterator
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from surgicai_vision.core.errors import BadFile
+
+if TYPE_CHECKING:
+    import av
 
 CODECS = MappingProxyType(
     {
@@ -35,9 +38,11 @@ class VideoWriter:
 
         name, options = CODECS[codec]
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._container: Any = av.open(str(path), "w")
-        stream: Any = self._container.add_stream(name, rate=fps, options=dict(options))
-        stream.width = stream.height = size
+        self._container = av.open(str(path), "w")
+        stream = self._container.add_stream(name, rate=fps, options=dict(options))
+        assert isinstance(stream, av.VideoStream)  # as CODECS has it
+        stream.width = size
+        stream.height = size
         stream.pix_fmt = PIXELS
         self._stream = stream
         self.written = 0
@@ -54,7 +59,7 @@ class VideoWriter:
         self._mux(self._stream.encode())
         self._container.close()
 
-    def _mux(self, packets: Any) -> None:
+    def _mux(self, packets: "list[av.Packet]") -> None:
         self.written += sum(packet.size for packet in packets)
         self._container.mux(packets)
 
@@ -62,7 +67,7 @@ class VideoWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None
+        self, kind: type[BaseException] | None, error: object, trace: TracebackType | None
     ) -> None:
         self.close() if kind is None else self._container.close()
 
@@ -78,11 +83,10 @@ def read_frames(path: Path, first: int, count: int, fps: float) -> Iterator[np.n
     wanted = first
     try:
         with av.open(str(path)) as container:
-            stream: Any = container.streams.video[0]
-            stream.thread_type = (
-                "NONE"  # frames by slices in threads would cost more than they bring at this size
-            )
-            if first:
+            stream = container.streams.video[0]
+            # Decoding slices of so small a frame in threads costs more than it brings.
+            stream.thread_type = "NONE"
+            if first and stream.time_base:
                 container.seek(int(first / fps / stream.time_base), stream=stream)
             for frame in container.decode(stream):
                 number = round(frame.time * fps)

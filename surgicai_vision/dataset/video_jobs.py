@@ -1,8 +1,7 @@
-"""Encode a dataset's images as videos, one job for each view and block of episodes, and look at
-what came of it.
+"""Encode a dataset's images as videos, one job for each view and block of episodes.
 
-A block is a video file of its own. Blocks depend on the dataset alone, so files are the same for
-any workers.
+A block is a video file of its own. Blocks depend on the dataset alone, so the files are the same
+for any number of workers. Every frame is decoded again and compared with its image.
 """
 
 import functools
@@ -24,7 +23,9 @@ from surgicai_vision.dataset.video import VideoWriter, read_frames
 
 BLOCK_FRAMES = 2000
 """Frames of a block, at least, but for the last: some 10 MB of video, half a minute of one core."""
-VIDEO_FILE, LOOK_FILE = "video.mp4", "look.json"
+VIDEO_FILE = "video.mp4"
+COMPARISON_FILE = "comparison.json"
+"""Digest and error of every episode of a block."""
 
 Place = tuple[int, float, float]
 """(number of the video file, first second, second after the last)."""
@@ -36,7 +37,7 @@ class Encoded:
 
     Attributes:
         place: where it is in the view's videos.
-        digest: sha256 (hex) of its decoded frames, as `layout.EpisodeDigest` takes it.
+        digest: sha256 (hex) of its decoded frames, as `schema.EpisodeDigest` takes it.
         error: sum over its frames of the mean absolute error, out of 255.
     """
 
@@ -50,13 +51,11 @@ def encode_views(
     folder: Path,
     views: Sequence[str],
     video: str,
-    *,
     store: Path,
     context: RunContext,
     progress: Progress,
 ) -> list[dict[str, Encoded]]:
-    """Encode `views` into the videos of the LeRobot folder `folder`; return every episode's by
-    their keys.
+    """Encode some views of a dataset; return every episode's videos by their keys.
 
     Args:
         dataset: a dataset of images.
@@ -67,7 +66,8 @@ def encode_views(
         context: workers and engine.
         progress: counts the frames of all views.
     """
-    blocks, bounds = _blocks(dataset.bounds()), dataset.bounds()
+    bounds = dataset.bounds()
+    blocks = _blocks(bounds)
     same = {"dataset": str(dataset.path.resolve()), "video": video}
     jobs = [
         Job(
@@ -90,7 +90,8 @@ def encode_views(
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(result / VIDEO_FILE, target)
             start = bounds[first][0]
-            for index, row in zip(range(first, stop), read_json(result / LOOK_FILE), strict=True):
+            compared = read_json(result / COMPARISON_FILE)
+            for index, row in zip(range(first, stop), compared, strict=True):
                 low, high = ((frame - start) / dataset.fps for frame in bounds[index])
                 episodes[index][key] = Encoded((number, low, high), row["digest"], row["error"])
     return episodes
@@ -98,7 +99,8 @@ def encode_views(
 
 def _blocks(bounds: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return (first episode, episode after the last) of every block."""
-    blocks, first = [], 0
+    blocks = []
+    first = 0
     for index, (_, stop) in enumerate(bounds):
         if stop - bounds[first][0] >= BLOCK_FRAMES or index == len(bounds) - 1:
             blocks.append((first, index + 1))
@@ -113,20 +115,23 @@ def _dataset(folder: str) -> RenderedDataset:
 
 @job("encode-video", stages=("dataset",), packages=("numpy", "av"))
 def encode_block(folder: Path, dataset: str, video: str, view: str, first: int, stop: int) -> None:
-    """Job "encode-video": encode a view of the episodes first … stop - 1, and compare each frame
-    with its image.
-    """
-    data, key, path = _dataset(dataset), names.image_key(view), folder / VIDEO_FILE
+    """Encode a view of the episodes first … stop - 1 and compare each frame with its image."""
+    data = _dataset(dataset)
+    key = names.image_key(view)
+    path = folder / VIDEO_FILE
     bounds = data.bounds()[first:stop]
-    begin, end = bounds[0][0], bounds[-1][1]
+    begin = bounds[0][0]
+    end = bounds[-1][1]
     with VideoWriter(path, video, data.fps, data.image_size) as writer:
         for image in data.decoded(key, begin, end):
             writer.add(image)
-    rows, decoded = [], read_frames(path, 0, end - begin, data.fps)
+    rows = []
+    decoded = read_frames(path, 0, end - begin, data.fps)
     for low, high in bounds:
-        digest, error = schema.ImageDigest(), 0.0
+        digest = schema.ImageDigest()
+        error = 0.0
         for before, after in zip(data.decoded(key, low, high), decoded, strict=False):
             error += float(np.abs(after.astype(np.int16) - before).mean())
             digest.add(after)
         rows.append({"digest": digest.hexdigest(), "error": error})
-    write_json(folder / LOOK_FILE, rows)
+    write_json(folder / COMPARISON_FILE, rows)

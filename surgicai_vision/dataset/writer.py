@@ -3,15 +3,15 @@
     assemble(shards, out, features, text, meta)
 
 The episodes' parquet files are copied row group by row group into data files of at most 100 MB,
-with the index columns filled in, and LeRobot's metadata is written beside them. (LeRobot's own
-`aggregate_datasets` reads and rewrites the growing file for every episode: 7 to 20 ms a frame of
-two views with depth, where this takes below one.) Memory holds one episode. The folder appears
-under its name when it is complete.
+with the index columns filled in, and LeRobot's metadata is written beside them. Memory holds one
+episode. The folder appears under its name when it is complete.
+
+LeRobot's own `aggregate_datasets` reads and rewrites the growing file for every episode: 7 to 20 ms
+a frame of two views with depth, where this takes below one.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,21 +21,22 @@ from surgicai_vision.core import names
 from surgicai_vision.core.files import read_json, whole_folder, write_json
 from surgicai_vision.dataset.metadata import (
     DATA_FILE_MB,
-    EpisodeRow,
+    EpisodeMetadata,
     Features,
     arrow_schema,
     data_path,
     write_metadata,
 )
-from surgicai_vision.dataset.stats import column_statistics
+from surgicai_vision.dataset.schema import Table
+from surgicai_vision.dataset.stats import Statistics, column_statistics
 
-EPISODE_FILE, SUMMARY_FILE = "episode.parquet", "summary.json"
-"""What a rendered episode's folder holds."""
+EPISODE_FILE = "episode.parquet"
+"""Columns and images of a rendered episode, in its own folder."""
+SUMMARY_FILE = "summary.json"
+"""Statistics, digest and cameras of a rendered episode, beside `EPISODE_FILE`."""
 
 
-def assemble(
-    shards: Sequence[Path], out: Path, features: Features, text: str, meta: Mapping[str, Any]
-) -> None:
+def assemble(shards: Sequence[Path], out: Path, features: Features, text: str, meta: Table) -> None:
     """Write the dataset `out` from rendered episodes.
 
     Args:
@@ -67,31 +68,45 @@ def compression(schema: pa.Schema, depth: Sequence[str]) -> dict[str, str]:
         if pa.types.is_struct(field.type):
             codecs[f"{field.name}.bytes"] = "zstd" if field.name in depth else "none"
             codecs[f"{field.name}.path"] = "zstd"
+        elif pa.types.is_fixed_size_list(field.type):
+            codecs[f"{field.name}.list.element"] = "zstd"
         else:
-            codecs[
-                f"{field.name}.list.element"
-                if pa.types.is_fixed_size_list(field.type)
-                else field.name
-            ] = "zstd"
+            codecs[field.name] = "zstd"
     return codecs
+
+
+def column_array(values: np.ndarray) -> pa.Array:
+    """Return a column (T,) or (T, n) as Arrow scalars or lists of fixed size."""
+    flat = pa.array(np.ascontiguousarray(values).ravel())
+    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim == 2 else flat
 
 
 class DataFiles:
     """The growing data files of a dataset in `folder`: one row group an episode."""
 
     def __init__(self, folder: Path, features: Features, fps: float = names.FPS):
-        self._folder, self._schema, self._fps = folder, arrow_schema(features), fps
-        self._file, self._frames, self._bytes = -1, 0, 0
+        self._folder = folder
+        self._schema = arrow_schema(features)
+        self._fps = fps
+        self._file = -1
+        self._frames = 0
+        self._bytes = 0
         self._writer: pq.ParquetWriter | None = None
-        self._compression = compression(
-            self._schema, [key for key, row in features.items() if row.get("info")]
-        )
+        depth = [key for key, row in features.items() if row.get("info")]
+        self._compression = compression(self._schema, depth)
 
-    def append(self, index: int, episode: pa.Table, statistics: Mapping[str, Any]) -> EpisodeRow:
-        """Write episode `index` and return its row; the index columns are made here, `task_index`
-        if it is missing.
+    def append(
+        self, index: int, episode: pa.Table, statistics: Mapping[str, Statistics]
+    ) -> EpisodeMetadata:
+        """Write one episode and return its metadata.
+
+        Args:
+            index: its number; the index columns are made from it.
+            episode: its rows; `task_index` is 0 where they have none.
+            statistics: those of the other columns.
         """
-        count, start = len(episode), self._frames
+        count = len(episode)
+        start = self._frames
         indices = {
             "timestamp": (np.arange(count) / self._fps).astype(np.float32),
             "frame_index": np.arange(count),
@@ -111,7 +126,7 @@ class DataFiles:
         self._bytes = (self._folder / data_path(self._file)).stat().st_size
         self._frames += count
         own = {key: column_statistics(values) for key, values in indices.items()}
-        return EpisodeRow(start, self._frames, self._file, {**statistics, **own})
+        return EpisodeMetadata(start, self._frames, self._file, {**statistics, **own})
 
     def _present(self) -> pq.ParquetWriter:
         """Return the writer of the present data file; a new one when the last is full."""

@@ -24,9 +24,9 @@ from surgicai_vision.dataset import (
     metadata,
     open_dataset,
     render_demos,
+    render_jobs,
     schema,
 )
-from surgicai_vision.dataset import render as render_module
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
 from surgicai_vision.dataset.subset import with_frame_stride
 from surgicai_vision.demos.record import record
@@ -44,10 +44,10 @@ def fake(monkeypatch):
     def env(config, views, size, depth, segmentation):
         return FakeEnv(CONFIG, views, size, depth, segmentation)
 
-    monkeypatch.setattr(render_module, "_env", env)
-    monkeypatch.setattr(render_module, "_renderer", lambda: "none")
+    monkeypatch.setattr(render_jobs, "_env", env)
+    monkeypatch.setattr(render_jobs, "_renderer", lambda: "none")
     monkeypatch.setattr(
-        render_module, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()}
+        render_jobs, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()}
     )
 
 
@@ -180,7 +180,7 @@ def test_rendering_again_does_nothing_and_other_options_are_refused(
     tmp_path, fake, demos, monkeypatch
 ):
     first = render(demos, tmp_path / "set")
-    monkeypatch.setattr(render_module, "_env", None)
+    monkeypatch.setattr(render_jobs, "_env", None)
     assert render(demos, tmp_path / "set").digest == first.digest
     with pytest.raises(OutputExists, match="other demonstrations or options"):
         render(demos, tmp_path / "set", size=64)
@@ -208,7 +208,7 @@ def test_demos_of_another_scene_are_refused(tmp_path, fake, demos, monkeypatch):
             super().__init__(*arguments)
             self.scene.hash = "0" * 64
 
-    monkeypatch.setattr(render_module, "_env", lambda config, *rest: Other(CONFIG, *rest))
+    monkeypatch.setattr(render_jobs, "_env", lambda config, *rest: Other(CONFIG, *rest))
     with pytest.raises(InputError, match="recorded in another scene"):
         render(demos, tmp_path / "set")
 

@@ -3,17 +3,17 @@
 import numpy as np
 from fake_env import FakeEnv, FakeExpert
 
-from surgicai_vision.dataset import render
+from surgicai_vision.dataset import render_jobs
 from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import write_demo, write_marker
 
 
 def render_with_fake_env(monkeypatch, config):
     """Let `render_demos` see the stand-in environment, without GL."""
-    monkeypatch.setattr(render, "_env", lambda _, *rest: FakeEnv(config, *rest))
-    monkeypatch.setattr(render, "_renderer", lambda: "none")
+    monkeypatch.setattr(render_jobs, "_env", lambda _, *rest: FakeEnv(config, *rest))
+    monkeypatch.setattr(render_jobs, "_renderer", lambda: "none")
     monkeypatch.setattr(
-        render, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()}
+        render_jobs, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()}
     )
 
 

@@ -1,0 +1,163 @@
+"""The job that renders one episode: its states → images and columns.
+
+Every state of a demonstration is set in the environment as it was recorded and observed; frame t is
+the state before action t. This module needs MuJoCo, so only the processes that render import it.
+"""
+
+import atexit
+import functools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from surgicai_vision import envs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.files import write_json
+from surgicai_vision.dataset import codecs, schema
+from surgicai_vision.dataset.schema import Table
+from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
+from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, column_array, compression
+from surgicai_vision.demos.store import Demo, read_demo
+from surgicai_vision.scene.cameras import extrinsics, intrinsics
+from surgicai_vision.scene.rendering import renderer_string
+
+MEASURED: Mapping[str, Callable[[envs.SuturingEnv], np.ndarray]] = {
+    names.STATE: lambda env: env.agent_pos(),
+    names.NEEDLE_POSE: lambda env: env.needle_pose(),
+    names.BOTH_ARMS: lambda env: env.both_arms(),
+    names.PRIVILEGED_STATE: lambda env: env.state_vector(),
+}
+"""Column → what the env measures in the state that was set."""
+
+
+@functools.lru_cache(maxsize=1)
+def _env(
+    config: str, views: tuple[str, ...], size: int, depth: bool, segmentation: bool
+) -> envs.SuturingEnv:
+    """Return this process's environment; the one before is closed with its GL context."""
+    # The GL context must go before the interpreter does.
+    atexit.register(_env.cache_clear)
+    return envs.make(
+        from_mapping(TaskConfig, json.loads(config)),
+        obs_type="pixels_agent_pos",
+        cameras=views,
+        image_size=size,
+        depth=depth,
+        segmentation=segmentation,
+    )
+
+
+def render_episode(
+    folder: Path,
+    demo: str,
+    views: Sequence[str],
+    size: int,
+    depth: bool,
+    segmentation: bool,
+    frame_stride: int = 1,
+) -> None:
+    """Write one episode's columns and images into `folder`; the job "render-episode"."""
+    episode = read_demo(Path(demo))
+    env = _env(json.dumps(to_mapping(episode.config)), tuple(views), size, depth, segmentation)
+    if env.scene.hash != episode.scene_hash:
+        raise BadFile(
+            f"{demo} was recorded in another scene (hash {episode.scene_hash[:12]}, now "
+            f"{env.scene.hash[:12]}); record it again with this version."
+        )
+    keys = schema.image_keys(views, depth, segmentation)
+    content: dict[str, list[bytes]] = {key: [] for key, _, _ in keys}
+    statistics = {key: ImageStatistics() for key in content}
+    digest = schema.EpisodeDigest(content)
+    measured: dict[str, list[np.ndarray]] = {key: [] for key in MEASURED}
+    for state in episode.state[:-1:frame_stride]:
+        env.set_state_vector(state)
+        observation = env.observe()
+        assert isinstance(observation, dict)  # the env shows images
+        for key, view, modality in keys:
+            frame = observation[names.frame_key(view, modality)]
+            # LeRobot admits one-channel images as depth only.
+            frame = np.repeat(frame, 3, axis=2) if modality == names.SEGMENTATION else frame
+            content[key].append(codecs.encode(frame))
+            statistics[key].add(frame)
+            digest.add(key, frame)
+        for key, measure in MEASURED.items():
+            measured[key].append(measure(env))
+    columns = _columns(episode, frame_stride, measured)
+    depth_keys = [key for key, _, modality in keys if modality == names.DEPTH]
+    _write_episode(folder, content, columns, depth_keys)
+    summary = {
+        "frames": len(columns[names.DONE]),
+        "digest": digest.hexdigest(columns),
+        "statistics": {
+            **{key: statistics[key].result() for key in content},
+            **{key: column_statistics(columns[key]) for key in schema.COLUMNS},
+        },
+        "renderer": _renderer(),
+        "cameras": {view: _camera(env, view, size, episode.state) for view in views},
+    }
+    write_json(folder / SUMMARY_FILE, summary)
+
+
+def _columns(
+    demo: Demo, frame_stride: int, measured: Mapping[str, Sequence[np.ndarray]]
+) -> dict[str, np.ndarray]:
+    """Return every column of `schema.COLUMNS`, (T,) or (T, n), for the T frames rendered."""
+    frames = len(measured[names.STATE])
+    return {
+        **{key: np.stack(rows).astype(np.float32) for key, rows in measured.items()},
+        names.ACTION: demo.action[::frame_stride],
+        names.REWARD: demo.reward[::frame_stride],
+        names.DONE: np.arange(frames) == frames - 1,
+        names.SUCCESS: demo.success[::frame_stride],
+        names.CONTACT: demo.contact[::frame_stride],
+        names.PHASE: demo.phase[::frame_stride].astype(np.int64),
+        names.SEED: np.full(frames, demo.seed, np.int64),
+    }
+
+
+def _write_episode(
+    folder: Path,
+    content: Mapping[str, list[bytes]],
+    columns: Mapping[str, np.ndarray],
+    depth_keys: Sequence[str],
+) -> None:
+    """Write one episode as parquet, images as LeRobot's (bytes, path) pairs."""
+    arrays: dict[str, pa.Array] = {}
+    for key, images in content.items():
+        paths = [f"frame-{index:06d}" for index in range(len(images))]
+        arrays[key] = pa.StructArray.from_arrays(
+            [pa.array(images, pa.binary()), pa.array(paths, pa.string())], ["bytes", "path"]
+        )
+    for key, values in columns.items():
+        arrays[key] = column_array(values)
+    table = pa.table(arrays)
+    codec = compression(table.schema, depth_keys)
+    pq.write_table(table, folder / EPISODE_FILE, compression=codec, use_dictionary=False)
+
+
+def _renderer() -> str:
+    """Return the GL renderer that drew the images."""
+    return renderer_string()
+
+
+def _camera(env: envs.SuturingEnv, view: str, size: int, states: np.ndarray) -> Table:
+    """Return a camera's geometry.
+
+    Returns:
+        `intrinsics` (3, 3) and `T_world_camera` (4, 4) with OpenCV's axes [m], None if it moves.
+    """
+    poses = []
+    for state in (states[0], states[-1]):
+        env.set_state_vector(state)
+        poses.append(extrinsics(env.model, env.data, view))
+    still = np.array_equal(poses[0], poses[1])
+    return {
+        "intrinsics": intrinsics(env.model, view, size, size).tolist(),
+        "T_world_camera": poses[0].tolist() if still else None,
+    }
