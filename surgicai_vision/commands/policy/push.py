@@ -1,0 +1,95 @@
+"""`policy push`: share a policy on the Hugging Face Hub, with a model card."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.options import DIRECTORY
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.files import read_json
+
+if TYPE_CHECKING:
+    from surgicai_vision.training.checkpoint import Checkpoint
+    from surgicai_vision.training.hub import Successes
+
+app = App(
+    name="push",
+    help_epilogue="""\
+example:
+  surgicai-vision policy push outputs/train/grasp-random-back-seed0 \\
+      --repo somebody/suturing-grasp-bc --private""",
+)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `policy push`.
+
+    Attributes:
+        policy: A checkpoint folder.
+        repo: Where to; made when it does not exist.
+        evaluation: Folder of an evaluation of this policy, whose successes the card tells.
+        private: Make it private.
+        licence: The Hub's short name of a licence.
+        dry_run: Show the card and upload nothing.
+    """
+
+    policy: Annotated[Path, DIRECTORY] = field(kw_only=False)
+    repo: Annotated[str, Parameter(metavar="USER/NAME")]
+    evaluation: Annotated[Path | None, DIRECTORY] = None
+    private: bool = False
+    licence: Annotated[str, Parameter(metavar="NAME")] = "mit"
+    dry_run: bool = False
+
+
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
+    """Verify the policy, push it and print where it is."""
+    from surgicai_vision.training.checkpoint import read_checkpoint
+    from surgicai_vision.training.hub import model_card, push_policy
+
+    checkpoint = read_checkpoint(options.policy)
+    successes = _successes(options.evaluation, checkpoint) if options.evaluation else None
+    if options.dry_run:
+        console.say(model_card(checkpoint, options.repo, options.licence, successes))
+        return {"repo": options.repo, "dry_run": True}
+    address = push_policy(
+        options.policy,
+        options.repo,
+        private=options.private,
+        licence=options.licence,
+        successes=successes,
+    )
+    console.say(f"pushed: {address}")
+    return {"repo": options.repo, "commit": address}
+
+
+def _successes(folder: Path, checkpoint: "Checkpoint") -> "Successes":
+    """Return what an evaluation counted.
+
+    Raises:
+        InputError: it is of another policy.
+    """
+    from surgicai_vision.evaluation.storage import MARKER, read_rows
+    from surgicai_vision.training.hub import Successes
+
+    seeds = [int(row["seed"]) for row in read_rows(folder)]
+    stored = read_json(folder / MARKER)
+    evaluated = stored["about"].get("checkpoint") or {}
+    if evaluated.get("policy_sha256") != checkpoint.policy_sha256:
+        raise InputError(
+            f"--evaluation {folder} is of another policy than {checkpoint.folder}; "
+            "give one of this policy, or leave it out."
+        )
+    summary = stored["summary"]
+    low, high = summary["ci95"]
+    return Successes(
+        count=summary["successes"],
+        episodes=summary["episodes"],
+        interval=(low, high),
+        seeds=tuple(seeds),
+    )

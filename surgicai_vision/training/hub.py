@@ -1,0 +1,229 @@
+"""Share a trained policy on the Hugging Face Hub: with a model card, verified before and after.
+
+    push_policy(Path("outputs/train/…"), "somebody/suturing-grasp-bc")
+    pull_policy("somebody/suturing-grasp-bc", Path("outputs/train/pulled"))
+
+What is shared is the checkpoint as it lies in its folder, so its own hashes tell whether it was
+changed on the way. `PyTorchModelHubMixin` would write a second format, without them.
+"""
+
+import io
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.executor import building
+from surgicai_vision.core.files import check_output
+from surgicai_vision.core.hub import connect, refusals_in_one_line
+from surgicai_vision.core.tasks import task_text
+from surgicai_vision.scene import build_scene
+from surgicai_vision.training.checkpoint import CARD, WEIGHTS, Checkpoint, read_checkpoint
+from surgicai_vision.training.policies import restore
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+
+MODEL_CARD = "README.md"
+LICENCE = "mit"
+
+
+@dataclass(frozen=True)
+class Successes:
+    """Counted successes of a policy on held-out starts.
+
+    Attributes:
+        count: successful episodes.
+        episodes: all episodes.
+        interval: exact 95 % interval of the rate.
+        seeds: seed of each start.
+    """
+
+    count: int
+    episodes: int
+    interval: tuple[float, float]
+    seeds: tuple[int, ...]
+
+    @property
+    def text(self) -> str:
+        """The count with its interval, in words."""
+        low, high = self.interval
+        return (
+            f"{self.count}/{self.episodes} (95 % interval {low:.0%} to {high:.0%}), "
+            f"start seeds {min(self.seeds)} to {max(self.seeds)}"
+        )
+
+
+def model_card(
+    checkpoint: Checkpoint, repo: str, licence: str = LICENCE, successes: Successes | None = None
+) -> str:
+    """Return the card of a policy, Markdown with the Hub's header.
+
+    Args:
+        checkpoint: the policy.
+        repo: "user/name".
+        licence: the Hub's short name of a licence.
+        successes: what an evaluation of this policy counted, where there is one.
+    """
+    from huggingface_hub import EvalResult, ModelCardData
+
+    task = checkpoint.task.task
+    results = None
+    if successes is not None:
+        rate = EvalResult(
+            task_type="robotics",
+            task_name=task,
+            dataset_type="simulation",
+            dataset_name=f"{task}, {successes.episodes} starts from {min(successes.seeds)}",
+            metric_type="success_rate",
+            metric_value=successes.count / successes.episodes,
+        )
+        results = [rate]
+    header = ModelCardData(
+        license=licence,
+        library_name="surgicai-vision",
+        pipeline_tag="robotics",
+        tags=["surgical-robotics", "suturing", "imitation-learning"],
+        model_name=repo.partition("/")[2],
+        eval_results=results,
+    )
+    facts = {**_facts(checkpoint), "licence": licence}
+    if successes is not None:
+        facts["successes"] = successes.text
+    rows = "\n".join(f"| {name} | {text} |" for name, text in facts.items())
+    settings = "\n".join(f"{key}: {value}" for key, value in checkpoint.recipe.items())
+    return f"""---
+{header.to_yaml().strip()}
+---
+
+# {repo.partition("/")[2]}
+
+{task_text(task)}
+
+A policy for the task `{task}` in simulated robotic suturing, trained by imitation with
+surgicai-vision ({checkpoint.code_version}). It is no medical device.
+
+| | |
+|---|---|
+{rows}
+
+The recipe, value by value:
+
+```yaml
+{settings}
+```
+
+```sh
+surgicai-vision policy pull {repo} --out policy
+surgicai-vision evaluate policy
+```
+"""
+
+
+def _facts(checkpoint: Checkpoint) -> dict[str, str]:
+    """Return what the card tells of a policy, name by name."""
+    encoder = checkpoint.encoder
+    held_out = len(checkpoint.validation_episodes)
+    facts = {
+        "policy": (
+            f"`{checkpoint.policy}`, recipe `{checkpoint.recipe_name}`, {checkpoint.epoch} epochs"
+        ),
+        "training seed": str(checkpoint.seed),
+        "views": ", ".join(checkpoint.views) or "none",
+        "images": f"{checkpoint.image_size} × {checkpoint.image_size} pixels",
+        "proprioception": "yes" if checkpoint.proprioception else "no",
+        "data": (f"{checkpoint.demonstrations} demonstrations trained on, {held_out} held out"),
+        "frames": str(checkpoint.frames),
+        "dataset, fingerprint": f"`{checkpoint.dataset}`",
+        "scene, sha256": f"`{build_scene(checkpoint.task.scene).hash}`",
+        "policy, sha256": f"`{checkpoint.policy_sha256}`",
+    }
+    if encoder is not None:
+        facts["encoder"] = (
+            f"`{encoder.name}`, pool {encoder.pool}, frozen and not part of this repository; "
+            f"its weights: {encoder.card['source']}, {encoder.card['licence']}"
+        )
+        facts["encoder's weights, sha256"] = f"`{encoder.weights_sha256}`"
+    return facts
+
+
+def push_policy(
+    folder: Path,
+    repo: str,
+    *,
+    private: bool = False,
+    licence: str = LICENCE,
+    successes: Successes | None = None,
+    api: "HfApi | None" = None,
+) -> str:
+    """Push a checkpoint with its card, in one commit; return the commit's address.
+
+    Args:
+        folder: the checkpoint folder.
+        repo: "user/name"; made when it does not exist.
+        private: make it private.
+        licence: the Hub's short name of a licence.
+        successes: what an evaluation of this policy counted, where there is one.
+        api: the Hub's client; made here by default.
+
+    Raises:
+        InputError: a bad name.
+        BadFile: no whole checkpoint.
+        SurgicaiError: offline, or the Hub refuses.
+    """
+    checkpoint = read_checkpoint(folder)
+    restore(checkpoint)
+    api = connect(repo, api)
+    from huggingface_hub import CommitOperationAdd
+
+    card = model_card(checkpoint, repo, licence, successes)
+    operations = [CommitOperationAdd(name, folder / name) for name in (CARD, WEIGHTS)]
+    operations.append(CommitOperationAdd(MODEL_CARD, io.BytesIO(card.encode())))
+    with refusals_in_one_line(repo):
+        api.create_repo(repo, repo_type="model", private=private, exist_ok=True)
+        text = f"{checkpoint.name} for {checkpoint.task.task}"
+        commit = api.create_commit(repo, operations, commit_message=text, repo_type="model")
+    return str(commit.commit_url)
+
+
+def pull_policy(
+    repo: str, out: Path, *, revision: str | None = None, api: "HfApi | None" = None
+) -> Checkpoint:
+    """Fetch a policy into the new folder `out` and verify it; return its checkpoint.
+
+    Args:
+        repo: "user/name".
+        out: folder to make.
+        revision: branch, tag or commit; None takes the main branch.
+        api: the Hub's client; made here by default.
+
+    Raises:
+        InputError: a bad name.
+        OutputExists: `out` holds something.
+        BadFile: what came is no whole policy, or was changed.
+        SurgicaiError: offline, or the Hub refuses.
+    """
+    check_output(out)
+    api = connect(repo, api)
+    with building(out) as (store, result):
+        fetched = store / "fetched"
+        with refusals_in_one_line(repo):
+            api.snapshot_download(
+                repo,
+                repo_type="model",
+                revision=revision,
+                local_dir=fetched,
+                allow_patterns=[CARD, WEIGHTS, MODEL_CARD],
+            )
+        shutil.rmtree(fetched / ".cache", ignore_errors=True)  # the Hub client's notes
+        try:
+            restore(read_checkpoint(fetched))
+        except BadFile as error:
+            problem = str(error).replace(f"{fetched}{os.sep}", "").replace(str(fetched), "it")
+            raise BadFile(f"{repo} holds no policy that can be used: {problem}") from None
+        if out.exists():
+            out.rmdir()  # empty: checked before
+        os.rename(fetched, result)
+    return read_checkpoint(out)
