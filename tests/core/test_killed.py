@@ -116,6 +116,7 @@ def kill_and_look(started, number, delay):
 def test_nothing_outlives_a_killed_command(tmp_path, given, verb):
     """Killed as soon as it has a child, which may still start, and while that one works."""
     run = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": tmp_path}
+    run["env"] = {**os.environ, "TMPDIR": str(tmp_path)}  # a killed process leaves its files there
     short = verb == "import-demos"  # its child lives for a moment only
     for number, delay in ((signal.SIGTERM, 0), (signal.SIGKILL, 0 if short else 1)):
         started = subprocess.Popen(command(verb, given, tmp_path / str(number)), **run)
