@@ -43,7 +43,7 @@ TOPICS = MappingProxyType(
 
 @dataclass(frozen=True)
 class Motion:
-    """What stood where in each state of a demonstration, every 20 ms.
+    """The poses in each state of a demonstration, every 20 ms.
 
     Tips (T, 4, 4) in the arm's base, jaws and joints by arm, needles (T, 4, 4) in world, phases
     (T,).
@@ -65,28 +65,26 @@ def shown(task, seed=0):
     env = envs.make(TaskConfig(task))
     result = rollout(env, Expert(env), seed)
     assert result.success
-    return watched(env, result.demo)
+    return measured_motion(env, result.demo)
 
 
-def watched(env, demo):
+def measured_motion(env, demo):
     simulation = env.simulation
     tip, jaw, joints = ({arm: [] for arm in names.ARMS} for _ in range(3))
-    lying = []
+    needles = []
     for state in demo.state:
         env.set_state_vector(state)
-        lying.append(poses.square(simulation.needle()))
+        needles.append(poses.square(simulation.needle()))
         for arm in names.ARMS:
             tip[arm].append(poses.square(simulation.tip_in_base(arm)))
             jaw[arm].append(simulation.jaw(arm))
             joints[arm].append(env.data.qpos[env.scene.arms[arm].qpos].copy())
     arrays = ({arm: np.array(rows) for arm, rows in table.items()} for table in (tip, jaw, joints))
-    return Motion(*arrays, np.array(lying), np.append(demo.phase, demo.phase[-1]))
+    return Motion(*arrays, np.array(needles), np.append(demo.phase, demo.phase[-1]))
 
 
 def streams(motion, jaw_scale=2.0, labels=True):
-    """Return role → (times since the start [ns], values); the jaw as dVRK has it, twice a finger's
-    angle.
-    """
+    """Return role → (times since the start [ns], values); dVRK's jaw is twice a finger's angle."""
     times = (np.arange(len(motion)) * 20_000_000).astype(np.int64)
     found = {}
     for arm in names.ARMS:

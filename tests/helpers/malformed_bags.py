@@ -1,4 +1,4 @@
-"""Malformed and malicious bags: what `test_malformed` feeds to the reader of bags."""
+"""Malformed and malicious bags for `test_malformed`."""
 
 import bz2
 import contextlib
@@ -172,7 +172,8 @@ def databases(folder, trace):
         "view": ["ALTER TABLE messages RENAME TO m", "CREATE VIEW messages AS SELECT * FROM m"],
         "endless view": [
             "DROP TABLE messages",
-            "CREATE VIEW messages AS WITH RECURSIVE c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) "
+            "CREATE VIEW messages AS WITH RECURSIVE "
+            "c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) "
             "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM c",
         ],
         "trigger": ["CREATE TRIGGER t AFTER INSERT ON messages BEGIN DELETE FROM messages; END"],
