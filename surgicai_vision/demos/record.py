@@ -154,6 +154,7 @@ def record(
             "they must be at least 1, 0 and 0."
         )
     _check_demos(demonstrator, demos)
+    # What decides the result: a finished folder of the same request is left as it is.
     request = {
         "task": to_mapping(config),
         "demonstrator": demonstrator,
@@ -244,6 +245,7 @@ def _run_seeds(
     if learner:
         shared["learner"] = str(learner.folder.resolve())
         inputs = (*inputs, learner.digest)
+    # The next seeds, without those of the demonstrations that are learned from.
     known = {read_demo(path).seed for path in demos}
     seeds = (seed for seed in itertools.count(request["seed"]) if seed not in known)
     while len(kept) < wanted:
@@ -254,6 +256,7 @@ def _run_seeds(
                 f"{len(kept) + len(skipped)} starts of {request['task']['task']}; "
                 f"{wanted} were wanted ({reasons}; …)."
             )
+        # As many seeds as episodes are missing; those that fail are made up for in the next turn.
         jobs = [
             Job(
                 "drive-episode" if learner else "record-episode",

@@ -78,6 +78,7 @@ class Demo:
     executed: np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        # Types and axes, then lengths, then the numbers themselves.
         arrays = self.arrays
         for name, (dtype, axes) in ARRAYS.items():
             array = arrays[name]

@@ -208,7 +208,8 @@ class Track:
         arms: arm → its motion; other arms are at their start.
         needle: T_world_needle (T + 1, 4, 4).
         grasp_angle: the needle's point that is grasped [rad], where the task has one.
-        passed: `TaskState.holes_passed` in each state, (T + 1,), or None: as the task's start has it.
+        passed: `TaskState.holes_passed` in each state, (T + 1,), or None for that of the task's
+            start.
     """
 
     arms: Mapping[str, Motion]

@@ -105,6 +105,7 @@ def import_bags(
     )
     if task:
         check_output(out, may_resume=MARKER)
+    # Read the bags, split into tracks.
     report = progress or silent
     tracks: list[SegmentTrack] = []
     skipped: list[Row] = []
@@ -120,6 +121,7 @@ def import_bags(
         "bag": to_mapping(config),
         "env": dict(env or {}),
     }
+    # Make a folder for each subtask that was found, or find it finished.
     summaries = []
     done = 0
     for name in names.SUBTASKS:
@@ -174,6 +176,7 @@ def _build(
     task_config = dataclasses.replace(
         base, task=task, step=step, max_steps=max(base.max_steps, longest)
     )
+    # Replay what can be replayed, and note why the rest cannot.
     replay = Replay(task_config)
     rows = list(skipped)
     counts = {"steps": 0, "clipped": 0, "pauses": 0, "succeeded": 0}

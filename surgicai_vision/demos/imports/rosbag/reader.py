@@ -139,6 +139,7 @@ def _read(
             f"{path} has no topic {wanted_topic} ({missing[0]}); "
             f"it has {topic_list(known, wanted_topic)}."
         )
+    # Check the types of the topics that are there, before a message is read.
     wanted = [
         connection for connection in reader.connections if connection.topic in topics.values()
     ]
