@@ -1,6 +1,6 @@
 """Read a parquet file whose writer was killed before it wrote the footer.
 
-    groups = recover(Path("data/chunk-000/file-000.parquet"), sample, Path("mended.parquet"))
+    groups = recover(Path("file-000.parquet"), sample, Path("mended.parquet"))
 
 The row groups of such a file are whole: pyarrow writes each as it is closed, and only the table of
 where they lie is missing. That table is rebuilt by walking the pages' own headers, with the schema
@@ -15,35 +15,79 @@ import mmap
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_salvage import thrift
-from lerobot_salvage.thrift import Fields, read_struct, write_struct
+from lerobot_salvage.thrift import Content, Fields, read_struct, write_struct
 from surgicai_vision.dataset.lerobot_files import LeRobotFiles
 from surgicai_vision.dataset.writer import compression
 
 MAGIC = b"PAR1"
-DATA_PAGE, DICTIONARY_PAGE, DATA_PAGE_V2 = 0, 2, 3
-"""PageHeader.type (parquet.thrift, parquet-format 2.9)."""
 
-SCHEMA, ROWS, GROUPS = 2, 3, 4
-COLUMNS, GROUP_BYTES, GROUP_ROWS, GROUP_OFFSET, GROUP_COMPRESSED, ORDINAL = 1, 2, 3, 5, 6, 7
-CHUNK_OFFSET, CHUNK_META = 2, 3
-VALUES, UNCOMPRESSED, COMPRESSED, DATA_OFFSET, DICTIONARY_OFFSET = 5, 6, 7, 9, 11
-OPTIONAL_META = (8, 10, 12, 13, 14, 15, 16, 17)
-"""Field numbers of FileMetaData, RowGroup, ColumnChunk and ColumnMetaData; the last are hints
-nobody needs.
-"""
+
+class PageType(IntEnum):
+    """PageHeader.type (parquet.thrift, parquet-format 2.9)."""
+
+    DATA = 0
+    DICTIONARY = 2
+    DATA_V2 = 3
+
+
+VALUE_COUNTS = {PageType.DATA: 5, PageType.DICTIONARY: 7, PageType.DATA_V2: 8}
+"""Type of a page → the field of PageHeader whose first field is the number of values."""
+
+
+class File(IntEnum):
+    """Fields of FileMetaData (parquet.thrift)."""
+
+    ROWS = 3
+    GROUPS = 4
+
+
+class Group(IntEnum):
+    """Fields of RowGroup (parquet.thrift)."""
+
+    COLUMNS = 1
+    BYTES = 2
+    ROWS = 3
+    OFFSET = 5
+    COMPRESSED = 6
+    ORDINAL = 7
+
+
+class Chunk(IntEnum):
+    """Fields of ColumnChunk (parquet.thrift)."""
+
+    OFFSET = 2
+    META = 3
+
+
+class Meta(IntEnum):
+    """Fields of ColumnMetaData (parquet.thrift)."""
+
+    VALUES = 5
+    UNCOMPRESSED = 6
+    COMPRESSED = 7
+    DATA_OFFSET = 9
+    DICTIONARY_OFFSET = 11
+
+
+HINTS = (8, 10, 12, 13, 14, 15, 16, 17)
+"""Fields of ColumnMetaData that no reader needs."""
 
 
 @dataclass(frozen=True)
 class Writing:
-    """How a file was written: codec by column (or of all) and whether values were put into
-    dictionaries.
+    """How a file was written.
+
+    Attributes:
+        compression: codec of all columns, or column → codec.
+        dictionary: whether values were put into dictionaries.
     """
 
     compression: str | Mapping[str, str]
@@ -55,9 +99,7 @@ LEROBOT = Writing("snappy", True)
 
 
 class _Page(NamedTuple):
-    """A page: where it begins and ends, its kind, its number of values, its bytes when
-    decompressed.
-    """
+    """A page: where it begins and ends, its type, number of values and decompressed bytes."""
 
     start: int
     end: int
@@ -66,19 +108,18 @@ class _Page(NamedTuple):
     size: int
 
 
-class _Chunk(NamedTuple):
+class _Column(NamedTuple):
     """A column of a row group: its pages, one behind the other."""
 
     pages: list[_Page]
 
     @property
     def values(self) -> int:
-        return sum(page.values for page in self.pages if page.kind != DICTIONARY_PAGE)
+        return sum(page.values for page in self.pages if page.kind != PageType.DICTIONARY)
 
 
 def recover(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) -> int:
-    """Write the whole row groups of the footerless file `path` as the parquet file `to`; return
-    their number.
+    """Write the whole row groups of a footerless file as a parquet file; return their number.
 
     Args:
         path: the broken file.
@@ -94,8 +135,8 @@ def recover(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) 
         use_dictionary=writing.dictionary,
     )
     footer = _footer(buffer.getvalue())
-    (model,) = footer[GROUPS][1][1]
-    leaves = [chunk[CHUNK_META][1] for chunk in model[COLUMNS][1][1]]
+    (model,) = footer[File.GROUPS][1][1]
+    leaves = [chunk[Chunk.META][1] for chunk in model[Group.COLUMNS][1][1]]
     if path.stat().st_size < len(MAGIC):
         return 0
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -104,14 +145,15 @@ def recover(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) 
         groups = list(_groups(content, leaves))
     if not groups:
         return 0
-    rows = [chunks[0].values // leaves[0][VALUES][1] for chunks in groups]
+    rows = [chunks[0].values // leaves[0][Meta.VALUES][1] for chunks in groups]
     tables = [
         _group(model, chunks, count, number)
         for number, (chunks, count) in enumerate(zip(groups, rows, strict=True))
     ]
-    footer[ROWS] = (thrift.I64, sum(rows))
-    footer[GROUPS] = (thrift.LIST, (thrift.STRUCT, tables))
-    end, tail = groups[-1][-1].pages[-1].end, write_struct(footer)
+    footer[File.ROWS] = (thrift.I64, sum(rows))
+    footer[File.GROUPS] = (thrift.LIST, (thrift.STRUCT, tables))
+    end = groups[-1][-1].pages[-1].end
+    tail = write_struct(footer)
     with open(path, "rb") as source, open(to, "wb") as target:
         shutil.copyfileobj(source, target)
         target.truncate(end)
@@ -167,7 +209,7 @@ def _footer(content: bytes) -> Fields:
     return read_struct(content, len(content) - 8 - length)[0]
 
 
-def _groups(content: Any, leaves: list[Fields]) -> Iterator[list[_Chunk]]:
+def _groups(content: Content, leaves: list[Fields]) -> Iterator[list[_Column]]:
     """Yield the whole row groups from the beginning of the file, each as its columns."""
     position = len(MAGIC)
     while True:
@@ -178,7 +220,7 @@ def _groups(content: Any, leaves: list[Fields]) -> Iterator[list[_Chunk]]:
         position = group[-1].pages[-1].end
 
 
-def _next_group(content: Any, position: int, leaves: list[Fields]) -> list[_Chunk] | None:
+def _next_group(content: Content, position: int, leaves: list[Fields]) -> list[_Column] | None:
     """Return the row group at `position`, or None where there is no whole one.
 
     Nothing says how many rows it has or where its first column ends; so the first column is taken
@@ -186,11 +228,11 @@ def _next_group(content: Any, position: int, leaves: list[Fields]) -> list[_Chun
     """
     first: list[_Page] = []
     for page in _pages(content, position):
-        if page.kind == DICTIONARY_PAGE and first:
+        if page.kind == PageType.DICTIONARY and first:
             return None
         first.append(page)
-        chunk = _Chunk(list(first))
-        rows, odd = divmod(chunk.values, leaves[0][VALUES][1])
+        chunk = _Column(list(first))
+        rows, odd = divmod(chunk.values, leaves[0][Meta.VALUES][1])
         if not rows or odd:
             continue
         others = _others(content, page.end, leaves[1:], rows)
@@ -199,13 +241,13 @@ def _next_group(content: Any, position: int, leaves: list[Fields]) -> list[_Chun
     return None
 
 
-def _others(content: Any, position: int, leaves: list[Fields], rows: int) -> list[_Chunk] | None:
-    """Return the columns behind the first one of a row group of `rows` rows, or None where they do
-    not fit.
-    """
+def _others(
+    content: Content, position: int, leaves: list[Fields], rows: int
+) -> list[_Column] | None:
+    """Return the columns behind the first of a row group, None if they do not have `rows` rows."""
     chunks = []
     for leaf in leaves:
-        chunk = _chunk(content, position, leaf, rows * leaf[VALUES][1])
+        chunk = _chunk(content, position, leaf, rows * leaf[Meta.VALUES][1])
         if chunk is None:
             return None
         chunks.append(chunk)
@@ -213,28 +255,28 @@ def _others(content: Any, position: int, leaves: list[Fields], rows: int) -> lis
     return chunks
 
 
-def _chunk(content: Any, position: int, leaf: Fields, values: int) -> _Chunk | None:
+def _chunk(content: Content, position: int, leaf: Fields, values: int) -> _Column | None:
     """Return the column of `values` values at `position`, or None where there is none."""
     pages: list[_Page] = []
     left = values
     for page in _pages(content, position):
         begins = not pages
-        if (page.kind == DICTIONARY_PAGE) != (begins and DICTIONARY_OFFSET in leaf):
+        if (page.kind == PageType.DICTIONARY) != (begins and Meta.DICTIONARY_OFFSET in leaf):
             return None
         pages.append(page)
-        left -= page.values if page.kind != DICTIONARY_PAGE else 0
+        left -= page.values if page.kind != PageType.DICTIONARY else 0
         if left <= 0:
-            return _Chunk(pages) if not left else None
+            return _Column(pages) if not left else None
     return None
 
 
-def _pages(content: Any, position: int) -> Iterator[_Page]:
+def _pages(content: Content, position: int) -> Iterator[_Page]:
     """Yield the pages from `position` on, as long as they are whole."""
     for _ in itertools.count():
         try:
             header, body = read_struct(content, position)
             kind, size, stored = (header[number][1] for number in (1, 2, 3))
-            values = header[{DATA_PAGE: 5, DICTIONARY_PAGE: 7, DATA_PAGE_V2: 8}[kind]][1][1][1]
+            values = header[VALUE_COUNTS[kind]][1][1][1]
         except (ValueError, KeyError, TypeError, IndexError):
             return
         if min(size, stored, values) < 0 or body + stored > len(content):
@@ -243,30 +285,28 @@ def _pages(content: Any, position: int) -> Iterator[_Page]:
         position = body + stored
 
 
-def _group(model: Fields, chunks: list[_Chunk], rows: int, number: int) -> Fields:
+def _group(model: Fields, chunks: list[_Column], rows: int, number: int) -> Fields:
     """Return the RowGroup of the footer for `chunks`, made like that of the sample."""
     tables = []
-    for example, chunk in zip(model[COLUMNS][1][1], chunks, strict=True):
-        meta = {
-            key: value for key, value in example[CHUNK_META][1].items() if key not in OPTIONAL_META
-        }
+    for example, chunk in zip(model[Group.COLUMNS][1][1], chunks, strict=True):
+        meta = {key: value for key, value in example[Chunk.META][1].items() if key not in HINTS}
         pages = chunk.pages
-        data = next(page for page in pages if page.kind != DICTIONARY_PAGE)
-        meta[VALUES] = (thrift.I64, chunk.values)
-        meta[UNCOMPRESSED] = (thrift.I64, sum(page.size for page in pages))
-        meta[COMPRESSED] = (thrift.I64, pages[-1].end - pages[0].start)
-        meta[DATA_OFFSET] = (thrift.I64, data.start)
-        meta.pop(DICTIONARY_OFFSET, None)
-        if pages[0].kind == DICTIONARY_PAGE:
-            meta[DICTIONARY_OFFSET] = (thrift.I64, pages[0].start)
+        data = next(page for page in pages if page.kind != PageType.DICTIONARY)
+        meta[Meta.VALUES] = (thrift.I64, chunk.values)
+        meta[Meta.UNCOMPRESSED] = (thrift.I64, sum(page.size for page in pages))
+        meta[Meta.COMPRESSED] = (thrift.I64, pages[-1].end - pages[0].start)
+        meta[Meta.DATA_OFFSET] = (thrift.I64, data.start)
+        meta.pop(Meta.DICTIONARY_OFFSET, None)
+        if pages[0].kind == PageType.DICTIONARY:
+            meta[Meta.DICTIONARY_OFFSET] = (thrift.I64, pages[0].start)
         tables.append(
-            {CHUNK_OFFSET: (thrift.I64, pages[0].start), CHUNK_META: (thrift.STRUCT, meta)}
+            {Chunk.OFFSET: (thrift.I64, pages[0].start), Chunk.META: (thrift.STRUCT, meta)}
         )
     return {
-        COLUMNS: (thrift.LIST, (thrift.STRUCT, tables)),
-        GROUP_BYTES: (thrift.I64, sum(page.size for chunk in chunks for page in chunk.pages)),
-        GROUP_ROWS: (thrift.I64, rows),
-        GROUP_OFFSET: (thrift.I64, chunks[0].pages[0].start),
-        GROUP_COMPRESSED: (thrift.I64, chunks[-1].pages[-1].end - chunks[0].pages[0].start),
-        ORDINAL: (thrift.I16, number),
+        Group.COLUMNS: (thrift.LIST, (thrift.STRUCT, tables)),
+        Group.BYTES: (thrift.I64, sum(page.size for chunk in chunks for page in chunk.pages)),
+        Group.ROWS: (thrift.I64, rows),
+        Group.OFFSET: (thrift.I64, chunks[0].pages[0].start),
+        Group.COMPRESSED: (thrift.I64, chunks[-1].pages[-1].end - chunks[0].pages[0].start),
+        Group.ORDINAL: (thrift.I16, number),
     }

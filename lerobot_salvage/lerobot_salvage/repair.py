@@ -16,7 +16,6 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from lerobot_salvage.check import check_dataset
 from lerobot_salvage.verify import Verified, Verifier
@@ -28,7 +27,13 @@ from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.check import CheckReport
 from surgicai_vision.dataset.lerobot_files import LeRobotFiles
-from surgicai_vision.dataset.metadata import INDEX_FEATURES, EpisodeMetadata, video_path, write_metadata
+from surgicai_vision.dataset.metadata import (
+    INDEX_FEATURES,
+    EpisodeMetadata,
+    video_path,
+    write_metadata,
+)
+from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.writer import DataFiles
 
 EXCHANGE = 2
@@ -58,9 +63,8 @@ class Repair:
     problems: tuple[str, ...]
 
 
-def repair_dataset(path: Path, out: Path | None = None, progress: Progress | None = None) -> Repair:
-    """Write the longest verified prefix of the dataset `path` to `out`, or put it in the place of
-    `path`.
+def repair_dataset(path: Path, out: Path | None = None, progress: Progress = silent) -> Repair:
+    """Write the longest verified prefix of a dataset.
 
     A dataset with nothing wrong is left alone, and `out` is not made.
 
@@ -87,7 +91,7 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress | Non
         with claim(work):
             made = work / "result"
             shutil.rmtree(made, ignore_errors=True)
-            rows = _write(files, made, work, claimed, progress or silent)
+            rows = _write(files, made, work, claimed, progress)
             after = check_dataset(made)
             if not after.ok:
                 raise SurgicaiError(
@@ -125,7 +129,8 @@ def _write(
         data.close()
         if not rows:
             raise BadFile(
-                f"{files.path} cannot be repaired: not one episode is whole ({_why(files.problems)})"
+                f"{files.path} cannot be repaired: not one episode is whole "
+                f"({_why(files.problems)})"
             )
         for key, videos in verifier.video_files.items():
             for number in sorted({row.videos[key][0] for row in rows}):
@@ -142,7 +147,9 @@ def _write(
 def _append(data: DataFiles, number: int, episode: Verified) -> EpisodeMetadata:
     """Write one episode."""
     row = data.append(number, episode.table, episode.statistics)
-    return EpisodeMetadata(row.start, row.stop, row.file, row.statistics, episode.tasks, episode.videos)
+    return EpisodeMetadata(
+        row.start, row.stop, row.file, row.statistics, episode.tasks, episode.videos
+    )
 
 
 def _texts(tasks: Mapping[int, str], rows: Sequence[EpisodeMetadata]) -> list[str]:
@@ -154,8 +161,8 @@ def _texts(tasks: Mapping[int, str], rows: Sequence[EpisodeMetadata]) -> list[st
 
 
 def _meta(
-    ours: Mapping[str, Any], rows: Sequence[EpisodeMetadata], digests: Sequence[str], claimed: int
-) -> dict[str, Any]:
+    ours: Table, rows: Sequence[EpisodeMetadata], digests: Sequence[str], claimed: int
+) -> Table:
     """Return `meta/surgicai.json` of the prefix; it is the result of no request any more."""
     return {
         **ours,

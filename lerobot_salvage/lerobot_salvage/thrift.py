@@ -8,19 +8,21 @@ every length against the content, so foreign bytes end in a `ValueError` and nev
 overrun.
 """
 
+import mmap
 import struct
 from typing import Any, Final
 
 TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
 """Types of the compact protocol (thrift-compact-protocol.md, parquet-format 2.9)."""
 
+Content = bytes | mmap.mmap
 Fields = dict[int, tuple[int, Any]]
 
 DEEPEST: Final = 32
 """Nesting of structs and lists; parquet's footer has 6."""
 
 
-def read_struct(content: bytes, position: int, depth: int = 0) -> tuple[Fields, int]:
+def read_struct(content: Content, position: int, depth: int = 0) -> tuple[Fields, int]:
     """Read the struct at `position`; return its fields and the position after it.
 
     Raises:
@@ -32,7 +34,8 @@ def read_struct(content: bytes, position: int, depth: int = 0) -> tuple[Fields, 
         header, position = _byte(content, position)
         if not header:
             return fields, position
-        kind, step = header & 15, header >> 4
+        kind = header & 15
+        step = header >> 4
         if step:
             last += step
         else:
@@ -40,14 +43,14 @@ def read_struct(content: bytes, position: int, depth: int = 0) -> tuple[Fields, 
         fields[last], position = _field(content, position, kind, depth)
 
 
-def _field(content: bytes, position: int, kind: int, depth: int) -> tuple[tuple[int, Any], int]:
+def _field(content: Content, position: int, kind: int, depth: int) -> tuple[tuple[int, Any], int]:
     if kind in (TRUE, FALSE):
         return (kind, kind == TRUE), position
     value, position = _value(content, position, kind, depth)
     return (kind, value), position
 
 
-def _value(content: bytes, position: int, kind: int, depth: int) -> tuple[Any, int]:
+def _value(content: Content, position: int, kind: int, depth: int) -> tuple[Any, int]:
     """Read one value of type `kind`."""
     if depth > DEEPEST:
         raise ValueError("nested too deep")
@@ -62,7 +65,8 @@ def _value(content: bytes, position: int, kind: int, depth: int) -> tuple[Any, i
         return _slice(content, position, length), position + length
     if kind in (LIST, SET):
         header, position = _byte(content, position)
-        count, element = header >> 4, header & 15
+        count = header >> 4
+        element = header & 15
         if count == 15:
             count, position = _unsigned(content, position)
         if count > len(content):
@@ -77,19 +81,19 @@ def _value(content: bytes, position: int, kind: int, depth: int) -> tuple[Any, i
     raise ValueError(f"type {kind}")
 
 
-def _byte(content: bytes, position: int) -> tuple[int, int]:
+def _byte(content: Content, position: int) -> tuple[int, int]:
     if not 0 <= position < len(content):
         raise ValueError("cut off")
     return content[position], position + 1
 
 
-def _slice(content: bytes, position: int, length: int) -> bytes:
+def _slice(content: Content, position: int, length: int) -> bytes:
     if position + length > len(content):
         raise ValueError("cut off")
     return bytes(content[position : position + length])
 
 
-def _unsigned(content: bytes, position: int) -> tuple[int, int]:
+def _unsigned(content: Content, position: int) -> tuple[int, int]:
     value = 0
     for shift in range(0, 70, 7):
         part, position = _byte(content, position)
@@ -99,14 +103,15 @@ def _unsigned(content: bytes, position: int) -> tuple[int, int]:
     raise ValueError("a number of more than 64 bits")
 
 
-def _signed(content: bytes, position: int) -> tuple[int, int]:
+def _signed(content: Content, position: int) -> tuple[int, int]:
     value, position = _unsigned(content, position)
     return (value >> 1) ^ -(value & 1), position
 
 
 def write_struct(fields: Fields) -> bytes:
     """Return the bytes of a struct."""
-    parts, last = [], 0
+    parts = []
+    last = 0
     for number in sorted(fields):
         kind, value = fields[number]
         step = number - last

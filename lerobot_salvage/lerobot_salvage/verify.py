@@ -13,7 +13,6 @@ import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,20 +20,27 @@ import pyarrow.compute as pc
 
 from lerobot_salvage.recovery import open_or_recover
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.errors import BadFile, first_line
 from surgicai_vision.core.files import read_json
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.lerobot_files import LeRobotFiles
-from surgicai_vision.dataset.metadata import row_statistics
+from surgicai_vision.dataset.metadata import Features, row_statistics
 from surgicai_vision.dataset.rules import ImageWatch, episode_problems, number_problems
+from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import ImageStatistics, Statistics, column_statistics
 from surgicai_vision.dataset.video import count_frames, read_frames
 
 
 @dataclass(frozen=True)
 class Verified:
-    """A verified episode: its rows with every image's bytes, statistics, tasks, place in the
-    videos, digest.
+    """A verified episode.
+
+    Attributes:
+        table: its rows, with every image's bytes.
+        statistics: its statistics by feature.
+        tasks: sentences of its tasks.
+        videos: feature → (file's number, first second, second after the last).
+        digest: of the content, where surgicai-vision rendered it.
     """
 
     table: pa.Table
@@ -49,8 +55,12 @@ class _Unfit(Exception):
 
 
 class Verifier:
-    """Verifies the episodes of `files` in order; `ours` is the content of `meta/surgicai.json`, if
-    it has one.
+    """Verifies the episodes of a dataset in order.
+
+    Attributes:
+        files: the dataset's files; what ends the episodes is added to its problems.
+        ours: content of `meta/surgicai.json`, empty in a dataset of others.
+        video_files: feature → its videos.
     """
 
     def __init__(self, files: LeRobotFiles):
@@ -64,17 +74,14 @@ class Verifier:
         self._ends = dict.fromkeys(files.video_keys, (0, 0))
 
     def episodes(self, scratch: Path) -> Iterator[Verified]:
-        """Yield the verified episodes from the first on; what ends them is added to
-        `files.problems`.
-        """
+        """Yield the whole episodes from the first on; `scratch` takes recovered files."""
         open_file = functools.partial(open_or_recover, files=self.files, scratch=scratch)
         start = 0
         for number, table in enumerate(self.files.episodes(open_file)):
             try:
                 yield self._verify(number, start, table)
             except (_Unfit, BadFile, pa.ArrowException, ValueError, TypeError) as error:
-                text = (str(error).splitlines() or [type(error).__name__])[0]
-                self.files.problems.append(f"episode {number}: {text}")
+                self.files.problems.append(f"episode {number}: {first_line(error)}")
                 return
             start += len(table)
 
@@ -136,7 +143,8 @@ class Verifier:
         for key, values in expected.items():
             if not np.array_equal(columns[key], values):
                 raise _Unfit(
-                    f"its {key} is {columns[key][0]} … {columns[key][-1]}, not {values[0]} … {values[-1]}."
+                    f"its {key} is {columns[key][0]} … {columns[key][-1]}, not "
+                    f"{values[0]} … {values[-1]}."
                 )
         if not np.allclose(columns["timestamp"], np.arange(count) / self.files.fps, atol=1e-3):
             raise _Unfit(f"its timestamp is not frame_index / {self.files.fps:g}.")
@@ -157,7 +165,9 @@ class Verifier:
         digest: schema.EpisodeDigest,
     ) -> tuple[pa.Table, Statistics]:
         """Verify one image column; return the table with the bytes of images that lay beside it."""
-        watch, statistics, found = self._watch(key, columns, True), ImageStatistics(), []
+        watch = self._watch(key, columns, True)
+        statistics = ImageStatistics()
+        found = []
         for index, (content, name) in enumerate(_contents(table.column(key))):
             content = self._beside(name) if content is None else content
             frame = codecs.decode(content, f"frame {index} of {key}")
@@ -199,19 +209,20 @@ class Verifier:
         self, key: str, number: int, columns: Mapping[str, np.ndarray], digest: schema.EpisodeDigest
     ) -> tuple[tuple[int, float, float], Statistics | None]:
         """Verify an episode's frames in a video; return where they are and their statistics."""
-        count, fps = len(columns["index"]), self.files.fps
+        count = len(columns["index"])
+        fps = self.files.fps
         file, first = self._place(key, number, count)
         place = (file, first / fps, (first + count) / fps)
         path = self.video_files[key][file]
         self._ends[key] = (file, first + count)
         if (self.files.features[key].get("info") or {}).get("is_depth_map"):
             # Quantised depth is LeRobot's to decode; here its frames are counted.
-            if self._length(path) < first + count:
-                raise _Unfit(
-                    f"{path.name} of {key} has {self._length(path)} frames; it needs {first + count}."
-                )
+            held = self._length(path)
+            if held < first + count:
+                raise _Unfit(f"{path.name} of {key} has {held} frames; it needs {first + count}.")
             return place, None
-        watch, statistics = self._watch(key, columns, False), ImageStatistics()
+        watch = self._watch(key, columns, False)
+        statistics = ImageStatistics()
         for index, frame in enumerate(read_frames(path, first, count, fps)):
             self._check_shape(key, index, frame)
             self._look(watch, key, index, frame)
@@ -221,8 +232,9 @@ class Verifier:
         return place, statistics.result()
 
     def _place(self, key: str, number: int, count: int) -> tuple[int, int]:
-        """Return (file, first frame) of an episode in a feature's videos: as its row says, else as
-        they follow.
+        """Return (file, first frame) of an episode in a feature's videos.
+
+        Its row says where it is; without a row the episodes follow one another.
         """
         files = self.video_files[key]
         row = self.files.rows[number] if number < len(self.files.rows) else {}
@@ -235,7 +247,8 @@ class Verifier:
             return files.index(named), round(row[f"videos/{key}/from_timestamp"] * self.files.fps)
         file, first = self._ends[key]
         if file < len(files) and first and self._length(files[file]) == first:
-            file, first = file + 1, 0
+            file += 1
+            first = 0
         if file >= len(files) or self._length(files[file]) < first + count:
             raise _Unfit(f"the videos of {key} end before it.")
         return file, first
@@ -246,7 +259,7 @@ class Verifier:
         return self._lengths[path]
 
 
-def _ours(path: Path) -> dict[str, Any]:
+def _ours(path: Path) -> Table:
     """Return `meta/surgicai.json`, empty where there is none that can be read."""
     try:
         meta = read_json(path / names.META_FILE)
@@ -262,11 +275,12 @@ def _contents(column: pa.ChunkedArray) -> list[tuple[bytes | None, str | None]]:
     return list(zip(content, pc.struct_field(whole, "path").to_pylist(), strict=True))
 
 
-def _array(column: pa.ChunkedArray, features: Mapping[str, Any], key: str) -> np.ndarray:
+def _array(column: pa.ChunkedArray, features: Features, key: str) -> np.ndarray:
     """Return a column as (T,), (T, n), … ; text as objects."""
     if column.null_count:
         raise _Unfit(f"{key} has {column.null_count} values missing.")
-    flat, count = column.combine_chunks(), len(column)
+    flat = column.combine_chunks()
+    count = len(column)
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
         flat = pc.list_flatten(flat)
     values = np.asarray(flat)
@@ -278,8 +292,6 @@ def _array(column: pa.ChunkedArray, features: Mapping[str, Any], key: str) -> np
 
 
 def _statistics(values: np.ndarray, shape: tuple[int, ...]) -> Statistics:
-    """Return a column's statistics; of a feature of several axes over all but the last, as
-    LeRobot's.
-    """
+    """Return a column's statistics over all axes but the last, as LeRobot's."""
     table = column_statistics(values.reshape(-1, shape[-1]))
     return {**table, "count": [len(values)]}

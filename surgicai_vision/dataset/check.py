@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, first_line
 from surgicai_vision.core.files import read_json
-from surgicai_vision.core.progress import Progress
+from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.lerobot_files import EPISODES, INFO
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
@@ -56,15 +56,15 @@ class CheckReport:
         return not self.problems
 
 
-def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
+def check_dataset(path: Path, progress: Progress = silent) -> CheckReport:
     """Read all of a dataset and report what is wrong with it.
 
     Args:
-        path: a dataset of ours or another LeRobot v3 dataset.
-        progress: called with (done, total, "frames" or "episodes").
+        path: a dataset of ours.
+        progress: called with (frames done, frames, "frames").
 
     Raises:
-        BadFile: it cannot be opened at all.
+        BadFile: it cannot be opened at all, or surgicai-vision did not render it.
     """
     if (path / INFO).is_file() and not (path / names.META_FILE).exists():
         raise BadFile(
@@ -83,8 +83,7 @@ def check_dataset(path: Path, progress: Progress | None = None) -> CheckReport:
     for start, stop in bounds:
         rows = {key: columns[key][start:stop] for key in schema.COLUMNS}
         digests.append(_check_episode(dataset, keys, start, stop, rows, problems))
-        if progress:
-            progress(stop, dataset.length, "frames")
+        progress(stop, dataset.length, "frames")
     digest = schema.dataset_digest(digests)
     if digest != dataset.meta.get("digest"):
         problems.append(

@@ -19,7 +19,7 @@ from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output
 from surgicai_vision.core.hub import connect, refusals_in_one_line
-from surgicai_vision.core.progress import Progress
+from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset.check import CheckReport, check_dataset
 from surgicai_vision.dataset.metadata import CODEBASE_VERSION
@@ -110,7 +110,7 @@ def push_dataset(
     *,
     private: bool = False,
     licence: str = LICENCE,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     api: "HfApi | None" = None,
 ) -> str:
     """Push a dataset of ours with its card, in one commit; return the commit's address.
@@ -153,7 +153,7 @@ def pull_dataset(
     out: Path,
     *,
     revision: str | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     api: "HfApi | None" = None,
 ) -> CheckReport:
     """Fetch a dataset of ours into the new folder `out` and check it.

@@ -75,7 +75,8 @@ def test_video_is_read_by_us_and_by_lerobot_and_its_error_is_measured(tmp_path, 
 
     render(demos, tmp_path / "set")
     made = render(demos, tmp_path / "video", video=codec)
-    before, after = open_dataset(tmp_path / "set"), open_dataset(tmp_path / "video")
+    before = open_dataset(tmp_path / "set")
+    after = open_dataset(tmp_path / "video")
     assert check_dataset(tmp_path / "video").problems == ()
     theirs = LeRobotDataset(
         "local/set", root=tmp_path / "video", video_backend="pyav", depth_output_unit="m"

@@ -281,9 +281,7 @@ def _edit(dataset, folder):
 
 
 def test_metadata_equals_lerobots(tmp_path, fake, demos):
-    """What we write without LeRobot is what LeRobot writes: same tables, same types, same
-    numbers.
-    """
+    """What we write without LeRobot is what LeRobot writes: tables, types and numbers."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.feature_utils import get_hf_features_from_features
 

@@ -86,6 +86,13 @@ def test_damage_is_neither_pushed_nor_pulled(tmp_path, dataset, fake_hub):
     assert len(fake_hub.asked) == before
 
 
+def test_a_dataset_of_others_is_not_pulled(tmp_path, dataset, fake_hub):
+    push_dataset(dataset, REPO, api=fake_hub)
+    (fake_hub.folder / names.META_FILE).unlink()
+    with pytest.raises(BadFile, match=r"not a dataset of surgicai-vision.*lerobot-salvage check"):
+        pull_dataset(REPO, tmp_path / "pulled", api=fake_hub)
+
+
 def test_a_refusal_is_one_line(tmp_path, dataset):
     fake_hub = FakeHub(tmp_path / "hub", OSError("403 Forbidden\nYou need a token"))
     with pytest.raises(

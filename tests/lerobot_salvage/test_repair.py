@@ -32,9 +32,7 @@ def offline(tmp_path, monkeypatch):
 
 
 def write_lerobot(root, video=False, **options):
-    """Write a foreign dataset of three episodes and two tasks with LeRobot; return it before
-    `finalize`.
-    """
+    """Write a foreign dataset of three episodes and two tasks; return it before `finalize`."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     plain = {"dtype": "float32", "names": None}
