@@ -77,7 +77,8 @@ class SurgicaiEnv(EnvConfig):
     encoder_sha256: str = ""
 
     def __post_init__(self) -> None:
-        self._fill(TaskConfig(), ["front", "back"], 224)
+        config = TaskConfig(self.task) if self.task else TaskConfig()
+        self._fill(config, ["front", "back"], 224)
         for camera in self.views:
             check_camera(camera)
         self.task_config()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from surgicai_vision import envs
+from surgicai_vision.core import cameras, names
 from surgicai_vision.core.config import (
     RANDOMISATION_LIMITS,
     RandomisationConfig,
@@ -21,6 +22,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.envs import observation, poses, randomisation, simulation
 from surgicai_vision.scene import build_scene, compose, kinematics, needle
+from surgicai_vision.scene.cameras import CameraPose
 
 EVERYTHING = RandomisationConfig(
     light=0.4,
@@ -334,3 +336,23 @@ def test_the_expert_copes_with_everything(task):
             done = terminated or truncated
         solved += info["is_success"]
     assert solved >= 2
+
+
+def test_a_camera_of_another_distribution_moves_as_front_does() -> None:
+    axes = {"camera_shift": 3.0, "camera_turn": 2.0, "camera_fovy": 2.0}
+    without = envs.make(TaskConfig(randomisation=RandomisationConfig(**axes)))
+    without.reset(seed=3)
+    pose = CameraPose((0.12, 0.03, 0.10), (-0.9, 0.0, -0.5), (0.0, 0.0, 1.0), 0.7)
+    cameras.register_camera("side", pose)
+    try:
+        env = envs.make(TaskConfig(randomisation=RandomisationConfig(**axes)))
+        env.reset(seed=3)
+        moved = env.model.camera("front").pos - build_scene().model.camera("front").pos
+        np.testing.assert_allclose(env.model.camera("side").pos, pose.position + moved, atol=1e-12)
+        assert env.model.camera("side").fovy != build_scene().model.camera("side").fovy
+        for name in names.CAMERAS:
+            for key in ("pos", "quat", "fovy"):
+                ours, before = (getattr(each.model.camera(name), key) for each in (env, without))
+                np.testing.assert_array_equal(ours, before)
+    finally:
+        cameras.CAMERAS.unregister("side")

@@ -165,6 +165,11 @@ def test_env_has_every_field_of_the_task_config_and_follows_a_dataset(dataset: P
         SurgicaiEnv(task="sew")
 
 
+def test_env_without_a_dataset_has_its_tasks_own_limit() -> None:
+    assert SurgicaiEnv(task="suture").max_steps == 1000
+    assert SurgicaiEnv(task="place").max_steps == SurgicaiEnv().max_steps == 200
+
+
 def test_env_shows_what_the_dataset_holds_and_waits_after_its_end(dataset: Path) -> None:
     from lerobot.envs.factory import make_env, make_env_config
     from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation

@@ -1,0 +1,102 @@
+"""Tasks by name: what is said of ours, and a task that is registered in a process."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from types import MappingProxyType
+
+import gymnasium
+import numpy as np
+import pytest
+
+import surgicai_vision
+from surgicai_vision import envs
+from surgicai_vision.core import names, tasks
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.plugins import NameCollision
+from surgicai_vision.demos.expert import Expert
+from surgicai_vision.envs.grasp import Grasp
+from surgicai_vision.envs.subtask import NO_PHASE, Demands, Subtask, Tolerance
+
+
+class Hover(Grasp):
+    """A grasp that is done 20 mm off: a task of its own, with no expert."""
+
+    name = "hover_near"
+    text = "Hover near the needle."
+    phase = NO_PHASE
+    max_steps = 40
+    tolerances = MappingProxyType({"paper": Tolerance.of(20.0, 90.0)})
+    demands = MappingProxyType({"paper": Demands()})
+
+
+@pytest.fixture
+def hover() -> Iterator[type[Subtask]]:
+    surgicai_vision.register_task(Hover)
+    yield Hover
+    tasks.TASKS.unregister(Hover.name)
+    gymnasium.registry.pop(tasks.env_id(Hover.name))
+
+
+@pytest.mark.parametrize("task", names.SUBTASKS)
+def test_our_subtasks_say_what_the_names_say(task: str) -> None:
+    subtask = tasks.load_subtask(task)
+    assert subtask.name == task
+    assert subtask.phase == names.SUBTASKS.index(task)
+    assert subtask.arm == names.ACTIVE_ARM[task]
+    assert isinstance(envs.SUBTASKS[task], subtask)
+
+
+def test_ids_are_there_in_whatever_order_the_two_are_imported() -> None:
+    both = ("surgicai_vision", "gymnasium")
+    for first, second in (both, both[::-1]):
+        code = f"import {first}, {second}, gymnasium as g; print(*g.registry)"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert {tasks.env_id(task) for task in names.TASKS} <= set(done.stdout.split())
+    code = "import surgicai_vision, sys; print('gymnasium' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_a_registered_task_is_one_of_all(hover: type[Subtask]) -> None:
+    assert tasks.task_names() == (*names.TASKS, "hover_near")
+    assert TaskConfig("hover_near").max_steps == 40
+    assert tasks.task_text("hover_near") == hover.text
+    env = gymnasium.make("surgicai_vision/HoverNear-v0")
+    _, info = env.reset(seed=0)
+    assert info["phase"] == NO_PHASE
+    steps = 0
+    terminated = truncated = False
+    while not (terminated or truncated):
+        *_, terminated, truncated, info = env.step(np.zeros(7, np.float32))
+        steps += 1
+    assert steps == 40
+    assert not info["is_success"]
+    with pytest.raises(NameCollision, match="hover_near"):
+        surgicai_vision.register_task(Hover)
+
+
+def test_what_a_task_lacks_is_said(hover: type[Subtask]) -> None:
+    env = envs.make(TaskConfig("hover_near"))
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="'hover_near' has no expert"):
+        Expert(env).action()
+    with pytest.raises(InputError, match=r"tolerance preset of 'hover_near'.*paper"):
+        envs.make(TaskConfig("hover_near", tolerance="released"))
+
+
+def test_a_task_under_another_name_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    tasks.TASKS.register("elsewhere", Hover)
+    try:
+        with pytest.raises(InputError, match=r"'elsewhere'.*calls itself 'hover_near'"):
+            tasks.load_subtask("elsewhere")
+    finally:
+        tasks.TASKS.unregister("elsewhere")
+
+
+def test_public_names_are_there_and_others_are_not() -> None:
+    for name in surgicai_vision.__all__:
+        assert callable(getattr(surgicai_vision, name))
+    with pytest.raises(AttributeError, match="register_robot"):
+        surgicai_vision.register_robot  # noqa: B018
