@@ -19,8 +19,9 @@ SIZE = 7 * len(names.ARMS)
 
 
 class Welds:
-    """The welds between both arms and the needle. The model must be the env's own: poses are
-    written into it.
+    """The welds between both arms and the needle.
+
+    The model must be the env's own: poses are written into it.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):

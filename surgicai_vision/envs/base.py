@@ -271,7 +271,10 @@ class SuturingEnv(gymnasium.Env):
     # -- observing ---------------------------------------------------------------------------------
 
     def agent_pos(self) -> NDArray[np.float32]:
-        """Return the active arm's measured tip in its base, (7,): x y z [m], roll pitch yaw, jaw."""
+        """Return the active arm's measured tip in its base, (7,): x y z, roll pitch yaw, jaw.
+
+        In m and rad.
+        """
         simulation = self.simulation
         arm = self.subtask.arm
         return np.array(
@@ -329,7 +332,7 @@ class SuturingEnv(gymnasium.Env):
         return [-1.0 if value < -1.0 else 1.0 if value > 1.0 else value for value in values]
 
     def _meet_draws(self) -> None:
-        """Follow new draws: goals move with the phantom, and a renderer keeps the needle's shape."""
+        """Follow new draws: goals move with the phantom, the renderer redraws the needle."""
         pair = randomisation.shifted(self.scene.pair, self.simulation.draws)
         axes = self.config.randomisation
         self.stitch = Stitch.of(pair, self.simulation.radius)

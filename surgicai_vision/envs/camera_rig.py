@@ -1,5 +1,6 @@
-"""Images: what an env's cameras see. One renderer at a time, made on first use, hence in the worker
-that uses it.
+"""Camera rig: what an env's cameras see.
+
+There is one renderer at a time; it is made on first use, hence in the worker that uses it.
 """
 
 from typing import Any

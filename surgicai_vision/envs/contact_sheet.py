@@ -54,9 +54,7 @@ def stage(config: TaskConfig, size: int, quality: str = "high") -> Iterator[Any]
 
 
 def coloured(frame: NDArray[Any], modality: str) -> Image:
-    """Return a frame as RGB (H, W, 3): depth by a colour map, segmentation by the parts'
-    palette.
-    """
+    """Return a frame as RGB (H, W, 3): depth by a colour map, segmentation by a palette."""
     if modality == names.RGB:
         return frame
     if modality == names.SEGMENTATION:
@@ -73,8 +71,9 @@ def coloured(frame: NDArray[Any], modality: str) -> Image:
 
 
 def depth_range(frame: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the 2nd and 90th percentile of the depths before `BEYOND` [m], between which colours
-    are spread.
+    """Return the depths [m] between which colours are spread.
+
+    They are the 2nd and the 90th percentile of the depths before `BEYOND`.
     """
     inside = frame[frame < BEYOND]
     if not inside.size:

@@ -123,22 +123,16 @@ class Stitch:
         return cls(pair, centre, math.asin(half / radius), radius)
 
     def on_arc(self, angle_at_entry: float) -> Matrix:
-        """Return the needle's pose on the circle with its point at `angle_at_entry` [rad] in the
-        entry.
-        """
+        """Return the needle's pose on the circle with `angle_at_entry` [rad] in the entry."""
         radial = (np.asarray(self.pair.entry.centre) - self.centre) / self.radius
         return _needle_pose(angle_at_entry, radial, self.centre)
 
     def angle_at_entry(self, angle: float, beyond: float) -> float:
-        """Return which needle angle is in the entry when the point at `angle` is `beyond` the exit
-        [m].
-        """
+        """Return the needle angle in the entry when `angle` is `beyond` the exit [m]."""
         return angle - beyond / self.radius - 2 * self.half
 
     def place(self) -> Matrix:
-        """Return the needle's pose with its tip in the entry, perpendicular to the entry's
-        plane.
-        """
+        """Return the needle's pose with its tip in the entry, perpendicular to its plane."""
         entry = self.pair.entry
         inward = -entry.rotation[:, 2]
         radial = np.cross(WOUND, inward)
@@ -153,8 +147,9 @@ class Stitch:
         return self.on_arc(self.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + extra))
 
     def pulled(self) -> Matrix:
-        """Return the goal of the pull-out: the handoff point at the end point, turned with the
-        inserted needle.
+        """Return the goal of the pull-out.
+
+        The handoff point is at the end point, turned with the inserted needle.
         """
         cosine, sine = math.cos(PULLOUT_TURN), math.sin(PULLOUT_TURN)
         turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
@@ -169,15 +164,14 @@ class Stitch:
 
     @functools.cached_property
     def last_grasp(self) -> float:
-        """Return the largest needle angle at which PSM2's jaws stay outside the entry to the end
-        [rad].
-        """
+        """Return the largest needle angle [rad] at which PSM2's jaws stay outside the entry."""
         return self.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA) - PAD_WIDTH / 2 / self.radius
 
     @property
     def possible(self) -> bool:
-        """Say whether the holes leave room for PSM2's jaws; where not, only grasp and place can be
-        done.
+        """Return True if the holes leave room for PSM2's jaws.
+
+        Where they do not, only grasp and place can be done.
         """
         return self.last_grasp >= FIRST_GRASP
 

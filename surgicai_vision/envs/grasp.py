@@ -32,9 +32,7 @@ def lying_needle(rng: np.random.Generator) -> np.ndarray:
 
 
 class Grasp(Subtask):
-    """Close PSM2's jaws on the needle at the grasp angle: 1 mm and 10°, both pads in contact
-    (paper).
-    """
+    """Close PSM2's jaws on the needle at the grasp angle: 1 mm, 10°, both pads touch (paper)."""
 
     name = "grasp"
     arm = PSM2

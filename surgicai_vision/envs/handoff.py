@@ -1,6 +1,4 @@
-"""Handoff (SurgicAI: Regrasp): PSM1 takes the needle's tip side while PSM2 holds it through the
-tissue.
-"""
+"""Handoff (SurgicAI: Regrasp): PSM1 takes the needle while PSM2 holds it in the tissue."""
 
 import math
 from types import MappingProxyType

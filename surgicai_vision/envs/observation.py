@@ -223,7 +223,10 @@ def _roll(sine: float, cosine: float) -> float:
 
 
 def goal_vector(pose: Pose, jaw: float, met: bool) -> np.ndarray:
-    """Return a pose in world as x y z [m], rotation vector, jaw [rad] and demands met or not, (8,)."""
+    """Return a pose in world as a goal (8,).
+
+    x y z [m], rotation vector [rad], jaw [rad], and 1 where what else success needs holds.
+    """
     turn = matrix_to_rotvec_flat(poses.rotation(pose))
     return np.array([*poses.position(pose), *turn, jaw, met], dtype=np.float32)
 

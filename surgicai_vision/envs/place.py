@@ -41,9 +41,7 @@ def draw_psm2_grasp(
 
 
 class Place(Subtask):
-    """Put the needle's tip into the entry: 5 mm and 10° of the needle's whole orientation
-    (paper).
-    """
+    """Put the needle's tip into the entry: 5 mm, 10° of the needle's orientation (paper)."""
 
     name = "place"
     arm = PSM2

@@ -1,5 +1,4 @@
-"""Randomisation: what differs from episode to episode besides the start, by
-`config.RandomisationConfig`.
+"""Randomisation: what differs from episode to episode besides the start.
 
 `draw` gives one episode's numbers, `apply` writes them into an env's own copy of the model. The
 numbers are part of the whole state, so a restored state looks and moves as it did. All axes are
@@ -158,8 +157,9 @@ def _aim(
     turn: Array,
     fovy: float,
 ) -> None:
-    """Shift a rig [m], turn it about its first camera [rad], both in its carrier's axes; widen its
-    view [deg].
+    """Shift a rig of cameras [m], turn it [rad] and widen its view [deg].
+
+    It turns about its first camera, in the axes of what carries it.
 
     Where a rig's first camera sees so much more, the others see more by the same factor.
     """
@@ -177,9 +177,7 @@ def _aim(
 def _shape_needle(
     source: mujoco.MjModel, model: mujoco.MjModel, geoms: range, size: float, thickness: float
 ) -> None:
-    """Scale the needle's arc and its thickness: what collides, the bounds that find collisions, and
-    what is drawn.
-    """
+    """Scale the needle's arc and thickness: what collides, its bounds, and what is drawn."""
     of, body = slice(geoms.start, geoms.stop), source.body("needle").id
     radius, half = source.geom_size[of, 0] * thickness, source.geom_size[of, 1] * size
     model.geom_size[of, 0], model.geom_size[of, 1] = radius, half
@@ -204,8 +202,9 @@ def _shape_needle(
 
 
 def _weigh_needle(source: mujoco.MjModel, model: mujoco.MjModel, body: int, size: float) -> None:
-    """Scale mass and inertia with the arc's length, move what is fixed to it, and derive MuJoCo's
-    constants anew.
+    """Scale mass and inertia with the arc's length, and derive MuJoCo's constants anew.
+
+    What is fixed to the needle moves with it.
     """
     model.body_mass[body] = source.body_mass[body] * size
     model.body_inertia[body] = source.body_inertia[body] * size**3

@@ -269,9 +269,7 @@ class Simulation:
     # -- measuring ---------------------------------------------------------------------------------
 
     def keep_reads(self) -> None:
-        """Read each pose only once from now on, until `forget_reads`: nothing may move in
-        between.
-        """
+        """Read each pose only once until `forget_reads`; nothing may move in between."""
         self._read = {}
 
     def forget_reads(self) -> None:
@@ -300,9 +298,7 @@ class Simulation:
         return read["needle"] if read is not None and "needle" in read else self._body("needle")
 
     def tip_in_base(self, arm: str) -> Pose:
-        """Return T_base_tip as the arm reports it: its kinematics do not know of an error of its
-        joints.
-        """
+        """Return T_base_tip as the arm reports it, which does not know of its joints' error."""
         if not self.offsets:
             return self.to_base(arm, self.tip(arm))
         joints = tuple(self.data.qpos[self.scene.arms[arm].qpos].tolist())
@@ -344,9 +340,7 @@ class Simulation:
         )
 
     def touching(self, arm: str) -> tuple[bool, bool]:
-        """Say whether the left and the right jaw pad touch the needle: the jaws' contact
-        sensors.
-        """
+        """Return whether the left and the right jaw pad touch the needle."""
         left, right = self._pads[arm]
         first, last = self._needle_geoms
         found_left = found_right = False
@@ -361,8 +355,9 @@ class Simulation:
         return found_left, found_right
 
     def holds(self, arm: str) -> bool:
-        """Say whether both jaw pads of an arm touch the needle, or, at grasp level "attach", it is
-        attached.
+        """Return True if an arm holds the needle.
+
+        Both its jaw pads touch it, or, at grasp level "attach", it is attached.
         """
         if self._welds:
             return self._welds.active(arm)
@@ -370,8 +365,9 @@ class Simulation:
         return left and right
 
     def touches_phantom(self, *, needle: bool) -> bool:
-        """Say whether an instrument, or with `needle` the needle too, touches the phantom; the
-        thread always may.
+        """Return True if an instrument, or with `needle` the needle too, touches the phantom.
+
+        The thread always may.
         """
         bodies = self.model.geom_bodyid[self.data.contact.geom]
         may = self.model.body_rootid[bodies] == self._needle_id  # the thread hangs on the needle

@@ -1,5 +1,4 @@
-"""Starts: put the needle into an arm's jaws by solving for the pose, not by playing the subtasks
-before.
+"""Starts: put the needle into an arm's jaws by solving for the pose.
 
 The jaws are posed closed around the needle and the physics settles for `SETTLE` steps; a start that
 then is not a grasp, or that touches the phantom where it should not, is refused and drawn again.
@@ -49,8 +48,9 @@ class GraspError(NamedTuple):
 
 
 def draw_grasp_error(rng: np.random.Generator, shift: float, angle: float) -> GraspError:
-    """Draw a grasp error: at most `shift` [m] along the needle and in depth, at most `angle` [rad]
-    about two axes.
+    """Draw how far a grasp is off: at most `shift` [m] and `angle` [rad].
+
+    The shift is along the needle and in depth, the angle about two axes.
 
     The third rotation and the third translation do not exist: the jaws' flat pads take them away on
     closing.
@@ -68,9 +68,7 @@ def grasp_pose(
     error: GraspError | None = None,
     radius: float = needle.RADIUS,
 ) -> Matrix:
-    """Return T_world_tip (4, 4) of a grasp of the point at `angle` [rad] of an arc of `radius` [m],
-    off by `error`.
-    """
+    """Return T_world_tip (4, 4) of a grasp of an arc's point at `angle` [rad], off by `error`."""
     if error is None:
         return needle_pose @ grasp_in_needle(arm, angle, radius=radius)
     grasp = needle_pose @ grasp_in_needle(
@@ -90,8 +88,7 @@ def hold_needle(
     tip: Matrix,
     turn: float = math.radians(8.0),
 ) -> bool:
-    """Pose the needle and `arm` around it, close, settle; say whether both pads hold it where it
-    was put.
+    """Put `arm` around the needle, close and settle; return True if it holds the needle there.
 
     Args:
         simulation: already reset.

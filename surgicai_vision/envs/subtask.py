@@ -76,8 +76,9 @@ class Subtask(ABC):
 
     @abstractmethod
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
-        """Put the simulation into a random start state; False where the draw is not physical (draw
-        again).
+        """Put the simulation into a random start state.
+
+        Return False where the draw is not physical: the caller draws again.
         """
 
     @abstractmethod

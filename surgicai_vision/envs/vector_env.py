@@ -101,8 +101,9 @@ class SuturingVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Tree, dict[str, Any]]:
-        """Reset all envs, or those of `options["reset_mask"]`; an int seeds them seed, seed + 1,
-        …
+        """Reset all envs, or those of `options["reset_mask"]`.
+
+        An int seeds them with seed, seed + 1, …
         """
         self._check_open()
         seeds = [None if seed is None else seed + index for index in range(self.num_envs)] if not isinstance(

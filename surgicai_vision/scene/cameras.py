@@ -130,8 +130,9 @@ BASELINE, TOE_IN = 0.004, 0.040
 
 
 def _endoscope(side: float) -> CameraPose:
-    """Return the left (side = 1) or the right (-1) camera: left is +x, for the endoscope looks
-    along -y.
+    """Return the left (side = 1) or the right (-1) camera.
+
+    Left is +x, because the endoscope looks along -y.
     """
     x, y, z = ENDOSCOPE
     across, forward, down = ENDOSCOPE_DIRECTION
@@ -206,8 +207,9 @@ def add_cameras(spec: mujoco.MjSpec, names: Iterable[str], instrument: str) -> N
 
 
 def look_at(direction: Vector, up: Vector) -> Array:
-    """Return the rotation (3, 3) of an OpenCV camera frame that looks along `direction` with `up`
-    upwards.
+    """Return the rotation (3, 3) of an OpenCV camera frame that looks along `direction`.
+
+    `up` shows upwards in its image.
     """
     forward: Array = np.array(direction, dtype=np.float64)
     forward /= np.linalg.norm(forward)
@@ -229,8 +231,7 @@ def intrinsics(model: mujoco.MjModel, camera: str, height: int, width: int) -> A
 
 
 def extrinsics(model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> Array:
-    """Return T_world_camera (4, 4) at the state of `data`, which must have been through
-    `mj_forward`.
+    """Return T_world_camera (4, 4) at the state of `data`, after `mj_forward`.
 
     Raises:
         UnknownName: no such camera in the model.

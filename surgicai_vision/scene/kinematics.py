@@ -1,5 +1,6 @@
-"""Kinematics of the da Vinci patient-side manipulator (PSM): joints ⇄ pose of the tool tip in the
-arm's base.
+"""Kinematics of the da Vinci patient-side manipulator (PSM): joints ⇄ pose of the tool tip.
+
+The pose is in the arm's base.
 
 `Instrument.dh` is the modified DH table that the surgical robotics challenge publishes. The base
 origin is the remote centre of motion: the shaft passes through it, so both directions are closed
@@ -53,8 +54,9 @@ TOLERANCE = 1e-9
 
 
 class Row(NamedTuple):
-    """One row: RotX(alpha) TransX(a) RotZ(q + offset) TransZ(d) [rad, m]; where `prismatic`, q adds
-    to d.
+    """One row: RotX(alpha) TransX(a) RotZ(q + offset) TransZ(d) [rad, m].
+
+    Where `prismatic`, q adds to d.
     """
 
     alpha: float
@@ -105,9 +107,7 @@ class Instrument:
 
 
 def _limits(*degrees: float) -> tuple[tuple[float, float], ...]:
-    """Return symmetric limits of the five turning joints, with 0..0.24 m of insertion between
-    them.
-    """
+    """Return symmetric limits of the five turning joints and 0..0.24 m of insertion."""
     turning = [(-radians(angle), radians(angle)) for angle in degrees]
     return (*turning[:INSERTION], (0.0, 0.24), *turning[INSERTION:])
 
@@ -287,9 +287,7 @@ def _shaft(
 
 
 def _better(first: Joints, second: Joints, instrument: Instrument, near: Joints | None) -> Joints:
-    """Return the solution within limits; of two such, or of none, the one nearer to `near` (or to
-    zero).
-    """
+    """Return the solution within limits, or the one nearer to `near`, or to zero."""
     within = [joints for joints in (first, second) if _violation(joints, instrument) < 0]
     return min(within or (first, second), key=lambda joints: math.dist(joints, near or (0.0,) * 6))
 

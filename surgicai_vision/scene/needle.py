@@ -45,9 +45,7 @@ at most; with 0.01 m 0.4° and 1.2°."""
 
 
 def point(angle: float, radius: float = RADIUS) -> np.ndarray:
-    """Return the point at `angle` [rad] of an arc of `radius` [m] in the needle frame, shape (3,)
-    [m].
-    """
+    """Return the point (3,) [m] at `angle` [rad] of an arc of `radius` [m] in its frame."""
     return np.array([-radius * math.cos(angle), radius * math.sin(angle), 0.0])
 
 
@@ -57,9 +55,7 @@ def tangent(angle: float) -> np.ndarray:
 
 
 def radial(angle: float) -> np.ndarray:
-    """Return the unit vector from the centre to the arc at `angle` [rad] in the needle frame, shape
-    (3,).
-    """
+    """Return the unit vector (3,) from the centre to the arc at `angle` [rad]."""
     return np.array([-math.cos(angle), math.sin(angle), 0.0])
 
 
@@ -72,9 +68,7 @@ def polyline(points: int = 61, radius: float = RADIUS) -> np.ndarray:
 
 
 def thickness(angle: float) -> float:
-    """Return half of the needle's thickness at `angle` [rad]: it tapers over the last quarter
-    [m].
-    """
+    """Return half of the needle's thickness [m] at `angle` [rad]; its last quarter tapers."""
     share = max(0.0, (angle / TIP_ANGLE - 0.75) / 0.25)
     return BODY_RADIUS + share * (TIP_RADIUS - BODY_RADIUS)
 

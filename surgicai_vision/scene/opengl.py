@@ -1,5 +1,4 @@
-"""OpenGL without a display: one context for the whole process, made on first use and freed at its
-end.
+"""OpenGL without a display: one context a process, made on first use, freed at its end.
 
 Software rendering runs in the calling thread ($LP_NUM_THREADS is put to 0): one process per core is
 faster than one threaded process, and a forked child, which lacks its parent's threads, would wait

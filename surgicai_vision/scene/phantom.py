@@ -79,8 +79,7 @@ def add_phantom(
 
 
 def add_table(spec: mujoco.MjSpec, bits: dict[str, int]) -> None:
-    """Add the tray and the table below it, on which a needle comes to rest that falls from the
-    phantom.
+    """Add the tray and the table below, where a needle that falls from the phantom rests.
 
     They are solid for the needle and the thread alone: no instrument is meant to come so low.
 

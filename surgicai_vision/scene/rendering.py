@@ -32,8 +32,9 @@ __all__ = ["QUALITIES", "FrameRenderer", "parts_of_geoms", "renderer_string"]
 
 @dataclass(frozen=True)
 class Quality:
-    """What an image costs: multisampling, shadow map [pixel], triangles round and along a capsule,
-    quads a face.
+    """What an image costs.
+
+    Multisampling, shadow map [pixel], triangles round and along a capsule, quads a face.
     """
 
     samples: int
@@ -89,9 +90,7 @@ class FrameRenderer:
     def render_all(
         self, data: mujoco.MjData, camera: str, modalities: Iterable[str]
     ) -> dict[str, NDArray[Any]]:
-        """Return several modalities of one view as `render` does; depth and segmentation share one
-        pass.
-        """
+        """Return several modalities of one view; depth and segmentation share one pass."""
         wanted = tuple(modalities)
         for modality in wanted:
             check_name("modality", modality, MODALITIES)
@@ -178,9 +177,7 @@ class _Target:
         mujoco.mjr_readPixels(self.colours, self.depths, self.area, self.context)
 
     def _depth(self) -> NDArray[np.float32]:
-        """Return metres from the depth buffer, which is 1 at the near plane and 0 at the far
-        plane.
-        """
+        """Return metres from the depth buffer: 1 at the near plane, 0 at the far plane."""
         extent = self.model.stat.extent
         near, far = self.model.vis.map.znear * extent, self.model.vis.map.zfar * extent
         stored = self.depths[::-1, :, None].astype(np.float64)
@@ -188,9 +185,7 @@ class _Target:
         return metres.astype(np.float32)
 
     def _segmentation(self) -> NDArray[np.uint8]:
-        """Return parts from colours: a geom's number in the scene plus 1, in base 256, red
-        first.
-        """
+        """Return parts from colours: a geom's number plus 1, in base 256, red first."""
         if (
             len(self.codes) != self.scene.ngeom + 1
         ):  # the same geoms are visible in every frame of a model
@@ -205,8 +200,9 @@ class _Target:
 
 
 def parts_of_geoms(model: mujoco.MjModel) -> NDArray[np.uint8]:
-    """Return each geom's index in `names.PARTS` (ngeom,), by the name of the first named part among
-    its bodies.
+    """Return each geom's index in `names.PARTS`, (ngeom,).
+
+    The first of its bodies that is named after a part decides.
     """
     found = np.zeros(model.ngeom, dtype=np.uint8)
     for geom in range(model.ngeom):

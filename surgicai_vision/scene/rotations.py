@@ -35,8 +35,9 @@ def rpy_to_matrix_flat(roll: float, pitch: float, yaw: float) -> Flat9:
 
 
 def matrix_to_rpy_flat(m: Sequence[float]) -> Vector:
-    """Return (roll, pitch, yaw) [rad]: roll in (-2π, 0] as in the released code, pitch in [-π/2,
-    π/2], yaw in (-π, π].
+    """Return (roll, pitch, yaw) [rad] of a rotation.
+
+    Roll is in (-2π, 0] as in the released code, pitch in [-π/2, π/2], yaw in (-π, π].
 
     The tools point down in their base frames, at a roll of about ±π; the range (-2π, 0] puts the
     cut elsewhere.
@@ -76,9 +77,7 @@ def rotvec_to_matrix_flat(x: float, y: float, z: float) -> Flat9:
 
 
 def matrix_to_rotvec_flat(m: Sequence[float]) -> Vector:
-    """Return the rotation vector [rad], of length at most π; exact to rounding at 0 and at π as
-    well.
-    """
+    """Return the rotation vector [rad], at most π long; exact to rounding at 0 and at π too."""
     w, x, y, z = matrix_to_quaternion_flat(m)
     half_sine = sqrt(x * x + y * y + z * z)
     scale = 2.0 if half_sine < 1e-12 else 2.0 * atan2(half_sine, w) / half_sine
@@ -86,8 +85,9 @@ def matrix_to_rotvec_flat(m: Sequence[float]) -> Vector:
 
 
 def matrix_to_quaternion_flat(m: Sequence[float]) -> Quaternion:
-    """Return the unit quaternion (w, x, y, z) with w >= 0, by Shepperd's choice of the largest
-    component.
+    """Return the unit quaternion (w, x, y, z) with w >= 0.
+
+    Shepperd's method: the largest component is computed first.
     """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = m
     trace = r00 + r11 + r22
@@ -163,9 +163,7 @@ def rotvec_to_matrix(rotvec: ArrayLike) -> Matrix:
 
 
 def matrix_to_rotvec(matrix: ArrayLike) -> Matrix:
-    """Return the rotation vector (3,) [rad] of a (3, 3) rotation: the logarithm, of length at most
-    π.
-    """
+    """Return the rotation vector (3,) [rad] of a rotation (3, 3): its logarithm, at most π long."""
     return np.array(matrix_to_rotvec_flat(flatten(matrix)))
 
 

@@ -1,6 +1,4 @@
-"""The environments' contract: gymnasium's own, determinism, the whole state in one vector,
-refusals.
-"""
+"""The environments' contract: gymnasium's own, determinism, the whole state, refusals."""
 
 import hashlib
 import subprocess
@@ -120,9 +118,7 @@ def test_a_used_env_repeats_a_seed(task):
 
 @pytest.mark.parametrize("task", names.TASKS)
 def test_a_restored_state_has_the_same_future(task):
-    """From the middle of an episode, contacts and all: same observation, same future, bit for
-    bit.
-    """
+    """From the middle of an episode: same observation, same future, bit for bit."""
     steps = {"grasp": 50, "place": 30, "insert": 48, "handoff": 86, "pullout": 40, "suture": 345}[
         task
     ]

@@ -1,6 +1,4 @@
-"""What the envs show: nothing shared, nothing constant, nothing privileged; starts, and the reward
-of goals.
-"""
+"""What the envs show: nothing shared, constant or privileged; starts; rewards of goals."""
 
 import numpy as np
 import pytest
@@ -86,9 +84,7 @@ def test_vision_holds_images_and_proprioception_only(obs_type, depth, segmentati
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_proprioception_does_not_know_the_needle(task):
-    """Move the needle and every goal with it, arms fixed: images change, the tool's numbers do
-    not.
-    """
+    """Move the needle and every goal, arms fixed: images change, the tool's numbers do not."""
     env = make(task, obs_type="pixels_agent_pos")
     seen, _ = env.reset(seed=0)
     qpos = env.data.qpos.copy()
@@ -201,8 +197,9 @@ def test_compute_reward_is_the_reward(task, reward, tolerance):
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_the_goals_pose_alone_is_no_reward(task):
-    """Jaws closed on nothing, holes not passed: a needle put to its goal is rewarded where nothing
-    else is asked.
+    """A needle put to its goal is rewarded only where nothing else is asked.
+
+    Jaws are closed on nothing, holes are not passed.
     """
     env = make(task, obs_type="goal")
     seen, _ = env.reset(seed=1)

@@ -1,6 +1,4 @@
-"""Randomisation: each axis changes what it should, from the seed alone, in a model of the env's
-own, and restores.
-"""
+"""Randomisation: each axis changes what it should, from the seed alone, and is restored."""
 
 import dataclasses
 import math
@@ -204,9 +202,7 @@ def test_a_thicker_needle_lies_higher():
 
 
 def test_a_needles_size_is_that_of_its_arc_its_mass_and_its_stitch():
-    """What collides, what is drawn, the tip that passage watches and the goals all lie on the arc
-    that was drawn.
-    """
+    """What collides, what is drawn, the watched tip and the goals all lie on the drawn arc."""
     axes = {"randomisation": RandomisationConfig(needle_size=0.1), "scene": SceneConfig(thread=10)}
     env, plain = envs.make(TaskConfig("insert", **axes)), build_scene(SceneConfig(thread=10)).model
     radii = set()

@@ -1,5 +1,6 @@
-"""Success: what must not count does not, and a physics error never does. Each fraud is shown beside
-the honest way.
+"""Success: what must not count does not, and a physics error never does.
+
+Each wrong way is shown beside the right one.
 """
 
 import dataclasses
@@ -30,8 +31,9 @@ def put(env, pose):
 
 
 def drag(env, path):
-    """Move the needle along `path` under the judge's eyes, with no physics in the way; return the
-    measurement.
+    """Move the needle along `path` without physics and return the measurement.
+
+    Every step is checked for crossings, as in an episode.
     """
     for pose in path:
         put(env, pose)
@@ -46,9 +48,7 @@ def shifted(pose, shift):
 
 
 def turning(stitch, first, last, shift=(0.0, 0.0, 0.0)):
-    """Needle poses on the circle from angle `first` to `last` in the entry [deg], 3° (half a mm)
-    apart.
-    """
+    """Needle poses on the circle from angle `first` to `last` in the entry [deg], 3° apart."""
     count = int(abs(last - first) / 3) + 2
     return [
         shifted(stitch.on_arc(math.radians(angle)), shift)
@@ -126,9 +126,7 @@ def test_tunnelling_beside_the_holes_does_not_count(side):
 
 @pytest.mark.parametrize("depth", [-0.0005, 0.0005])
 def test_dragging_along_the_entrys_plane_does_not_count(depth):
-    """The tip dips below the plane beside the opening and is dragged under it, or is dragged over
-    it.
-    """
+    """The tip dips below the plane beside the opening and is dragged under it or over it."""
     env = start("insert")
     outward = env.stitch.pair.entry.rotation[:, 2]
     beside = shifted(env.stitch.place(), ASIDE + 0.002 * outward)
@@ -150,9 +148,7 @@ def test_the_wrong_way_round_does_not_count():
 
 
 def test_a_needle_torn_out_of_the_entry_alone_does_not_count():
-    """Honestly through both holes, then turned by 8° about the exit, through the tissue beside the
-    entry.
-    """
+    """Through both holes, then turned by 8° about the exit through the tissue at the entry."""
     env = start("insert")
     inserted = turning(env.stitch, 130.0, inserted_angle(env))
     path = [*inserted, *sliding(inserted[-1], (0.0, 0.0015, 0.0))]
@@ -232,7 +228,7 @@ def test_a_needle_drawn_back_does_not_count():
 
 
 def test_the_closed_form_is_the_naive_test():
-    """`hole_crossing` equals the crossing of a fine polyline, for needles anywhere about the holes."""
+    """The closed form equals the crossing of a fine polyline, anywhere about the holes."""
     env = start("pullout")
     simulation, pair = env.simulation, env.stitch.pair
     rng, found = np.random.default_rng(0), np.zeros((3, 2), int)
@@ -262,9 +258,7 @@ GRASPS = {"grasp": (names.PSM2, None), "handoff": (names.PSM1, HANDOFF_ANGLE)}
 
 
 def jaws_at_the_grasp(task, jaw, measured, needle_shift=(0.0, 0.0, 0.0)):
-    """Measure with the jaws at the grasp's pose; needle, free in the air, `needle_shift` away in
-    its own frame.
-    """
+    """Measure with the jaws at the grasp's pose, the needle `needle_shift` away in its frame."""
     env = start(task)
     simulation, (arm, angle) = env.simulation, GRASPS[task]
     pose = env.stitch.inserted() if task == "handoff" else poses.square(simulation.needle())
@@ -322,7 +316,7 @@ def moved_world(monkeypatch):
 
 
 def carry_over(source, target, shift):
-    """Give `target` the tools, needle and task state of `source`, all moved by `shift` [m, world]."""
+    """Give `target` the poses and the task state of `source`, moved by `shift` [m, world]."""
     one, other = source.simulation, target.simulation
     for arm in names.ARMS:
         tip = poses.square(one.tip(arm))
@@ -336,9 +330,7 @@ def carry_over(source, target, shift):
 
 @pytest.mark.parametrize("task", names.SUBTASKS)
 def test_success_does_not_change_when_the_world_is_moved(task, moved_world):
-    """Holes, tools and needle 3 mm and -6 mm away: every measure of the first and the last state is
-    the same.
-    """
+    """With everything 3 mm and -6 mm away, every measure of the first and last state is equal."""
     shift = np.array([0.003, -0.006, 0.0])
     here = make(task)
     here.reset(seed=1)

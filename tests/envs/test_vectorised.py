@@ -1,6 +1,4 @@
-"""Vectorised: make_vec, sync, async and with our own workers, gives what single envs give, infos
-included.
-"""
+"""Vector envs, sync, async and with our workers, give what single envs give, infos too."""
 
 import os
 import signal
@@ -109,9 +107,7 @@ def test_importing_registers_every_id():
 
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
 def test_shares_of_envs_are_one_sync_vector(autoreset):
-    """Three envs on two workers, over ends of episodes: the same as in this process, infos and
-    masks included.
-    """
+    """Three envs on two workers, over ends of episodes, are the same as in this process."""
     arguments = {
         "max_episode_steps": 3,
         "autoreset_mode": autoreset,
@@ -159,9 +155,7 @@ def assert_same(one, other):
 
 
 def test_a_workers_error_and_its_death_are_told():
-    """The error is the one of a single env; a killed worker is named; after both the vector env is
-    closed.
-    """
+    """The error is that of a single env, a killed worker is named, and the env is closed."""
     vector = make_vec("place", "workers")
     vector.reset(seed=0)
     with pytest.raises(InputError, match="7 finite numbers"):

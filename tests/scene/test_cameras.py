@@ -1,6 +1,4 @@
-"""Cameras of the scene: the published poses arrived, and the wrist cameras see what they are aimed
-at.
-"""
+"""Cameras: the published poses arrived, and the wrist cameras see what they aim at."""
 
 import math
 from collections.abc import Iterator

@@ -61,9 +61,7 @@ def test_physics_is_the_same_without_the_looks(model, monkeypatch):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_skin_lies_on_the_flanks_and_the_holes_are_open(layout):
-    """Depth of a ray through each hole's ink is that of the flank, and through its middle it is
-    deeper.
-    """
+    """The depth at each hole's rim is that of the flank, and in its middle it is deeper."""
     model = build_scene(SceneConfig(layout=layout)).model
     data = at_start(model)
     T_world_camera, matrix = extrinsics(model, data, "back"), intrinsics(model, "back", *SIZE)

@@ -1,6 +1,4 @@
-"""The compiled scene: the numbers that were declared arrived, and the laws of mechanics hold in
-it.
-"""
+"""The compiled scene: declared numbers arrived, and the laws of mechanics hold in it."""
 
 import dataclasses
 import math
@@ -212,9 +210,7 @@ def test_the_holes_of_the_simple_layout_are_surgicais(number):
 )
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_the_circle_through_both_holes_clears_the_phantom(layout, clearance, number):
-    """From the tip in the entry until the base is out of the exit; `clearance` [mm] is that of the
-    needle's skin.
-    """
+    """From the tip in the entry until the base is out; `clearance` [mm] is that of the skin."""
     scene = build_scene(SceneConfig(layout=layout, hole_pair=number))
     simulation, stitch = Simulation(scene), Stitch.of(scene.pair)
     model, data = simulation.model, simulation.data

@@ -1,5 +1,4 @@
-"""Look: materials, lights, surroundings, and the visible shape of what physics sees as boxes and
-capsules.
+"""Look: materials, lights, surroundings, and the visible shape of physical parts.
 
 Nothing here touches physics: every geom it adds collides with nothing and weighs nothing (group 1),
 and the physical geoms it covers are only moved to a group that is not drawn (group 4). Colours and

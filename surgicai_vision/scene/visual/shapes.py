@@ -28,8 +28,9 @@ class Mesh:
     def add_grid(
         self, points: ArrayLike, coordinates: ArrayLike | None = None, keep: ArrayLike | None = None
     ) -> None:
-        """Add a grid of points (rows, columns, 3) [m], seen from the side on which rows × columns
-        is the normal.
+        """Add a grid of points (rows, columns, 3) [m].
+
+        It is seen from the side on which rows × columns is the normal.
 
         Args:
             coordinates: of the texture, (rows, columns, 2).
@@ -65,8 +66,9 @@ class Mesh:
 
 
 def loft(sections: ArrayLike) -> Mesh:
-    """Return the closed surface through sections (n, sides, 3) [m], each running anticlockwise seen
-    from the last.
+    """Return the closed surface through sections (n, sides, 3) [m].
+
+    Each runs anticlockwise, seen from the last.
     """
     rings = np.asarray(sections, dtype=np.float64)
     mesh = Mesh()
@@ -98,8 +100,9 @@ def tube(centres: ArrayLike, radii: ArrayLike, normal: ArrayLike, sides: int = 8
 
 
 def bar(sections: Sequence[tuple[float, float, float, float]]) -> Mesh:
-    """Return a straight bar along z through rectangles (z, lowest y, highest y, half of the width
-    in x) [m].
+    """Return a straight bar along z through rectangles [m].
+
+    A rectangle is (z, lowest y, highest y, half of the width in x).
     """
     corners = [
         [(-w, low, z), (w, low, z), (w, high, z), (-w, high, z)] for z, low, high, w in sections

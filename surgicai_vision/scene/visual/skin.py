@@ -123,8 +123,9 @@ def _flattened(profile: Array) -> Array:
 
 
 def _skin(pairs: tuple[HolePair, ...]) -> Mesh:
-    """Return the outer surface with the openings left out; the texture runs along it without
-    stretching.
+    """Return the outer surface without the openings.
+
+    The texture runs along it without stretching.
     """
     rows = _rows(pairs, [_profile(pair) for pair in pairs])
     points = np.stack([np.insert(section, 1, y, axis=1) for y, section, _ in rows])
@@ -142,9 +143,7 @@ def _skin(pairs: tuple[HolePair, ...]) -> Mesh:
 
 
 def _inside(pairs: tuple[HolePair, ...]) -> Mesh:
-    """Return what shows through the holes: the walls of the openings and the flanks' inner
-    faces.
-    """
+    """Return what shows through the holes: the openings' walls, the flanks' inner faces."""
     mesh = Mesh()
     sections = []
     for pair in pairs:
@@ -169,8 +168,9 @@ def _inside(pairs: tuple[HolePair, ...]) -> Mesh:
 
 
 def _add_walls(mesh: Mesh, near: Array, far: Array, y: float) -> None:
-    """Add the four walls of one opening between its outer and inner edges, (2, 2) each: lower and
-    upper x, z.
+    """Add the four walls of one opening between its outer and inner edges.
+
+    An edge is (2, 2): lower and upper x, z.
     """
     reach = OPENING / 2
     loop = ((0, -reach), (1, -reach), (1, reach), (0, reach), (0, -reach))

@@ -54,9 +54,7 @@ def cloth(size: int = 256, seed: int = 2) -> Image:
 
 
 def noise(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Field:
-    """Return smooth noise in [0, 1), (height, width), with `rows` × `columns` random knots; it
-    tiles.
-    """
+    """Return smooth noise in [0, 1), (height, width), with `rows` × `columns` knots; it tiles."""
     knots = rng.integers(0, 65536, size=(rows, columns)) / 65536.0
     first, second, share = _knots(height, rows)
     along = knots[first] * (1.0 - share)[:, None] + knots[second] * share[:, None]
@@ -74,9 +72,7 @@ def _knots(length: int, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64
 
 
 def _filaments(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Field:
-    """Return thin winding lines: 1 where smooth noise crosses its middle, falling steeply beside
-    it.
-    """
+    """Return thin winding lines: 1 where smooth noise crosses its middle, 0 beside it."""
     octaves = ((0.6, 1), (0.28, 2), (0.12, 4))
     field = sum(
         weight * noise(rng, height, width, rows * fine, columns * fine) for weight, fine in octaves
@@ -98,8 +94,9 @@ def _bytes(image: Field) -> Image:
 
 
 def png(image: Image) -> bytes:
-    """Return an (H, W, 3) image as a PNG file, stored without compression so that its bytes depend
-    on nothing.
+    """Return an (H, W, 3) image as a PNG file.
+
+    It is stored without compression, so that its bytes depend on nothing else.
     """
     height, width, _ = image.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)

@@ -1,5 +1,4 @@
-"""Tool: the visible shape of an instrument's shaft, wrist and fingers, over the capsules and boxes
-of its physics.
+"""Tool: the visible shape of an instrument's shaft, wrist and fingers over its physics.
 
 One mesh a link, because every geom costs each physics step a little, collides or not. Dimensions
 are those of an 8 mm needle driver, drawn slim at the wrist so that it hides little of the needle.
@@ -20,8 +19,9 @@ HALF_TURN = [0.0, 0.0, 0.0, 1.0]
 
 
 def add_tool_meshes(spec: mujoco.MjSpec, length: float) -> None:
-    """Add the meshes "fork", "wrist" and "finger"; `length` is that of the link between the wrist's
-    axes [m].
+    """Add the meshes "fork", "wrist" and "finger".
+
+    `length` is that of the link between the wrist's axes [m].
     """
     _fork().add_to(spec, "fork")
     _wrist(length).add_to(spec, "wrist")
@@ -29,8 +29,9 @@ def add_tool_meshes(spec: mujoco.MjSpec, length: float) -> None:
 
 
 def dress_shaft(link: mujoco.MjsBody, arm: str) -> None:
-    """Draw the shaft, a coloured band on it, and the fork; z runs along the shaft, y is the pitch
-    axis.
+    """Draw the shaft, a coloured band on it, and the fork.
+
+    z runs along the shaft, y is the pitch axis.
     """
     show(link, Cylinder, "shaft", fromto=[0, 0, -SHAFT_LENGTH, 0, 0, -0.0105], size=[0.0040, 0, 0])
     show(link, Cylinder, f"band_{arm}", fromto=[0, 0, -0.0150, 0, 0, -0.0130], size=[0.0041, 0, 0])
@@ -39,16 +40,18 @@ def dress_shaft(link: mujoco.MjsBody, arm: str) -> None:
 
 
 def dress_wrist(link: mujoco.MjsBody, length: float) -> None:
-    """Draw the link between the wrist's axes; x runs along it, z is the pitch axis, y the yaw
-    axis.
+    """Draw the link between the wrist's axes.
+
+    x runs along it, z is the pitch axis, y the yaw axis.
     """
     show(link, mujoco.mjtGeom.mjGEOM_MESH, "steel", meshname="wrist")
     show(link, Cylinder, "jaw", pos=[length, 0, 0], quat=ALONG_Y, size=[0.0008, 0.0025, 0])
 
 
 def dress_finger(finger: mujoco.MjsBody, sign: float) -> None:
-    """Draw the back of a finger that opens towards +y (sign = 1) or -y; its physical pad shows as
-    it is.
+    """Draw the back of a finger that opens towards +y (sign = 1) or -y.
+
+    Its physical pad is visible as it is.
     """
     turn = {} if sign > 0 else {"quat": HALF_TURN}
     show(finger, mujoco.mjtGeom.mjGEOM_MESH, "steel", meshname="finger", **turn)
@@ -78,9 +81,7 @@ def _wrist(length: float) -> Mesh:
 
 
 def _finger() -> Mesh:
-    """Return a finger's back, tapered from the hinge to the end of its pad, and its hub on one half
-    of the hinge.
-    """
+    """Return a finger's back, tapered from hinge to pad, and its hub on half of the hinge."""
     middle, half = PAD_OFFSET + PAD_THICKNESS / 2, PAD_WIDTH / 2
     mesh = bar(
         [
