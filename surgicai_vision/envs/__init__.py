@@ -62,7 +62,7 @@ def _subtask(task: str) -> Subtask:
 
 
 def make_task(
-    task: str, scene: SceneConfig | dict[str, Any] | None = None, **arguments: Any
+    task: str, scene: SceneConfig | dict[str, object] | None = None, **arguments: Any
 ) -> SuturingEnv:
     """Return an env from flat arguments.
 
@@ -102,7 +102,7 @@ def make_registered(task: str, **arguments: Any) -> SuturingEnv:
     return make_task(task, truncates=False, **arguments)
 
 
-def refuse_max_steps(arguments: Mapping[str, Any]) -> None:
+def refuse_max_steps(arguments: Mapping[str, object]) -> None:
     """Raise `InputError` where two arguments would limit an episode."""
     if "max_steps" in arguments:
         raise InputError(

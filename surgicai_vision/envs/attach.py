@@ -25,7 +25,8 @@ class Welds:
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
-        self._model, self._data = model, data
+        self._model = model
+        self._data = data
         self._ids = {arm: model.equality(f"{arm}_attach").id for arm in names.ARMS}
 
     def active(self, arm: str) -> bool:

@@ -15,9 +15,10 @@
 """
 
 from math import isfinite
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import gymnasium
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,12 +35,14 @@ from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.envs.success import Info, Target, measure, meets_demands
 from surgicai_vision.scene import build_scene, needle
+from surgicai_vision.scene.rendering import Frame
 
 START_DRAWS = 60
 """Draws of a start state before giving up."""
-RENDER_CAMERA, RENDER_SIZE = "front", (480, 640)
+RENDER_CAMERA = "front"
+RENDER_SIZE = (480, 640)
 
-Observation = NDArray[np.float32] | dict[str, Any]
+Observation = NDArray[np.float32] | dict[str, Frame]
 
 
 class SuturingEnv(gymnasium.Env):
@@ -53,7 +56,7 @@ class SuturingEnv(gymnasium.Env):
         truncates: end episodes at `config.max_steps`; False where gymnasium's `TimeLimit` does.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # gymnasium declares no ClassVar
+    metadata: ClassVar[dict[str, object]] = {  # type: ignore[misc]  # gymnasium declares no ClassVar
         "render_modes": ["rgb_array"],
         "render_fps": names.FPS,
     }
@@ -114,7 +117,7 @@ class SuturingEnv(gymnasium.Env):
     # -- gymnasium ---------------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
     ) -> tuple[Observation, Info]:
         """Draw a start state; `seed` makes it reproducible."""
         super().reset(seed=seed)
@@ -177,12 +180,12 @@ class SuturingEnv(gymnasium.Env):
     # -- what it is --------------------------------------------------------------------------------
 
     @property
-    def model(self) -> Any:
+    def model(self) -> mujoco.MjModel:
         """Return the `mujoco.MjModel`."""
         return self.simulation.model
 
     @property
-    def data(self) -> Any:
+    def data(self) -> mujoco.MjData:
         """Return the `mujoco.MjData`."""
         return self.simulation.data
 

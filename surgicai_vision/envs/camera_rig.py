@@ -3,13 +3,11 @@
 There is one renderer at a time; it is made on first use, hence in the worker that uses it.
 """
 
-from typing import Any
-
 import mujoco
-from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.envs.observation import ObservationConfig
+from surgicai_vision.scene.rendering import Frame, FrameRenderer
 
 
 class Images:
@@ -17,21 +15,20 @@ class Images:
 
     def __init__(self, model: mujoco.MjModel):
         self._model = model
-        self._renderer: Any = None
+        self._renderer: FrameRenderer | None = None
 
-    def look(self, data: mujoco.MjData, view: ObservationConfig) -> dict[str, NDArray[Any]]:
+    def look(self, data: mujoco.MjData, view: ObservationConfig) -> dict[str, Frame]:
         """Return the frames of an observation by `names.frame_key`."""
         renderer = self._sized(view.image_size)
-        frames: dict[str, NDArray[Any]] = {}
+        frames: dict[str, Frame] = {}
         for camera in view.cameras:
             for modality, frame in renderer.render_all(data, camera, view.modalities).items():
                 frames[names.frame_key(camera, modality)] = frame
         return frames
 
-    def image(self, data: mujoco.MjData, camera: str, size: tuple[int, int]) -> NDArray[Any]:
+    def image(self, data: mujoco.MjData, camera: str, size: tuple[int, int]) -> Frame:
         """Return one RGB image, (height, width, 3) uint8."""
-        image: NDArray[Any] = self._sized(size).render(data, camera, names.RGB)
-        return image
+        return self._sized(size).render(data, camera, names.RGB)
 
     def close(self) -> None:
         """Free the renderer; the next image makes a new one."""
@@ -39,9 +36,7 @@ class Images:
             self._renderer.close()
             self._renderer = None
 
-    def _sized(self, size: tuple[int, int]) -> Any:
-        from surgicai_vision.scene.rendering import FrameRenderer
-
+    def _sized(self, size: tuple[int, int]) -> FrameRenderer:
         if self._renderer is None or (self._renderer.height, self._renderer.width) != size:
             self.close()
             self._renderer = FrameRenderer(self._model, *size)

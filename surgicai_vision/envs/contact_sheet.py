@@ -2,13 +2,18 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.envs import make
+from surgicai_vision.scene.rendering import Frame, FrameRenderer
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Image = NDArray[np.uint8]
 
@@ -29,16 +34,17 @@ BEYOND = 1.0
 """Depth [m] from which a pixel is background; the scene is 0.2 m deep."""
 
 
+class Draw(Protocol):
+    """Draws a state of an env, as `get_state` returns it."""
+
+    def __call__(self, state: NDArray[np.float64], view: str, modality: str = names.RGB) -> Image:
+        """Return an RGB image (size, size, 3); depth and segmentation are coloured."""
+
+
 @contextmanager
-def stage(config: TaskConfig, size: int, quality: str = "high") -> Iterator[Any]:
-    """Yield a function `image(state, view, modality) -> (size, size, 3) uint8`.
-
-    The state is that of the env's `get_state`; depth and segmentation are coloured.
-    """
-    from surgicai_vision import envs
-    from surgicai_vision.scene.rendering import FrameRenderer
-
-    env = envs.make(config, obs_type="state")
+def stage(config: TaskConfig, size: int, quality: str = "high") -> Iterator[Draw]:
+    """Yield what draws states of a task's env."""
+    env = make(config, obs_type="state")
     env.reset(seed=0)
     renderer = FrameRenderer(env.model, size, size, quality=quality)
 
@@ -53,7 +59,7 @@ def stage(config: TaskConfig, size: int, quality: str = "high") -> Iterator[Any]
         env.close()
 
 
-def coloured(frame: NDArray[Any], modality: str) -> Image:
+def coloured(frame: Frame, modality: str) -> Image:
     """Return a frame as RGB (H, W, 3): depth by a colour map, segmentation by a palette."""
     if modality == names.RGB:
         return frame
@@ -82,11 +88,14 @@ def depth_range(frame: NDArray[np.float32]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def sheet(rows: Sequence[tuple[str, Sequence[Image]]], columns: Sequence[str], title: str) -> Any:
+def sheet(
+    rows: Sequence[tuple[str, Sequence[Image]]], columns: Sequence[str], title: str
+) -> "Figure":
     """Return a matplotlib figure: a grid of images with a name for each row and column."""
     from matplotlib.figure import Figure
 
-    width, height = 2.1 * len(columns) + 1.0, 2.1 * len(rows) + 0.8
+    width = 2.1 * len(columns) + 1.0
+    height = 2.1 * len(rows) + 0.8
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(title, fontsize=13, fontweight="bold")
     axes = figure.subplots(len(rows), len(columns), squeeze=False)

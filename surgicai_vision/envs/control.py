@@ -21,7 +21,8 @@ from surgicai_vision.scene.rotations import multiply_flat, rotvec_to_matrix_flat
 
 JAW_OPEN = 1.0
 """Largest commanded jaw angle [rad]; 0 is closed."""
-SQUEEZE, SQUEEZE_BELOW = 0.3, 0.1
+SQUEEZE = 0.3
+SQUEEZE_BELOW = 0.1
 """Below a command of 0.1 rad the jaw's servo is led up to 0.3 rad past it, gently at first: the
 motor's torque limit then sets the force of the grip, and the pads do not slam."""
 WORKSPACE = ((-0.09, -0.09, 0.060), (0.09, 0.14, 0.165))

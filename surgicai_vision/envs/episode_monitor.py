@@ -1,7 +1,6 @@
 """Episode monitor: what one episode does to needle and tissue, read after every control step.
 
-An `EpisodeMonitor` only reads: neither the env's state nor its physics know of it, so an episode is the same
-with and without.
+An `EpisodeMonitor` only reads: an episode is the same with and without it.
 
 * Where the needle's tip goes through the stitch's planes: `entry_error` and `exit_error`, the
   distance of that point from the hole's centre in the hole's plane [m]; NaN where the tip did not
@@ -133,14 +132,16 @@ class ForcePlate:
 
     def _touching(self, data: mujoco.MjData) -> NDArray[np.bool_]:
         """Return which contacts are of the tissue with the needle or an instrument, (contacts,)."""
-        one, other = data.contact.geom[:, 0], data.contact.geom[:, 1]
+        one = data.contact.geom[:, 0]
+        other = data.contact.geom[:, 1]
         return (self._tissue[one] & self._presses[other]) | (
             self._tissue[other] & self._presses[one]
         )
 
     def _net(self, data: mujoco.MjData) -> NDArray[np.float64]:
         """Return the net force in world (3,) [N]."""
-        net, wrench = np.zeros(3), np.empty(6)
+        net = np.zeros(3)
+        wrench = np.empty(6)
         for index in np.flatnonzero(self._touching(data)):
             contact = data.contact[int(index)]
             mujoco.mj_contactForce(self._model, data, int(index), wrench)

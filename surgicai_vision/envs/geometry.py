@@ -115,7 +115,8 @@ class Stitch:
     @classmethod
     def of(cls, pair: HolePair, radius: float = needle.RADIUS) -> "Stitch":
         """Return the stitch through `pair` by a needle whose arc has `radius` [m]."""
-        entry, leave = np.asarray(pair.entry.centre), np.asarray(pair.exit.centre)
+        entry = np.asarray(pair.entry.centre)
+        leave = np.asarray(pair.exit.centre)
         chord = leave - entry
         half = float(np.linalg.norm(chord)) / 2
         up = np.cross(chord / (2 * half), WOUND)
@@ -151,7 +152,8 @@ class Stitch:
 
         The handoff point is at the end point, turned with the inserted needle.
         """
-        cosine, sine = math.cos(PULLOUT_TURN), math.sin(PULLOUT_TURN)
+        cosine = math.cos(PULLOUT_TURN)
+        sine = math.sin(PULLOUT_TURN)
         turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
         pose = np.eye(4)
         pose[:3, :3] = turn @ self.inserted()[:3, :3]

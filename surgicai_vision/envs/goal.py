@@ -5,8 +5,7 @@ are functions of the achieved goal, the desired goal and the info, so that a rep
 for them with another desired goal. All three take single goals (8,) or batches (batch, 8).
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from surgicai_vision.envs.success import Info, Target
 from surgicai_vision.envs.suture import Suture
 
 Goals = NDArray[np.float32]
-Infos = Mapping[str, Any] | Sequence[Mapping[str, Any]] | NDArray[np.object_]
+Infos = Info | Sequence[Info] | NDArray[np.object_]
 """The info of one step, or one for each row of a batch."""
 
 
@@ -83,6 +82,6 @@ def _physics_errors(info: Infos | None) -> NDArray[np.bool_]:
     """Return whether infos report a physics error, () or (batch,)."""
     if info is None:
         return np.array(False)
-    if isinstance(info, Mapping):
+    if isinstance(info, dict):
         return np.array(bool(info.get("physics_error")))
     return np.array([bool(row.get("physics_error")) for row in info])

@@ -17,7 +17,9 @@ from surgicai_vision.scene.arm import GRASP_DEPTH
 from surgicai_vision.scene.kinematics import Pose
 from surgicai_vision.scene.rotations import rpy_to_matrix
 
-SPREAD_X, SPREAD_Y, SPREAD_TURN = 0.003, 0.020, math.radians(30.0)
+SPREAD_X = 0.003
+SPREAD_Y = 0.020
+SPREAD_TURN = math.radians(30.0)
 """Half widths of the needle's start about its home [m, m, rad] (released code, Approach)."""
 
 

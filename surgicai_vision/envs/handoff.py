@@ -17,7 +17,8 @@ from surgicai_vision.scene.kinematics import Pose
 
 DRIVEN = (0.0, 0.002)
 """How far the insertion went past its goal [m]: room for PSM1's jaws beside the exit."""
-OFF_PATH, OFF_TURN = 0.0003, math.radians(2.0)
+OFF_PATH = 0.0003
+OFF_TURN = math.radians(2.0)
 """Scatter of the inserted needle about the circle [m, rad], inside the openings' clearance."""
 
 STRAIGHT = math.radians(4.0)

@@ -15,7 +15,8 @@ from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.kinematics import Pose
 
-START_SHIFT, START_TURN = 0.0055, math.radians(12.0)
+START_SHIFT = 0.0055
+START_TURN = math.radians(12.0)
 """How far the tip may be off the entry at the start (paper)."""
 
 

@@ -159,21 +159,15 @@ def state_vector_in_world(
     gx, gy, gz, g0, g1, g2, g3, g4, g5, g6, g7, g8 = desired
     # The turn from achieved to desired, the tip in the base, the way to the goal in world and in
     # the base.
-    d0, d1, d2 = (
-        g0 * a0 + g1 * a1 + g2 * a2,
-        g0 * a3 + g1 * a4 + g2 * a5,
-        g0 * a6 + g1 * a7 + g2 * a8,
-    )
-    d3, d4, d5 = (
-        g3 * a0 + g4 * a1 + g5 * a2,
-        g3 * a3 + g4 * a4 + g5 * a5,
-        g3 * a6 + g4 * a7 + g5 * a8,
-    )
-    d6, d7, d8 = (
-        g6 * a0 + g7 * a1 + g8 * a2,
-        g6 * a3 + g7 * a4 + g8 * a5,
-        g6 * a6 + g7 * a7 + g8 * a8,
-    )
+    d0 = g0 * a0 + g1 * a1 + g2 * a2
+    d1 = g0 * a3 + g1 * a4 + g2 * a5
+    d2 = g0 * a6 + g1 * a7 + g2 * a8
+    d3 = g3 * a0 + g4 * a1 + g5 * a2
+    d4 = g3 * a3 + g4 * a4 + g5 * a5
+    d5 = g3 * a6 + g4 * a7 + g5 * a8
+    d6 = g6 * a0 + g7 * a1 + g8 * a2
+    d7 = g6 * a3 + g7 * a4 + g8 * a5
+    d8 = g6 * a6 + g7 * a7 + g8 * a8
     x, y, z = tx - bx, ty - by, tz - bz
     px, py, pz = b0 * x + b3 * y + b6 * z, b1 * x + b4 * y + b7 * z, b2 * x + b5 * y + b8 * z
     x, y, z = tx - ax, ty - ay, tz - az
@@ -188,15 +182,14 @@ def state_vector_in_world(
     vx, vy, vz = matrix_to_rotvec_flat((d0, d1, d2, d3, d4, d5, d6, d7, d8))
     # Of both rotations in the base, what roll, pitch and yaw need: the first column and the end of
     # the last row.
-    cx, cy, cz = (
-        b0 * r0 + b3 * r3 + b6 * r6,
-        b1 * r0 + b4 * r3 + b7 * r6,
-        b2 * r0 + b5 * r3 + b8 * r6,
-    )
+    cx = b0 * r0 + b3 * r3 + b6 * r6
+    cy = b1 * r0 + b4 * r3 + b7 * r6
+    cz = b2 * r0 + b5 * r3 + b8 * r6
     x, y, z = d0 * r0 + d1 * r3 + d2 * r6, d3 * r0 + d4 * r3 + d5 * r6, d6 * r0 + d7 * r3 + d8 * r6
     fx, fy, fz = b0 * x + b3 * y + b6 * z, b1 * x + b4 * y + b7 * z, b2 * x + b5 * y + b8 * z
     x, y, z = b2 * d0 + b5 * d3 + b8 * d6, b2 * d1 + b5 * d4 + b8 * d7, b2 * d2 + b5 * d5 + b8 * d8
-    cos_pitch, goal_cos_pitch = sqrt(cx * cx + cy * cy), sqrt(fx * fx + fy * fy)
+    cos_pitch = sqrt(cx * cx + cy * cy)
+    goal_cos_pitch = sqrt(fx * fx + fy * fy)
     if cos_pitch < GIMBAL or goal_cos_pitch < GIMBAL:
         to_base = poses.invert(base)
         goal = poses.compose(desired, poses.relative(achieved, tip))

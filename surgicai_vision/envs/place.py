@@ -21,7 +21,8 @@ from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.kinematics import Pose
 
-GRASP_SHIFT, GRASP_TILT = 0.0015, math.radians(12.0)
+GRASP_SHIFT = 0.0015
+GRASP_TILT = math.radians(12.0)
 """How far PSM2's grasp may be off at the start of place and insert (paper)."""
 
 
@@ -35,7 +36,8 @@ def draw_psm2_grasp(
         needle_pose: T_world_needle (4, 4).
         stitch: leaves room for some angles.
     """
-    angle, error = rng.uniform(*GRASP_ANGLES), draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
+    angle = rng.uniform(*GRASP_ANGLES)
+    error = draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
     low, high = (limit - error.along / stitch.radius for limit in stitch.grasps(*SAFE_ANGLES))
     return grasp_pose(PSM2, needle_pose, min(max(angle, low), high), error, stitch.radius)
 

@@ -15,9 +15,11 @@ from surgicai_vision.envs.starts import draw_grasp_error, grasp_pose, hold_needl
 from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
 from surgicai_vision.scene.kinematics import Pose
 
-GRASP_SHIFT, GRASP_TILT = 0.0015, math.radians(20.0)
+GRASP_SHIFT = 0.0015
+GRASP_TILT = math.radians(20.0)
 """How far PSM1's grasp may be off at the start (paper)."""
-RETREAT, RELEASED_JAW = 0.025, 0.5
+RETREAT = 0.025
+RELEASED_JAW = 0.5
 """Where PSM2 is after it let go: drawn back along its axis [m], jaw open [rad]."""
 
 

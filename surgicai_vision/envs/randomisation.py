@@ -9,7 +9,6 @@ import dataclasses
 import math
 from itertools import accumulate, pairwise
 from types import MappingProxyType
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -38,8 +37,10 @@ RIGS = (
 """Cameras that move as one, about the first; those that follow the jaws are shifted with them, and
 see them still. A camera of another distribution takes the draw of "front", about its own place.
 """
-TISSUE, SURROUNDINGS = ("tissue", "flesh"), ("drape", "tray")
+TISSUE = ("tissue", "flesh")
 """Materials of one tint."""
+SURROUNDINGS = ("drape", "tray")
+"""Materials of another tint."""
 JOINT_ERROR = (math.radians(5.0), math.radians(5.0), 0.005)
 """Largest error of an arm's first three joints [rad, rad, m] (surgical robotics challenge)."""
 
@@ -79,9 +80,9 @@ def draw(config: RandomisationConfig, rng: np.random.Generator) -> Draws:
     return tuple(value + 0.0 for value in values)  # no -0.0
 
 
-def report(config: RandomisationConfig, draws: Draws) -> dict[str, Any]:
+def report(config: RandomisationConfig, draws: Draws) -> dict[str, Array | int]:
     """Return axis → drawn numbers of the axes that are on, for `info["randomisation"]`."""
-    drawn: dict[str, Any] = {
+    drawn: dict[str, Array | int] = {
         axis: np.array(draws[_PLACES[axis]]) for axis in config.on if axis in UNITS
     }
     return drawn | ({"latency": config.latency} if config.latency else {})
@@ -117,10 +118,12 @@ def shifted(pair: HolePair, draws: Draws) -> HolePair:
 
 def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
     """Write one episode's numbers into `model`, a copy of the scene's own, which is only read."""
-    source, numbers = scene.model, {axis: np.array(draws[place]) for axis, place in _PLACES.items()}
+    source = scene.model
+    numbers = {axis: np.array(draws[place]) for axis, place in _PLACES.items()}
     _light(source, model, 1.0 + numbers["light"])
     _tint(source, model, 1.0 + numbers["colour"].reshape(2, 3))
-    shifts, turns = numbers["camera_shift"].reshape(-1, 3), numbers["camera_turn"].reshape(-1, 3)
+    shifts = numbers["camera_shift"].reshape(-1, 3)
+    turns = numbers["camera_turn"].reshape(-1, 3)
     for cameras, shift, turn, fovy in zip(RIGS, shifts, turns, numbers["camera_fovy"], strict=True):
         _aim(source, model, cameras, shift, turn, fovy)
     for name in other_cameras():
@@ -164,7 +167,8 @@ def _aim(
     Where a rig's first camera sees so much more, the others see more by the same factor.
     """
     first = source.camera(cameras[0]).id
-    rotation, pivot = rotvec_to_matrix(turn), source.cam_pos[first]
+    rotation = rotvec_to_matrix(turn)
+    pivot = source.cam_pos[first]
     for name in cameras:
         index = source.camera(name).id
         model.cam_pos[index] = pivot + rotation @ (source.cam_pos[index] - pivot) + shift
@@ -178,9 +182,12 @@ def _shape_needle(
     source: mujoco.MjModel, model: mujoco.MjModel, geoms: range, size: float, thickness: float
 ) -> None:
     """Scale the needle's arc and thickness: what collides, its bounds, and what is drawn."""
-    of, body = slice(geoms.start, geoms.stop), source.body("needle").id
-    radius, half = source.geom_size[of, 0] * thickness, source.geom_size[of, 1] * size
-    model.geom_size[of, 0], model.geom_size[of, 1] = radius, half
+    of = slice(geoms.start, geoms.stop)
+    body = source.body("needle").id
+    radius = source.geom_size[of, 0] * thickness
+    half = source.geom_size[of, 1] * size
+    model.geom_size[of, 0] = radius
+    model.geom_size[of, 1] = half
     model.geom_pos[of] = source.geom_pos[of] * size
     model.geom_rbound[of] = radius + half
     model.geom_aabb[of, 3:] = np.stack([radius, radius, radius + half], axis=1)
@@ -191,7 +198,8 @@ def _shape_needle(
     _weigh_needle(source, model, body, size)
     mesh = source.mesh("needle").id
     of = slice(source.mesh_vertadr[mesh], source.mesh_vertadr[mesh] + source.mesh_vertnum[mesh])
-    turn, origin = quaternion_to_matrix(source.mesh_quat[mesh]), source.mesh_pos[mesh]
+    turn = quaternion_to_matrix(source.mesh_quat[mesh])
+    origin = source.mesh_pos[mesh]
     points = source.mesh_vert[of] @ turn.T + origin
     angles = np.clip(np.arctan2(points[:, 1], -points[:, 0]), 0.0, needle.TIP_ANGLE)
     line = np.stack(
@@ -217,9 +225,9 @@ def _weigh_needle(source: mujoco.MjModel, model: mujoco.MjModel, body: int, size
         for name in DERIVED:
             getattr(model, name)[:] = getattr(source, name)
         return
-    extent, centre = source.stat.extent, source.stat.center.copy()
+    extent = source.stat.extent
+    centre = source.stat.center.copy()
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    model.stat.extent, model.stat.center[:] = (
-        extent,
-        centre,
-    )  # they place the cameras' near and far planes
+    # They place the cameras' near and far planes.
+    model.stat.extent = extent
+    model.stat.center[:] = centre

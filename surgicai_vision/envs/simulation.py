@@ -40,9 +40,12 @@ CLOCK_START = 1.0
 step too.
 """
 _SET_SEVEN = struct.Struct("7d").pack_into
-_THREE, _NINE = struct.Struct("3d").unpack_from, struct.Struct("9d").unpack_from
+_THREE = struct.Struct("3d").unpack_from
+_NINE = struct.Struct("9d").unpack_from
 """One row of positions, of rotations, as floats: half the time of `array[row].tolist()`."""
-RELEASE_STEPS, RELEASE_JAW, RELEASE_SHIFT = 40, 0.1, 0.001
+RELEASE_STEPS = 40
+RELEASE_JAW = 0.1
+RELEASE_SHIFT = 0.001
 """How PSM2 lets go after the handoff: jaw opened by 0.1 rad a step to 0.5, then drawn back 1 mm a
 step.
 """
@@ -68,11 +71,15 @@ class Simulation:
     """
 
     def __init__(self, scene: Scene, *, own_model: bool = False, latency: int = 0):
-        self.scene, self.latency = scene, latency
+        self.scene = scene
+        self.latency = latency
         welded = scene.config.grasp == "attach"
         self.model = copy.copy(scene.model) if own_model or welded else scene.model
         self.data = data = mujoco.MjData(self.model)
-        self._ctrl, self._qpos, self._xpos, self._xmat = data.ctrl, data.qpos, data.xpos, data.xmat
+        self._ctrl = data.ctrl
+        self._qpos = data.qpos
+        self._xpos = data.xpos
+        self._xmat = data.xmat
         self.draws = randomisation.NOTHING
         self.offsets: dict[str, tuple[float, ...]] = {}
         self.radius = needle.RADIUS
@@ -124,7 +131,8 @@ class Simulation:
                 "The state is of a randomised episode; make the env with its randomisation."
             )
         randomisation.apply(self.scene, self.model, draws)
-        self.draws, self.offsets = draws, randomisation.joint_offsets(draws)
+        self.draws = draws
+        self.offsets = randomisation.joint_offsets(draws)
         self.radius = randomisation.needle_radius(draws)
 
     def refresh(self) -> None:
@@ -201,7 +209,8 @@ class Simulation:
         """
         if self.latency:
             action = self._delayed(action)
-        data, ctrl = self.data, self._ctrl
+        data = self.data
+        ctrl = self._ctrl
         finite = isfinite(ctrl.dot(ctrl))
         if not finite:
             for name, command in self.commands.items():
@@ -246,7 +255,8 @@ class Simulation:
         for arm in names.ARMS:
             closed = self.commands[arm].jaw < attach.CLOSED
             touching = closed and any(self.touching(arm))
-            tip, needle = self.tip(arm), self.needle()
+            tip = self.tip(arm)
+            needle = self.needle()
             changed |= welds.update(arm, closed=closed, touching=touching, tip=tip, needle=needle)
         if changed:
             self.refresh()
@@ -277,7 +287,8 @@ class Simulation:
         self._read = None
 
     def _body(self, name: str) -> Pose:
-        read, index = self._read, self._bodies[name]
+        read = self._read
+        index = self._bodies[name]
         pose: Pose = (*_THREE(self._xpos, 24 * index), *_NINE(self._xmat, 72 * index))
         if read is not None:
             read[name] = pose

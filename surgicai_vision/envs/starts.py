@@ -22,7 +22,8 @@ Matrix = NDArray[np.float64]
 
 SETTLE = 60
 """Physics steps (2 ms) a start state settles."""
-REST_SPEED, REST_TURN = 0.010, 1.0
+REST_SPEED = 0.010
+REST_TURN = 1.0
 """A held needle faster than this [m/s, rad/s] is slipping out: one closing of the jaws in 150 does
 that.
 """
@@ -57,7 +58,8 @@ def draw_grasp_error(rng: np.random.Generator, shift: float, angle: float) -> Gr
     """
     along = rng.uniform(-shift, shift)
     depth = rng.uniform(-0.6, 0.2) * math.sqrt(shift**2 - along**2)
-    size, direction = angle * math.sqrt(rng.uniform()), rng.uniform(0.0, 2 * math.pi)
+    size = angle * math.sqrt(rng.uniform())
+    direction = rng.uniform(0.0, 2 * math.pi)
     return GraspError(along, depth, (size * math.cos(direction), size * math.sin(direction)))
 
 
@@ -110,7 +112,7 @@ def hold_needle(
 
 
 def _at_rest(simulation: Simulation) -> bool:
-    """Say whether the needle has stopped, not slipping out of the jaws."""
+    """Return True if the needle has stopped: it does not slip out of the jaws."""
     first = simulation.model.joint("needle").dofadr[0]
     velocity = simulation.data.qvel[first : first + 6]
     return bool(

@@ -24,11 +24,14 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.processes import Child
-from surgicai_vision.envs import make_task, refuse_max_steps
+from surgicai_vision.envs import SuturingEnv, make_task, refuse_max_steps
+from surgicai_vision.envs.success import Info
 
 Tree = Any
 """Arrays, or dicts of trees."""
-Step = tuple[Tree, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+Arguments = dict[str, Any]
+"""What `make_task` takes, by name."""
+Step = tuple[Tree, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]
 
 
 def make_vector(
@@ -65,18 +68,14 @@ class SuturingVectorEnv(VectorEnv):
     Processes are spawned, so a script that makes one needs the usual `if __name__ == "__main__":`.
     """
 
-    def __init__(self, num_envs: int, workers: int, mode: AutoresetMode, arguments: dict[str, Any]):
+    def __init__(self, num_envs: int, workers: int, mode: AutoresetMode, arguments: Arguments):
         self._workers: list[Child] = []
         self.num_envs = num_envs
         first = _make(arguments)
-        self.single_observation_space, self.single_action_space = (
-            first.observation_space,
-            first.action_space,
-        )
-        self.metadata, self.render_mode = (
-            dict(first.metadata) | {"autoreset_mode": mode},
-            first.render_mode,
-        )
+        self.single_observation_space = first.observation_space
+        self.single_action_space = first.action_space
+        self.metadata = dict(first.metadata) | {"autoreset_mode": mode}
+        self.render_mode = first.render_mode
         first.close()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -99,16 +98,20 @@ class SuturingVectorEnv(VectorEnv):
         self._ask_all("ready", [()] * workers)
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Tree, dict[str, Any]]:
+        self,
+        *,
+        seed: int | list[int | None] | None = None,
+        options: dict[str, object] | None = None,
+    ) -> tuple[Tree, Info]:
         """Reset all envs, or those of `options["reset_mask"]`.
 
         An int seeds them with seed, seed + 1, …
         """
         self._check_open()
-        seeds = [None if seed is None else seed + index for index in range(self.num_envs)] if not isinstance(
-            seed, list | tuple
-        ) else list(seed)  # fmt: skip
+        if isinstance(seed, list | tuple):
+            seeds = list(seed)
+        else:
+            seeds = [None if seed is None else seed + index for index in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise InputError(
                 f"seed holds {len(seeds)} seeds; this vector env has {self.num_envs} envs."
@@ -128,20 +131,16 @@ class SuturingVectorEnv(VectorEnv):
         self._check_open()
         if np.shape(actions) != self.action_space.shape:
             raise InputError(
-                f"actions has shape {np.shape(actions)}; this vector env needs {self.action_space.shape}."
+                f"actions has shape {np.shape(actions)}; this vector env needs "
+                f"{self.action_space.shape}."
             )
         actions = np.asarray(actions)
         answers = self._ask_all("step", [(actions[share],) for share in self._shares])
         rewards, terminated, truncated = (
             np.concatenate([answer[index] for answer in answers]) for index in range(3)
         )
-        return (
-            deepcopy(self._seen),
-            rewards,
-            terminated,
-            truncated,
-            self._merge([answer[3] for answer in answers]),
-        )
+        infos = self._merge([answer[3] for answer in answers])
+        return deepcopy(self._seen), rewards, terminated, truncated, infos
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Return an attribute of each env, or what its method returns."""
@@ -156,7 +155,7 @@ class SuturingVectorEnv(VectorEnv):
         """Return an attribute of each env."""
         return self.call(name)
 
-    def set_attr(self, name: str, values: Any) -> None:
+    def set_attr(self, name: str, values: object) -> None:
         """Set an attribute of each env, one value for all or a list of as many."""
         self._check_open()
         rows = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
@@ -170,7 +169,7 @@ class SuturingVectorEnv(VectorEnv):
         """Return each env's image."""
         return self.call("render")
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """End the workers."""
         for worker in self._workers:
             worker.dismiss()
@@ -198,7 +197,7 @@ class SuturingVectorEnv(VectorEnv):
                 raise answer.error from RuntimeError(answer.trace)
         return answers
 
-    def _merge(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
+    def _merge(self, infos: list[Info]) -> Info:
         """Return the workers' infos as one, in the envs' order."""
         return _merged(infos, [share.stop - share.start for share in self._shares])
 
@@ -207,23 +206,25 @@ class _Failure:
     """An error in a worker, and where it happened there."""
 
     def __init__(self, error: Exception):
-        self.error, self.trace = error, traceback.format_exc()
+        self.error = error
+        self.trace = traceback.format_exc()
 
 
-def _make(arguments: dict[str, Any]) -> Any:
+def _make(arguments: Arguments) -> SuturingEnv:
     return make_task(**arguments)
 
 
 def _work(
     connection: Connection,
     share: slice,
-    arguments: dict[str, Any],
+    arguments: Arguments,
     mode: AutoresetMode,
     space: spaces.Space,
     memory: Tree,
 ) -> None:
     """Serve one share of the envs until the other end is closed."""
-    vector, seen = None, _view(space, memory)
+    vector = None
+    seen = _view(space, memory)
     try:
         while True:
             what, part = connection.recv()
@@ -287,11 +288,11 @@ def _write(seen: Tree, share: slice, observation: Tree) -> None:
         seen[share] = observation
 
 
-def _merged(parts: list[dict[str, Any]], sizes: list[int]) -> dict[str, Any]:
+def _merged(parts: list[Info], sizes: list[int]) -> Info:
     """Return dicts of arrays as one, rows of absent keys filled as gymnasium does."""
     if len(parts) == 1:
         return parts[0]
-    merged: dict[str, Any] = {}
+    merged: Info = {}
     for key in dict.fromkeys(itertools.chain.from_iterable(parts)):
         values: list[Any] = [part.get(key) for part in parts]
         known = next(value for value in values if value is not None)

@@ -30,15 +30,19 @@ needle.
 """
 JAW_LIMITS = (-0.06, 1.0)
 """Angle of each finger [rad]; below 0 only when the jaws close on nothing."""
-JAW_GAIN, JAW_TORQUE, JAW_ARMATURE = 1.0, 0.05, 1e-4
+JAW_GAIN = 1.0
+JAW_TORQUE = 0.05
+JAW_ARMATURE = 1e-4
 """[N·m/rad, N·m, kg·m²]: the coupled fingers' servo has 70 rad/s. With an armature of 1e-5 (220
 rad/s) the closing jaws struck the needle at 12 rad/s, 0.25 mm of the pads' way in one physics step:
 with friction drawn 15 % lower it shot out of them in one grasp of three."""
-SHAFT_RADIUS, SHAFT_LENGTH = 0.004, 0.36
+SHAFT_RADIUS = 0.004
+SHAFT_LENGTH = 0.36
 WRIST_RADIUS = 0.003
 BANDWIDTH = 100.0
 """[rad/s]"""
-LIMIT_SOLREF, LIMIT_SOLIMP = [0.004, 1.0], [0.99, 0.999, 0.0001, 0.5, 2.0]
+LIMIT_SOLREF = [0.004, 1.0]
+LIMIT_SOLIMP = [0.99, 0.999, 0.0001, 0.5, 2.0]
 """Of joint limits and of the fingers' coupling: a servo told to go 0.5 rad past a limit rests
 within 0.1 mrad of it; with MuJoCo's default it stood 83 mrad beyond."""
 ARMATURE = (0.02, 0.02, 0.5, 2e-4, 1e-4, 1e-4)
@@ -87,12 +91,10 @@ def add_arm(
 
 def _frame(alpha: float, offset: float) -> list[float]:
     """Return the quaternion (wxyz) of RotX(alpha)·RotZ(offset)."""
-    ca, sa, co, so = (
-        math.cos(alpha / 2),
-        math.sin(alpha / 2),
-        math.cos(offset / 2),
-        math.sin(offset / 2),
-    )
+    ca = math.cos(alpha / 2)
+    sa = math.sin(alpha / 2)
+    co = math.cos(offset / 2)
+    so = math.sin(offset / 2)
     return [ca * co, sa * co, -sa * so, ca * so]
 
 
@@ -107,7 +109,9 @@ def _add_link(
         quat=_frame(row.alpha, row.offset),
     )
     body.gravcomp = 1.0
-    body.mass, body.inertia, body.explicitinertial = MASSES[index], [MASSES[index] * 1e-4] * 3, True
+    body.mass = MASSES[index]
+    body.inertia = [MASSES[index] * 1e-4] * 3
+    body.explicitinertial = True
     body.add_joint(
         name=f"{arm}_{name}",
         type=mujoco.mjtJoint.mjJNT_SLIDE if row.prismatic else mujoco.mjtJoint.mjJNT_HINGE,
@@ -145,7 +149,9 @@ def _add_finger(tip: mujoco.MjsBody, name: str, side: float, bits: dict[str, int
     """Add one finger: its hinge opens towards +y (side = 1) or -y (side = -1)."""
     body = tip.add_body(name=f"{name}_finger")
     body.gravcomp = 1.0
-    body.mass, body.inertia, body.explicitinertial = 0.001, [1e-7] * 3, True
+    body.mass = 0.001
+    body.inertia = [1e-7] * 3
+    body.explicitinertial = True
     body.ipos = [0.0, 0.0, 0.006]
     body.add_joint(
         name=f"{name}_finger",
@@ -171,7 +177,8 @@ def _add_finger(tip: mujoco.MjsBody, name: str, side: float, bits: dict[str, int
 def _couple_fingers(spec: mujoco.MjSpec, arm: str) -> None:
     """Tie the right finger's angle to the left one's, and drive both by one motor."""
     equality = spec.add_equality(name=f"{arm}_fingers", type=mujoco.mjtEq.mjEQ_JOINT)
-    equality.name1, equality.name2 = f"{arm}_right_finger", f"{arm}_left_finger"
+    equality.name1 = f"{arm}_right_finger"
+    equality.name2 = f"{arm}_left_finger"
     equality.data[:5] = [0, 1, 0, 0, 0]
     equality.solref = LIMIT_SOLREF
     equality.solimp = LIMIT_SOLIMP
@@ -188,7 +195,9 @@ def add_weld(spec: mujoco.MjSpec, arm: str) -> None:
     weld = spec.add_equality(
         name=f"{arm}_attach", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY
     )
-    weld.name1, weld.name2, weld.active = f"{arm}_tip", "needle", False
+    weld.name1 = f"{arm}_tip"
+    weld.name2 = "needle"
+    weld.active = False
     weld.data[:11] = [0.0] * 6 + [
         1.0,
         0.0,
@@ -196,4 +205,5 @@ def add_weld(spec: mujoco.MjSpec, arm: str) -> None:
         0.0,
         0.01,
     ]  # anchor, pose in the jaws, torque scale [m]
-    weld.solref, weld.solimp = [0.004, 1.0], [0.99, 0.999, 0.0001, 0.5, 2.0]
+    weld.solref = [0.004, 1.0]
+    weld.solimp = [0.99, 0.999, 0.0001, 0.5, 2.0]

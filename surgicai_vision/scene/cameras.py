@@ -125,7 +125,8 @@ the wound, which is the line of sight, so that placing ends with 5 to 15 pixels 
 PSM2's side, 14 mm forwards, 11 mm up and 0.9 rad bring it above 25 at the end of grasp, place,
 insert and handoff, with both arms still in view at the start (`tests/test_visibility.py`).
 """
-BASELINE, TOE_IN = 0.004, 0.040
+BASELINE = 0.004
+TOE_IN = 0.040
 """Between the endoscope's two cameras [m]; x of each one's direction, 2.3° (SurgicAI)."""
 
 
@@ -155,7 +156,8 @@ FRONT_PSM2 = FollowingCamera(FRONT, PSM2)
 BACK_PSM1 = FollowingCamera(BACK, PSM1)
 BACK_PSM2 = FollowingCamera(BACK, PSM2)
 
-WRIST_ASIDE, WRIST_BACK = 0.030, 0.030
+WRIST_ASIDE = 0.030
+WRIST_BACK = 0.030
 """From the wrist's pitch axis to the wrist camera: beside the shaft and up along it [m]. So the
 view meets the shaft at 33°: far enough to look past it at the jaws, and clear of the tissue in
 every grasp of the five subtasks."""

@@ -32,7 +32,11 @@ USER_DATA = 176
 state.
 """
 
-SURFACES, GRIP, FIRM, ARMS, THREAD = 1, 2, 4, 8, 16
+SURFACES = 1
+GRIP = 2
+FIRM = 4
+ARMS = 8
+THREAD = 16
 """Collision bits: needle on tissue, needle in jaws, instruments on firm tissue, instrument on
 instrument, thread on tissue and instruments."""
 
@@ -177,15 +181,20 @@ def _set_options(spec: mujoco.MjSpec, thread: int) -> None:
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    option.impratio, option.iterations, option.tolerance = 100.0, 50, 1e-10
+    option.impratio = 100.0
+    option.iterations = 50
+    option.tolerance = 1e-10
     option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     if thread:
         option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
         option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     spec.nuserdata = USER_DATA
-    spec.stat.extent, spec.stat.center = 0.1, [0.0, 0.044, 0.08]
-    spec.visual.map.znear, spec.visual.map.zfar = 0.02, 20.0
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    spec.stat.extent = 0.1
+    spec.stat.center = [0.0, 0.044, 0.08]
+    spec.visual.map.znear = 0.02
+    spec.visual.map.zfar = 20.0
+    spec.visual.global_.offwidth = 1280
+    spec.visual.global_.offheight = 960
     spec.compiler.degree = False
     spec.compiler.autolimits = True
 

@@ -38,14 +38,16 @@ class Hole:
     @property
     def rotation(self) -> np.ndarray:
         """Return R_world_hole, shape (3, 3)."""
-        cosine, sine = math.cos(self.tilt), math.sin(self.tilt)
+        cosine = math.cos(self.tilt)
+        sine = math.sin(self.tilt)
         return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
     @property
     def pose(self) -> np.ndarray:
         """Return T_world_hole, shape (4, 4)."""
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self.rotation, self.centre
+        pose[:3, :3] = self.rotation
+        pose[:3, 3] = self.centre
         return pose
 
 

@@ -97,12 +97,12 @@ class Instrument:
     def dh(self) -> tuple[Row, ...]:
         """Return the table: six joints and the fixed tip."""
         right = pi / 2
-        first, second = Row(right, 0.0, 0.0, right), Row(-right, 0.0, 0.0, -right)
-        insertion, roll = (
-            Row(right, 0.0, -self.rcc, 0.0, prismatic=True),
-            Row(0.0, 0.0, self.tool, 0.0),
-        )
-        wrist_yaw, tip = Row(-right, self.pitch_to_yaw, 0.0, -right), Row(-right, 0.0, 0.0, right)
+        first = Row(right, 0.0, 0.0, right)
+        second = Row(-right, 0.0, 0.0, -right)
+        insertion = Row(right, 0.0, -self.rcc, 0.0, prismatic=True)
+        roll = Row(0.0, 0.0, self.tool, 0.0)
+        wrist_yaw = Row(-right, self.pitch_to_yaw, 0.0, -right)
+        tip = Row(-right, 0.0, 0.0, right)
         return first, second, insertion, roll, second, wrist_yaw, tip
 
 
@@ -218,7 +218,8 @@ def forward_flat(q: Joints, instrument: str = DEFAULT) -> Pose:
     ex, ey, ez = s4 * xx + c4 * c1, s4 * xy, s4 * xz + c4 * s1
     fx, fy, fz = c4 * xx - s4 * c1, c4 * xy, c4 * xz - s4 * s1
     ux, uy, uz = s5 * fx + c5 * zx, s5 * fy + c5 * zy, s5 * fz + c5 * zz
-    depth, p2y = q3 + length.tool - length.rcc, length.pitch_to_yaw
+    depth = q3 + length.tool - length.rcc
+    p2y = length.pitch_to_yaw
     return (
         depth * zx + p2y * ux, depth * zy + p2y * uy, depth * zz + p2y * uz,
         s5 * zx - c5 * fx, c6 * ex - s6 * ux, c6 * ux + s6 * ex,
@@ -238,7 +239,10 @@ def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = No
     if (
         norm < 1e-12
     ):  # the yaw axis passes through the remote centre: every wrist yaw serves, take none
-        ex, ey, ez, norm = yx, yy, yz, 1.0
+        ex = yx
+        ey = yy
+        ez = yz
+        norm = 1.0
     ex, ey, ez = ex / norm, ey / norm, ez / norm
     ux, uy, uz = ay * ez - az * ey, az * ex - ax * ez, ax * ey - ay * ex
     c6 = bx * ux + by * uy + bz * uz
@@ -317,7 +321,8 @@ def _checked(joints: Joints, instrument: Instrument) -> Joints:
     index = _violation(joints, instrument)
     if index < 0:
         return joints
-    (low, high), value = instrument.limits[index], joints[index]
+    (low, high) = instrument.limits[index]
+    value = joints[index]
     scale, unit = (1000.0, "mm") if index == INSERTION else (180.0 / pi, "°")
     raise UnreachablePose(
         f"Pose out of reach: {DVRK_JOINTS[index]} would be {value * scale:.2f} {unit}; "
@@ -328,5 +333,6 @@ def _checked(joints: Joints, instrument: Instrument) -> Joints:
 def _matrix(position: ArrayLike, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (4, 4) transform of a position (3,) and a rotation (3, 3)."""
     transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation, position
+    transform[:3, :3] = rotation
+    transform[:3, 3] = position
     return transform

@@ -11,7 +11,7 @@ import os
 import platform
 from collections.abc import Callable
 from types import MappingProxyType
-from typing import Any
+from typing import Protocol, cast
 
 from surgicai_vision.core.errors import InputError, check_name
 
@@ -20,7 +20,18 @@ BACKENDS = MappingProxyType(
 )
 """$MUJOCO_GL → the module that has its `GLContext`."""
 
-_context: Any = None
+
+class _Context(Protocol):
+    """An OpenGL context of one of MuJoCo's backends."""
+
+    def make_current(self) -> None:
+        """Direct this thread's OpenGL calls to it."""
+
+    def free(self) -> None:
+        """Free it."""
+
+
+_context: _Context | None = None
 _closers: list[Callable[[], None]] = []
 
 
@@ -51,18 +62,18 @@ def before_closing(closer: Callable[[], None]) -> None:
     _closers.append(closer)
 
 
-def _new_context() -> Any:
+def _new_context() -> _Context:
     """Return a context of the backend that $MUJOCO_GL names; on Linux EGL where it names none."""
     default = {"Linux": "egl", "Darwin": "cgl"}.get(platform.system(), "glfw")
     backend = os.environ.get("MUJOCO_GL", "").lower().strip() or default
     module = BACKENDS[check_name("MUJOCO_GL backend", backend, BACKENDS)]
     try:
-        return importlib.import_module(module).GLContext(64, 64)
+        return cast(_Context, importlib.import_module(module).GLContext(64, 64))
     except (ImportError, AttributeError, OSError, RuntimeError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
-            f"No OpenGL through '{backend}' ({reason}). On Debian or Ubuntu: apt-get install libegl1 libgl1; "
-            f"or set MUJOCO_GL to another of: {', '.join(BACKENDS)}."
+            f"No OpenGL through '{backend}' ({reason}). On Debian or Ubuntu: apt-get install "
+            f"libegl1 libgl1; or set MUJOCO_GL to another of: {', '.join(BACKENDS)}."
         ) from error
 
 

@@ -31,7 +31,8 @@ BEYOND = 0.006
 """How far the ridge goes on beyond the first and the last hole pair [m]: short, because the tools
 come along the wound and their wrists stand there."""
 
-TRAY_RIM, TRAY_HEIGHT = 0.007, 0.012
+TRAY_RIM = 0.007
+TRAY_HEIGHT = 0.012
 """How far the tray on which the phantom lies reaches beyond it, and its height [m]."""
 CLEARANCE = 0.002
 """Between the phantom's underside and the table [m]; the phantom stands sunk into the tray."""
@@ -121,7 +122,8 @@ def _add_flank(
     opening = OPENING / 2
     drop = (hole.centre[2] - SURFACE) / math.sin(abs(hole.tilt)) + WALL
     up = -math.copysign(1.0, hole.tilt)
-    near, far = end - hole.centre[1], start - hole.centre[1]
+    near = end - hole.centre[1]
+    far = start - hole.centre[1]
     rectangles = {
         "top": (opening, rise, near, far),
         "bottom": (-drop, -opening, near, far),

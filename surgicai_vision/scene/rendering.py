@@ -27,7 +27,10 @@ from surgicai_vision.scene import opengl
 from surgicai_vision.scene.cameras import camera_id
 from surgicai_vision.scene.opengl import renderer_string
 
-__all__ = ["QUALITIES", "FrameRenderer", "parts_of_geoms", "renderer_string"]
+__all__ = ["QUALITIES", "Frame", "FrameRenderer", "parts_of_geoms", "renderer_string"]
+
+Frame = NDArray[Any]
+"""One modality of a view, (height, width, channels): uint8, of depth float32 [m]."""
 
 
 @dataclass(frozen=True)
@@ -68,11 +71,14 @@ class FrameRenderer:
                 raise InputError(
                     f"An image of {height} × {width} pixels; each side must be 1 to {MAX_SIDE}."
                 )
-        self.model, self.height, self.width, self.quality = model, int(height), int(width), quality
+        self.model = model
+        self.height = int(height)
+        self.width = int(width)
+        self.quality = quality
         self._cameras: dict[str, mujoco.MjvCamera] = {}
         self._target: _Target | None = _acquire(model, self.height, self.width, quality)
 
-    def render(self, data: mujoco.MjData, camera: str, modality: str = RGB) -> NDArray[Any]:
+    def render(self, data: mujoco.MjData, camera: str, modality: str = RGB) -> Frame:
         """Return one image of the state `data`, an array of its own.
 
         Args:
@@ -89,7 +95,7 @@ class FrameRenderer:
 
     def render_all(
         self, data: mujoco.MjData, camera: str, modalities: Iterable[str]
-    ) -> dict[str, NDArray[Any]]:
+    ) -> dict[str, Frame]:
         """Return several modalities of one view; depth and segmentation share one pass."""
         wanted = tuple(modalities)
         for modality in wanted:
@@ -104,7 +110,8 @@ class FrameRenderer:
 
     def close(self) -> None:
         """Free what no other renderer uses. A second call does nothing."""
-        target, self._target = getattr(self, "_target", None), None
+        target = getattr(self, "_target", None)
+        self._target = None
         if target is not None:
             _release(target)
 
@@ -120,7 +127,8 @@ class FrameRenderer:
     def _view(self, camera: str) -> mujoco.MjvCamera:
         """Return MuJoCo's handle of a camera and keep it."""
         view = mujoco.MjvCamera()
-        view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera_id(self.model, camera)
+        view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        view.fixedcamid = camera_id(self.model, camera)
         self._cameras[camera] = view
         return view
 
@@ -131,7 +139,10 @@ class _Target:
     def __init__(self, key: tuple[int, int, int, str], model: mujoco.MjModel):
         _, height, width, name = key
         quality = QUALITIES[name]
-        self.key, self.model, self.users, self.lost = key, model, 0, False
+        self.key = key
+        self.model = model
+        self.users = 0
+        self.lost = False
         with _visual_settings(model, quality, height, width):
             self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         self.context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
@@ -146,14 +157,14 @@ class _Target:
 
     def draw(
         self, data: mujoco.MjData, view: mujoco.MjvCamera, wanted: tuple[str, ...]
-    ) -> dict[str, NDArray[Any]]:
+    ) -> dict[str, Frame]:
         """Return the wanted modalities from at most two passes."""
         opengl.make_current()
         # Another target may have drawn since; without this its buffer would be drawn over and read.
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self.model, data, self.option, None, view, everything, self.scene)
-        images: dict[str, NDArray[Any]] = {}
+        images: dict[str, Frame] = {}
         if RGB in wanted:
             mujoco.mjr_render(self.area, self.scene, self.context)
             mujoco.mjr_readPixels(self.colours, None, self.area, self.context)
@@ -179,7 +190,8 @@ class _Target:
     def _depth(self) -> NDArray[np.float32]:
         """Return metres from the depth buffer: 1 at the near plane, 0 at the far plane."""
         extent = self.model.stat.extent
-        near, far = self.model.vis.map.znear * extent, self.model.vis.map.zfar * extent
+        near = self.model.vis.map.znear * extent
+        far = self.model.vis.map.zfar * extent
         stored = self.depths[::-1, :, None].astype(np.float64)
         metres: NDArray[np.float64] = near * far / (near + stored * (far - near))
         return metres.astype(np.float32)
@@ -260,7 +272,8 @@ def _visual_settings(
     model: mujoco.MjModel, quality: Quality, height: int, width: int
 ) -> Iterator[None]:
     """Lend the model the settings that OpenGL objects are made from; they are read only then."""
-    look, screen = model.vis.quality, model.vis.global_
+    look = model.vis.quality
+    screen = model.vis.global_
     settings = (
         (look, "offsamples", quality.samples),
         (look, "shadowsize", quality.shadow),

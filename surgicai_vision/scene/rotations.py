@@ -45,9 +45,11 @@ def matrix_to_rpy_flat(m: Sequence[float]) -> Vector:
     r00, _, _, r10, r11, r12, r20, r21, r22 = m
     cos_pitch = sqrt(r00 * r00 + r10 * r10)
     if cos_pitch < GIMBAL:
-        roll, yaw = atan2(-r12, r11), 0.0
+        roll = atan2(-r12, r11)
+        yaw = 0.0
     else:
-        roll, yaw = atan2(r21, r22), atan2(r10, r00)
+        roll = atan2(r21, r22)
+        yaw = atan2(r10, r00)
     if roll > 0.0:
         roll = max(roll - 2.0 * pi, -LARGEST_ROLL)
     return roll, atan2(-r20, cos_pitch), yaw

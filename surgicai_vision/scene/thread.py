@@ -10,7 +10,9 @@ import mujoco
 LENGTH = 0.095
 RADIUS = 0.000186
 MASS = 0.0002
-STIFFNESS, DAMPING, ARMATURE = 2e-6, 2e-7, 1e-8
+STIFFNESS = 2e-6
+DAMPING = 2e-7
+ARMATURE = 1e-8
 
 
 def add_thread(
@@ -30,7 +32,9 @@ def add_thread(
         bits: collision bits of the thread.
     """
     pitch = LENGTH / max(segments, 1)
-    parent, start, flat = needle, base, [0.7071067811865476, 0.7071067811865476, 0.0, 0.0]
+    parent = needle
+    start = base
+    flat = [0.7071067811865476, 0.7071067811865476, 0.0, 0.0]
     for index in range(segments):
         body = parent.add_body(name=f"thread_{index}", pos=start, quat=flat)
         body.add_joint(
@@ -51,4 +55,6 @@ def add_thread(
             priority=1,
             **bits,
         )
-        parent, start, flat = body, [0.0, 0.0, pitch], [1.0, 0.0, 0.0, 0.0]
+        parent = body
+        start = [0.0, 0.0, pitch]
+        flat = [1.0, 0.0, 0.0, 0.0]

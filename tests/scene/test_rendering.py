@@ -175,7 +175,8 @@ def test_a_process_that_closes_nothing_ends_cleanly():
         "import sys; sys.path.insert(0, 'tests/helpers')\n"
         "import mujoco; from small_scene import small_spec\n"
         "from surgicai_vision.scene.rendering import FrameRenderer\n"
-        "model = small_spec().compile(); data = mujoco.MjData(model); mujoco.mj_forward(model, data)\n"
+        "model = small_spec().compile(); data = mujoco.MjData(model)\n"
+        "mujoco.mj_forward(model, data)\n"
         "renderers = [FrameRenderer(model, 32, 32), FrameRenderer(model, 64, 64, 'high')]\n"
         "print(sum(r.render(data, 'front').mean() > 0 for r in renderers))"
     )

@@ -57,11 +57,9 @@ def add_materials(spec: mujoco.MjSpec) -> None:
 def add_surroundings(spec: mujoco.MjSpec) -> None:
     """Add the lights, the sky and the drape."""
     head = spec.visual.headlight
-    head.ambient, head.diffuse, head.specular = (
-        [0.26, 0.25, 0.25],
-        [0.26, 0.26, 0.26],
-        [0.25, 0.25, 0.25],
-    )
+    head.ambient = [0.26, 0.25, 0.25]
+    head.diffuse = [0.26, 0.26, 0.26]
+    head.specular = [0.25, 0.25, 0.25]
     world = spec.worldbody
     for name, position, direction, strength in (
         ("key", [-0.10, 0.12, 0.45], [0.25, -0.25, -1.0], 0.44),
@@ -99,10 +97,8 @@ def dress(spec: mujoco.MjSpec, layout: str = "simple", instrument: str = "400006
     length = INSTRUMENTS[instrument].pitch_to_yaw
     tool.add_tool_meshes(spec, length)
     for arm in ARMS:
-        shaft, wrist = (
-            spec.body(f"{arm}_outer_roll_link"),
-            spec.body(f"{arm}_outer_wrist_pitch_link"),
-        )
+        shaft = spec.body(f"{arm}_outer_roll_link")
+        wrist = spec.body(f"{arm}_outer_wrist_pitch_link")
         hide(shaft)
         hide(wrist)
         tool.dress_shaft(shaft, arm)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-VISIBLE, HIDDEN = 1, 4
+VISIBLE = 1
+HIDDEN = 4
 """Geom groups: drawn and not drawn."""
 
 
@@ -75,7 +76,8 @@ def loft(sections: ArrayLike) -> Mesh:
     closed = np.concatenate([rings, rings[:, :1]], axis=1)
     mesh.add_grid(closed[:, ::-1])
     for ring, flip in ((rings[0], -1), (rings[-1], 1)):
-        first, sides = len(mesh.points), len(ring)
+        first = len(mesh.points)
+        sides = len(ring)
         mesh.points += ring.tolist()
         mesh.faces += [(first, first + 1 + i, first + 2 + i)[::flip] for i in range(sides - 2)]
     return mesh
@@ -90,7 +92,8 @@ def tube(centres: ArrayLike, radii: ArrayLike, normal: ArrayLike, sides: int = 8
         normal: unit normal of the curve's plane (3,).
         sides: corners of a section.
     """
-    curve, upright = np.asarray(centres, dtype=np.float64), np.asarray(normal, dtype=np.float64)
+    curve = np.asarray(centres, dtype=np.float64)
+    upright = np.asarray(normal, dtype=np.float64)
     tangents = np.gradient(curve, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     across = np.cross(upright, tangents)

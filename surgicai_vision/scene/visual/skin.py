@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 
 LIFT = 0.00005
 """Of the skin above the boxes [m], so that they never shine through it."""
-INK_LIFT, INK_WIDTH = 0.0001, 0.0009
+INK_LIFT = 0.0001
+INK_WIDTH = 0.0009
 """Of the ink above the boxes, and of its ring [m]."""
 FILLET = 0.0015
 """Length over which the ridge's foot is rounded [m]."""
@@ -28,7 +29,9 @@ RAMP = 0.0015
 """Length over which the ridge falls at its ends [m]."""
 MARGIN = 0.0012
 """Along the wound beside a hole, where the skin still lies on the boxes [m]."""
-BESIDE, FLAT_ROWS, STRIP = 8, 7, 0.0005
+BESIDE = 8
+FLAT_ROWS = 7
+STRIP = 0.0005
 """Points across the flat tissue on each side of the ridge, rows before and behind it (lighting is
 per point), and the length of the row next to it [m]."""
 
@@ -48,7 +51,8 @@ def _flank(hole: Hole, height: float, offset: float) -> Array:
         height: from the hole's centre to the top, along the flank [m].
         offset: outwards of the boxes [m].
     """
-    along, normal = hole.rotation[:, 0] * -math.copysign(1.0, hole.tilt), hole.rotation[:, 2]
+    along = hole.rotation[:, 0] * -math.copysign(1.0, hole.tilt)
+    normal = hole.rotation[:, 2]
     drop = (hole.centre[2] - SURFACE) / along[2]
     steps = np.array([-drop, -OPENING / 2, OPENING / 2, height])
     points = np.asarray(hole.centre) + steps[:, None] * along + offset * normal
@@ -72,10 +76,8 @@ def _profile(pair: HolePair) -> Array:
     edge = SIZE[0] / 2
     sides = []
     for flank, end in ((left, ORIGIN[0] - edge), (right, ORIGIN[0] + edge)):
-        foot, above = (
-            flank[0],
-            flank[0] + (flank[1] - flank[0]) * FILLET / np.linalg.norm(flank[1] - flank[0]),
-        )
+        foot = flank[0]
+        above = flank[0] + (flank[1] - flank[0]) * FILLET / np.linalg.norm(flank[1] - flank[0])
         flat = np.linspace((end, SURFACE), (foot[0] + math.copysign(FILLET, end), SURFACE), BESIDE)
         share = np.linspace(0.0, 1.0, 5)[1:, None]
         fillet = (1 - share) ** 2 * flat[-1] + 2 * share * (1 - share) * foot + share**2 * above
@@ -101,7 +103,8 @@ def _rows(pairs: Sequence[HolePair], profiles: Sequence[Array]) -> list[tuple[fl
             (-reach, False),
         ):
             rows.append((y + shift, profile, opens))
-    first, last = _flattened(profiles[0]), _flattened(profiles[-1])
+    first = _flattened(profiles[0])
+    last = _flattened(profiles[-1])
     far = [ORIGIN[1] + SIZE[1] / 2, ORIGIN[1] - SIZE[1] / 2]
     # A short strip beside the ridge's end keeps its slope out of the flat tissue's normals.
     head = [

@@ -45,7 +45,8 @@ def tissue(height: int = 768, width: int = 384, seed: int = 1) -> Image:
 def cloth(size: int = 256, seed: int = 2) -> Image:
     """Return a woven surgical drape, (size, size, 3), that tiles."""
     rng = np.random.default_rng(seed)
-    weft, warp = (np.arange(size) % 4 < 2)[:, None], (np.arange(size) % 4 < 2)[None, :]
+    weft = (np.arange(size) % 4 < 2)[:, None]
+    warp = (np.arange(size) % 4 < 2)[None, :]
     weave = np.where(weft ^ warp, 1.0, 0.0)
     shade = (
         0.5 * noise(rng, size, size, 8, 8) + 0.25 * weave + 0.25 * noise(rng, size, size, 64, 64)

@@ -82,7 +82,8 @@ def _wrist(length: float) -> Mesh:
 
 def _finger() -> Mesh:
     """Return a finger's back, tapered from hinge to pad, and its hub on half of the hinge."""
-    middle, half = PAD_OFFSET + PAD_THICKNESS / 2, PAD_WIDTH / 2
+    middle = PAD_OFFSET + PAD_THICKNESS / 2
+    half = PAD_WIDTH / 2
     mesh = bar(
         [
             (0.0, -0.0005, 0.0014, 0.5 * half),
