@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 import torch
@@ -27,6 +27,9 @@ from torch import nn
 from surgicai_vision.core import names
 from surgicai_vision.core.config import CLOCK_SIZE
 from surgicai_vision.core.errors import InputError, check_name
+
+if TYPE_CHECKING:
+    from surgicai_vision.training.checkpoint import Checkpoint
 
 ACTIONS = len(names.ACTION_NAMES)
 VECTORS: Mapping[str, int] = MappingProxyType(
@@ -168,8 +171,10 @@ class Policy(nn.Module, abc.ABC):
         inputs: what it is fed.
         input_mean: mean of each input over the training frames, (inputs.dim,).
         input_std: standard deviation of each, 1 where an input is constant.
+        checkpoint: what a policy that was loaded was restored from.
     """
 
+    checkpoint: "Checkpoint"
     input_mean: torch.Tensor
     input_std: torch.Tensor
 

@@ -16,18 +16,22 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-import torch
 from safetensors import SafetensorError
-from safetensors.torch import load, save
 
 from surgicai_vision.core.config import TaskConfig, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_json, write_bytes, write_json
 
+if TYPE_CHECKING:
+    import torch
+
+    from encoders.base import Encoder
+
 FORMAT = 2
-CARD, WEIGHTS = "checkpoint.json", "policy.safetensors"
+CARD = "checkpoint.json"
+WEIGHTS = "policy.safetensors"
 
 
 @dataclass(frozen=True)
@@ -114,9 +118,11 @@ class Checkpoint:
 
 
 def write_checkpoint(
-    folder: Path, checkpoint: Checkpoint, tensors: Mapping[str, torch.Tensor]
+    folder: Path, checkpoint: Checkpoint, tensors: "Mapping[str, torch.Tensor]"
 ) -> Checkpoint:
     """Write weights, then card; return the checkpoint as it now lies in `folder`."""
+    from safetensors.torch import save
+
     content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
     checkpoint = replace(
         checkpoint, policy_sha256=hashlib.sha256(content).hexdigest(), folder=folder
@@ -164,8 +170,10 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     return checkpoint
 
 
-def read_tensors(checkpoint: Checkpoint) -> dict[str, torch.Tensor]:
+def read_tensors(checkpoint: Checkpoint) -> "dict[str, torch.Tensor]":
     """Return the policy's tensors after checking their hash; `BadFile` where it does not fit."""
+    from safetensors.torch import load
+
     path = checkpoint.folder / WEIGHTS
     try:
         content = path.read_bytes()
@@ -185,7 +193,7 @@ SEEN = ("input_size", "input_range", "mean", "std", "interpolation", "channel_or
 """Entries of a card that change what the network sees."""
 
 
-def check_encoder(checkpoint: Checkpoint, encoder: Any) -> None:
+def check_encoder(checkpoint: Checkpoint, encoder: "Encoder | None") -> None:
     """Refuse an encoder whose weights, preprocessing or pool differ from those trained on.
 
     Raises:
@@ -211,8 +219,9 @@ def check_encoder(checkpoint: Checkpoint, encoder: Any) -> None:
     for key, value in trained.items():
         if given[key] != value:
             raise InputError(
-                f"The checkpoint {checkpoint.folder} was trained on encoder '{wanted.name}' with {key} "
-                f"{value}, got '{encoder.card.name}' with {given[key]}; hand over the same with --weights."
+                f"The checkpoint {checkpoint.folder} was trained on encoder '{wanted.name}' with "
+                f"{key} {value}, got '{encoder.card.name}' with {given[key]}; "
+                "hand over the same with --weights."
             )
 
 

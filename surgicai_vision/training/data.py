@@ -1,10 +1,8 @@
-"""Training data: what training reads of a dataset, how frames are split and batched, statistics of
-the inputs.
-"""
+"""Training data: the split into training and validation, batches, statistics of the inputs."""
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,11 +10,12 @@ import torch
 from surgicai_vision.core import names
 from surgicai_vision.core.config import clock
 
+if TYPE_CHECKING:
+    from policies.base import Recipe
+
 
 def with_clock(columns: dict[str, np.ndarray], vector: str | None) -> dict[str, np.ndarray]:
-    """Return the columns, and `names.CLOCKED_STATE` (N, 10) beside them where that is the `vector`
-    asked for.
-    """
+    """Return the columns, with `names.CLOCKED_STATE` (N, 10) where `vector` asks for it."""
     if vector != names.CLOCKED_STATE:
         return columns
     steps = np.rint(np.asarray(columns["timestamp"]) * names.FPS)
@@ -27,13 +26,13 @@ def with_clock(columns: dict[str, np.ndarray], vector: str | None) -> dict[str, 
 
 
 def split(
-    episode_index: np.ndarray, recipe: Any, seed: int
+    episode_index: np.ndarray, recipe: "Recipe", seed: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
     """Split the frames into training and validation.
 
     Args:
         episode_index: (N,) episode of every frame.
-        recipe: has `split` ("episode" or "transition") and `validation` (share held out).
+        recipe: its `split` ("episode" or "transition") and `validation` (share held out) count.
         seed: of the draw.
 
     Returns:
@@ -60,27 +59,26 @@ def cuts(count: int, size: int) -> list[int]:
 def over_places(
     mean: torch.Tensor, std: torch.Tensor, visual: Sequence[tuple[int, ...]]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Give all places of a feature map their channel's statistics: a place that never changes is
-    not made loud.
+    """Give all places of a feature map their channel's statistics.
+
+    A place that hardly changes is not amplified so.
 
     Args:
         mean: (inputs,) means of the inputs, the views' rows first.
         std: (inputs,) their standard deviations.
         visual: shape of each view's feature; only maps (C, h, w) are changed.
     """
-    mean, std = mean.clone(), std.clone()
+    mean = mean.clone()
+    std = std.clone()
     at = 0
     for shape in visual:
         size = math.prod(shape)
         if len(shape) == 3:
-            m, s = mean[at : at + size].view(shape), std[at : at + size].view(shape)
-            channel = m.mean((1, 2), keepdim=True)
-            s.copy_(
-                ((s**2 + m**2).mean((1, 2), keepdim=True) - channel**2)
-                .clamp(min=0)
-                .sqrt()
-                .expand(shape)
-            )
-            m.copy_(channel.expand(shape))
+            mean_map = mean[at : at + size].view(shape)
+            std_map = std[at : at + size].view(shape)
+            channel = mean_map.mean((1, 2), keepdim=True)
+            squares = (std_map**2 + mean_map**2).mean((1, 2), keepdim=True)
+            std_map.copy_((squares - channel**2).clamp(min=0).sqrt().expand(shape))
+            mean_map.copy_(channel.expand(shape))
         at += size
     return mean, std

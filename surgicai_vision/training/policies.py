@@ -8,18 +8,20 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import yaml
 
-from surgicai_vision.core.config import from_mapping
+from surgicai_vision.core.config import JSON, from_mapping
 from surgicai_vision.core.errors import BadFile, check_name
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.core.plugins import POLICIES_GROUP, Registry
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 
 if TYPE_CHECKING:
-    from policies.base import Plugin
+    from encoders.base import Encoder
+    from policies.base import Plugin, Policy, Recipe
+    from surgicai_vision.training.checkpoint import Checkpoint
 
 POLICIES: Final = Registry["Plugin"](
     "policy", POLICIES_GROUP, {"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP"}
@@ -52,8 +54,8 @@ def recipe_names() -> tuple[str, ...]:
 
 
 def load_recipe(
-    policy: str = "bc", recipe: str | Path = "paper", changes: Mapping[str, Any] | None = None
-) -> Any:
+    policy: str = "bc", recipe: str | Path = "paper", changes: Mapping[str, JSON] | None = None
+) -> "Recipe":
     """Read a recipe and apply changes.
 
     Args:
@@ -80,7 +82,7 @@ def load_recipe(
     return from_mapping(plugin.recipe, {**values, **(changes or {})}, f"recipe {recipe}")
 
 
-def load_policy(folder: Path | str) -> Any:
+def load_policy(folder: Path | str) -> "Policy":
     """Load a trained policy from a checkpoint folder, verified.
 
     Returns:
@@ -94,7 +96,7 @@ def load_policy(folder: Path | str) -> Any:
     return restore(read_checkpoint(Path(folder)))
 
 
-def restore(checkpoint: Any) -> Any:
+def restore(checkpoint: "Checkpoint") -> "Policy":
     """Build the trained policy of a checkpoint; see `load_policy`."""
     from surgicai_vision.training.checkpoint import read_tensors
 
@@ -111,7 +113,9 @@ def restore(checkpoint: Any) -> Any:
     return policy
 
 
-def load_encoder_of(checkpoint: Any, weights: WeightsSource = ANYWHERE) -> Any:
+def load_encoder_of(
+    checkpoint: "Checkpoint", weights: WeightsSource = ANYWHERE
+) -> "Encoder | None":
     """Load the encoder a policy was trained on, verified; None for a policy without images.
 
     Raises:
@@ -119,8 +123,7 @@ def load_encoder_of(checkpoint: Any, weights: WeightsSource = ANYWHERE) -> Any:
     """
     from surgicai_vision.training.checkpoint import check_encoder
 
-    record, encoder = checkpoint.encoder, None
-    if record:
-        encoder = load_encoder(record.name, record.pool, weights)
+    record = checkpoint.encoder
+    encoder = load_encoder(record.name, record.pool, weights) if record else None
     check_encoder(checkpoint, encoder)
     return encoder

@@ -29,14 +29,15 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from torch.optim.lr_scheduler import LRScheduler
 
+from policies.base import Plugin, Policy, Recipe
 from surgicai_vision import __version__
 from surgicai_vision.core import names
-from surgicai_vision.core.config import digest, to_mapping
+from surgicai_vision.core.config import JSON, digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, UnknownName
 from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
 from surgicai_vision.dataset.protocol import Dataset
@@ -51,9 +52,11 @@ from surgicai_vision.training.checkpoint import (
 from surgicai_vision.training.data import cuts, over_places, split, with_clock
 from surgicai_vision.training.threads import one_thread
 
-REQUEST, STATE = "training.json", "training_state.pt"
+REQUEST = "training.json"
+STATE = "training_state.pt"
 STATE_EVERY = 5  # epochs between training states: a broken-off training loses at most these
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of malloc.h
+TRIM_THRESHOLD = -1  # of malloc.h, as is the next
+MMAP_THRESHOLD = -3
 STATISTICS_ROWS = 1024  # rows summed at a time
 SMALLEST_STD = 1e-6  # an input that varies less is constant, and only its mean is removed
 
@@ -66,15 +69,15 @@ Log = Callable[[int, dict[str, float]], None]
 def train(
     dataset: Dataset,
     features: Sequence[Features],
-    policy: Any,
-    recipe: Any,
+    policy: Plugin,
+    recipe: Recipe,
     *,
     seed: int = 0,
     out: Path,
     progress: Progress | None = None,
     recipe_name: str = "custom",
     save_every: int = 0,
-    start: Any = None,
+    start: Policy | None = None,
     device: str = "cpu",
     log: Log | None = None,
 ) -> Checkpoint:
@@ -123,9 +126,10 @@ def train(
 
 
 def _keep_memory() -> None:
-    """Let glibc keep what is freed: a batch of feature maps is allocated anew each step, and
-    handing its pages back and forth costs 1.5 times the arithmetic (221 against 84 ms of CPU a step
-    of 256 maps of 48 × 28 × 28).
+    """Let glibc keep what is freed.
+
+    A batch of feature maps is allocated anew each step, and handing its pages back and forth costs
+    1.5 times the arithmetic (221 against 84 ms of CPU a step of 256 maps of 48 × 28 × 28).
     """
     with suppress(OSError, AttributeError):  # another C library
         mallopt = ctypes.CDLL(None).mallopt
@@ -139,12 +143,12 @@ class _Task:
 
     dataset: Dataset
     features: tuple[Features, ...]
-    policy: Any
-    recipe: Any
+    policy: Plugin
+    recipe: Recipe
     seed: int
     recipe_name: str
 
-    def untrained(self) -> Any:
+    def untrained(self) -> Policy:
         """Return the policy as it is before training."""
         return self.policy.make(self.recipe, tuple(entry.shape for entry in self.features))
 
@@ -175,7 +179,7 @@ def _check(task: _Task) -> None:
             raise InputError(f"Column '{key}' of the dataset holds values that are not finite.")
 
 
-def _request(task: _Task, start: Any) -> dict[str, Any]:
+def _request(task: _Task, start: Policy | None) -> dict[str, JSON]:
     """Return everything that decides the result, as plain data."""
     return {
         "policy": task.policy.name,
@@ -194,8 +198,9 @@ def _request(task: _Task, start: Any) -> dict[str, Any]:
 class _Training:
     """One training: its data, its policy, its optimiser."""
 
-    def __init__(self, task: _Task, start: Any, device: torch.device) -> None:
-        self.task, self.device = task, device
+    def __init__(self, task: _Task, start: Policy | None, device: torch.device) -> None:
+        self.task = task
+        self.device = device
         columns = with_clock(task.dataset.columns(), task.untrained().inputs.vector)
         index = np.asarray(task.dataset.episode_index)
         self.rows, self.held_rows, self.held_episodes = split(index, task.recipe, task.seed)
@@ -206,7 +211,8 @@ class _Training:
             )
         torch.manual_seed(task.seed)
         self.policy = task.untrained()
-        vector, target = self.policy.inputs.vector, np.array(columns[task.policy.target])
+        vector = self.policy.inputs.vector
+        target = np.array(columns[task.policy.target])
         self.vector = np.asarray(columns[vector], np.float32) if vector else None
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
         last = np.searchsorted(index, index, side="right") - 1
@@ -248,7 +254,7 @@ class _Training:
                 progress(done, epochs)
         return self._write(out)
 
-    def _optimiser(self) -> tuple[torch.optim.Optimizer, Any]:
+    def _optimiser(self) -> tuple[torch.optim.Optimizer, LRScheduler | None]:
         """Return the recipe's optimiser and its schedule, or None where the learning rate stays."""
         recipe = self.task.recipe
         kind = torch.optim.AdamW if recipe.weight_decay else torch.optim.Adam
@@ -263,8 +269,9 @@ class _Training:
         )
 
     def _observed(self, rows: np.ndarray) -> torch.Tensor:
-        """Return the raw inputs of some frames, (n, inputs) float32: the views' features, then the
-        vector.
+        """Return the raw inputs of some frames, (n, inputs) float32.
+
+        The views' features stand before the vector.
         """
         parts = [torch.from_numpy(entry.rows[rows]).float() for entry in self.task.features]
         if self.vector is not None:
@@ -287,7 +294,7 @@ class _Training:
         self.policy.input_mean.copy_(mean)
         self.policy.input_std.copy_(torch.where(std > SMALLEST_STD, std, torch.ones_like(std)))
 
-    def _copy(self, start: Any) -> None:
+    def _copy(self, start: Policy) -> None:
         """Start from a trained policy, its input statistics included."""
         if start.inputs != self.policy.inputs:
             raise InputError(
@@ -301,8 +308,9 @@ class _Training:
             ) from None
 
     def _batches(self) -> list[np.ndarray]:
-        """Return the training rows of one epoch in a new order; a last batch of one joins the one
-        before.
+        """Return the training rows of one epoch in a new order, batch by batch.
+
+        A last batch of one joins the one before.
         """
         order = self.order.permutation(self.rows)
         return np.split(order, cuts(len(order), self.task.recipe.batch_size)[1:])
@@ -368,11 +376,13 @@ class _Training:
             self.schedule.load_state_dict(state["schedule"])
         self.order.bit_generator.state = json.loads(state["order"])
         torch.set_rng_state(state["random"])
-        self.losses, self.held_losses = list(state["losses"]), list(state["held_losses"])
+        self.losses = list(state["losses"])
+        self.held_losses = list(state["held_losses"])
 
     def _write(self, folder: Path) -> Checkpoint:
         """Write the policy as it stands."""
-        task, dataset = self.task, self.task.dataset
+        task = self.task
+        dataset = task.dataset
         folder.mkdir(parents=True, exist_ok=True)
         checkpoint = Checkpoint(
             task=dataset.config,
