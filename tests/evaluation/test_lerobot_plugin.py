@@ -166,6 +166,8 @@ def test_env_has_every_field_of_the_task_config_and_follows_a_dataset(dataset: P
 
 
 def test_env_without_a_dataset_has_its_tasks_own_limit() -> None:
+    from lerobot_env_surgicai import SurgicaiEnv
+
     assert SurgicaiEnv(task="suture").max_steps == 1000
     assert SurgicaiEnv(task="place").max_steps == SurgicaiEnv().max_steps == 200
 
