@@ -85,7 +85,7 @@ def repair_dataset(path: Path, out: Path | None = None, progress: Progress = sil
     if out is not None:
         check_output(out)
     elif _free(path, "broken") is None:
-        raise BadFile(f"Beside {path} there are already 100 broken ones; give --out DIR.")
+        raise BadFile(f"100 broken datasets lie beside {path} already; give --out DIR.")
     work = work_folder(out or path)
     try:
         with claim(work):
@@ -208,7 +208,7 @@ def _commit(made: Path, path: Path, out: Path | None) -> Path:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Swap two folders' names in one step; say whether that was done."""
+    """Swap two folders' names in one step; return False where the file system cannot."""
     try:
         swap = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError):

@@ -1,4 +1,4 @@
-"""Check a dataset of ours: every frame of it, and all that is said about them.
+"""Check a dataset of ours: every frame, and its metadata against the frames.
 
     report = check_dataset(Path("dataset"))
     report.ok, report.problems        # each problem one line

@@ -70,6 +70,7 @@ def render_episode(
             f"{demo} was recorded in another scene (hash {episode.scene_hash[:12]}, now "
             f"{env.scene.hash[:12]}); record it again with this version."
         )
+    # The images, frame by frame: encoded, counted and hashed; what the env measures beside them.
     keys = schema.image_keys(views, depth, segmentation)
     content: dict[str, list[bytes]] = {key: [] for key, _, _ in keys}
     statistics = {key: ImageStatistics() for key in content}
@@ -88,6 +89,7 @@ def render_episode(
             digest.add(key, frame)
         for key, measure in MEASURED.items():
             measured[key].append(measure(env))
+    # The columns, and everything in one file and its summary.
     columns = _columns(episode, frame_stride, measured)
     depth_keys = [key for key, _, modality in keys if modality == names.DEPTH]
     _write_episode(folder, content, columns, depth_keys)

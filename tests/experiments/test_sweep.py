@@ -157,7 +157,7 @@ def test_smaller_sets_of_demonstrations_lie_within_larger(quiet):
     assert {asked: card.frames for asked, card in trained.items()}[1] == part.length
 
 
-def test_thinned_frames_are_those_of_the_whole(quiet):
+def test_frames_of_a_stride_are_those_of_the_whole(quiet):
     out, _ = quiet
     dataset = open_dataset(out / "data/grasp/dataset")
     part = with_frame_stride(dataset, 7)

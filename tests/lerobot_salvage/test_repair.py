@@ -2,6 +2,10 @@
 
 import json
 import shutil
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -308,6 +312,12 @@ def test_the_command_line_checks_and_repairs(tmp_path, foreign, capsys):
     for wrong in (["check"], ["mend", str(folder)], ["check", str(tmp_path / "none")]):
         assert main(wrong) == 2
         assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_command_is_installed():
+    command = Path(sys.executable).with_name("lerobot-salvage")
+    result = subprocess.run([command, "--version"], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["lerobot-salvage", version("lerobot_salvage")]
 
 
 def test_our_own_check_names_the_command_for_other_datasets(foreign):

@@ -215,7 +215,7 @@ def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(
     with pytest.raises(InputError, match="has 0 to 8"):
         part.frames("back", 0, 9)
     assert with_frame_stride(part, 2).length == 4
-    whole.fps = 25  # rendered with every other frame: a part of it is not thinned once more
+    whole.fps = 25  # rendered with every other frame: the stride counts control steps
     sparse = of_subtask(whole, "insert")
     assert (
         with_frame_stride(sparse, 2) is sparse
