@@ -1,6 +1,4 @@
-"""Downloads of weights, against a server on this machine: resumed, hash checked, and given up at
-once.
-"""
+"""Downloads of weights, against a server on this machine: resumed, verified, given up at once."""
 
 import hashlib
 import threading

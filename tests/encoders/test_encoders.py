@@ -102,9 +102,7 @@ def test_red_and_blue_differ(encoder: Encoder) -> None:
 
 
 def test_frozen_for_good(encoder: Encoder) -> None:
-    """Nothing a training could do changes weights or buffers (the released code's BatchNorms
-    drifted).
-    """
+    """Nothing that training does changes weights or buffers."""
     before, feature = encoder.state_sha256(), encoder(images())
     network = encoder._network
     assert not any(parameter.requires_grad for parameter in network.parameters())
@@ -199,12 +197,8 @@ def test_random_is_reproducible_and_leaves_the_global_state() -> None:
 
 
 def test_imagenet_lite_classifies() -> None:
-    """The tensors, mapped by position, are the trained network: it names what a photograph
-    shows.
-    """
+    """The tensors, mapped by position, are the trained network: it classifies a photograph."""
     import timm
-
-    from encoders.base import read_torch
 
     network = timm.create_model("tf_efficientnet_lite0")
     tensors = read_torch(packaged_file())

@@ -1,6 +1,4 @@
-"""Folding BatchNorms: the answers stay, the passes go, and what does not run in order is left
-alone.
-"""
+"""Folding BatchNorms: the answers stay, the passes go, other orders are left alone."""
 
 import copy
 

@@ -1,6 +1,4 @@
-"""Weights: where they are found, which files are refused, and loaders on tables of the right names
-and shapes.
-"""
+"""Weights: where they are found, which files are refused, and every loader on a whole file."""
 
 from pathlib import Path
 
@@ -93,9 +91,7 @@ def test_any_timm_network(tmp_path: Path) -> None:
 
 
 def assert_stable(encoder: Encoder, dim: int) -> None:
-    """Check the dimension, and that a feature depends neither on its batch nor on the thread
-    count.
-    """
+    """Check the dimension, and that neither batch nor thread count changes a feature."""
     frames = np.concatenate([np.roll(hopper(), 9 * shift, axis=2) for shift in range(11)])
     together = encoder(frames)
     assert together.shape == (11, dim) and encoder.card.dim == dim
@@ -119,9 +115,7 @@ def assert_stable(encoder: Encoder, dim: int) -> None:
 def test_known_imagenet_file_classifies(
     shared: Path, name: str, label: int, probability: float
 ) -> None:
-    """Stride and statistics are the file's own: its classifier, on our features, says what is
-    listed beside it.
-    """
+    """Stride and statistics are the file's own: its classifier names the photograph's label."""
     path = known_file(shared)
     encoder, tensors = load_encoder("imagenet", weights=WeightsSource.of(path)), load_file(path)
     logits = (
@@ -141,12 +135,11 @@ def test_known_imagenet_file_classifies(
 
 
 def test_stride_decides_what_the_known_file_sees(shared: Path) -> None:
-    """With torchvision's stride the same tensors load and are less sure of the cat, by more than
-    the test allows.
-    """
+    """With torchvision's stride the same tensors load, and are less sure of the cat."""
     card, network = imagenet.classifier(imagenet.CARD, known_file(shared))
     for stage in (network.layer2, network.layer3, network.layer4):
-        stage[0].conv1.stride, stage[0].conv2.stride = (1, 1), (2, 2)
+        stage[0].conv1.stride = (1, 1)
+        stage[0].conv2.stride = (2, 2)
     logits = torch.from_numpy(Encoder(card, network, dtype=torch.float32)(photograph("cat")))
     assert float(logits.softmax(1)[0, 285]) < 0.73 - 0.1
 

@@ -1,5 +1,4 @@
-"""The LeRobot plug-in: stock commands on our env and dataset, `surgicai_bc`, and our evaluation of
-the same.
+"""The LeRobot plug-in: stock commands on our env and dataset, and our evaluation of the same.
 
 LeRobot's commands run in this process through their own `main`: importing them takes most of the
 time here.
@@ -74,8 +73,9 @@ def command(monkeypatch: pytest.MonkeyPatch, folder: Path):
 def training(dataset: Path, out: Path, policy: str, *more: str) -> list[str]:
     return [
         "--dataset.repo_id=local/toy", f"--dataset.root={dataset}", f"--policy.type={policy}",
-        "--policy.device=cpu", "--policy.push_to_hub=false", "--batch_size=2", "--steps=2", "--num_workers=0",
-        "--log_freq=1", f"--output_dir={out}", "--env.type=surgicai", f"--env.dataset={dataset}",
+        "--policy.device=cpu", "--policy.push_to_hub=false", "--batch_size=2", "--steps=2",
+        "--num_workers=0", "--log_freq=1", f"--output_dir={out}", "--env.type=surgicai",
+        f"--env.dataset={dataset}",
         f"--env.max_steps={STEPS}", "--env_eval_freq=0", *more,
     ]  # fmt: skip
 
@@ -97,9 +97,7 @@ def trained(dataset: Path, folder: Path) -> Path:
 
 
 def skilled(dataset: Path, out: Path, steps: int = 400) -> Path:
-    """Train a `surgicai_bc` that sees the tip alone on all frames at once, and save it as LeRobot
-    does.
-    """
+    """Train a `surgicai_bc` without images on all frames at once; save it as LeRobot does."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.policies.factory import make_policy, make_pre_post_processors
 
@@ -249,12 +247,12 @@ def load(folder: Path) -> Any:
 def frames(count: int) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     images = torch.randint(0, 256, (count, 3, SIZE, SIZE), generator=generator) / 255
-    state, action = (
-        torch.randn(count, 7, generator=generator),
-        torch.rand(count, 7, generator=generator),
-    )
-    return {names.image_key("front"): images, names.image_key("back"): 1 - images, names.STATE: state,
-            names.ACTION: action}  # fmt: skip
+    return {
+        names.image_key("front"): images,
+        names.image_key("back"): 1 - images,
+        names.STATE: torch.randn(count, 7, generator=generator),
+        names.ACTION: torch.rand(count, 7, generator=generator),
+    }
 
 
 def test_policy_acts_the_same_after_saving_and_in_any_batch(trained: Path, tmp_path: Path) -> None:
@@ -288,7 +286,7 @@ def test_training_moves_the_network_and_never_the_encoder(trained: Path) -> None
     np.testing.assert_array_equal(encoder(np.full((1, SIZE, SIZE, 3), 90, np.uint8)), feature)
 
 
-def test_training_encodes_a_image_once_and_forgets_beyond_its_limit() -> None:
+def test_training_encodes_an_image_once_and_forgets_beyond_its_limit() -> None:
     from lerobot_env_surgicai.images import FeatureMemory
 
     encoded: list[int] = []
@@ -426,9 +424,10 @@ def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(
     from surgicai_vision.evaluation.rollout import evaluate
 
     command(
-        "lerobot_eval", f"--policy.path={trained / CHECKPOINT}", "--env.type=surgicai", f"--env.dataset={dataset}",
-        f"--env.max_steps={STEPS}", "--env.reward=dense", "--eval.n_episodes=2", "--eval.batch_size=2",
-        "--eval.use_async_envs=false", "--policy.device=cpu", f"--output_dir={trained / 'eval'}", "--seed=1000",
+        "lerobot_eval", f"--policy.path={trained / CHECKPOINT}", "--env.type=surgicai",
+        f"--env.dataset={dataset}", f"--env.max_steps={STEPS}", "--env.reward=dense",
+        "--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false",
+        "--policy.device=cpu", f"--output_dir={trained / 'eval'}", "--seed=1000",
     )  # fmt: skip
     metrics = json.loads((trained / "eval" / "eval_info.json").read_text())["per_task"][0][
         "metrics"
@@ -591,8 +590,8 @@ def test_lerobot_edits_our_dataset(dataset: Path, folder: Path, tmp_path: Path, 
         f"--operation.splits={splits}",
     )
     command(
-        edit, "--new_repo_id=local/whole", f"--new_root={tmp_path / 'whole'}", "--operation.type=merge",
-        "--operation.repo_ids=['local/toy_train','local/toy_val']",
+        edit, "--new_repo_id=local/whole", f"--new_root={tmp_path / 'whole'}",
+        "--operation.type=merge", "--operation.repo_ids=['local/toy_train','local/toy_val']",
         f"--operation.roots=['{tmp_path / 'train'}','{tmp_path / 'val'}']",
     )  # fmt: skip
     infos = {

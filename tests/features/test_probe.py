@@ -1,6 +1,4 @@
-"""The linear probe: what it finds in features that hold the pose, what in noise, and what it
-refuses.
-"""
+"""The linear probe: in features that hold the pose, in noise, and what it refuses."""
 
 import json
 from dataclasses import dataclass, field
@@ -75,9 +73,7 @@ def test_features_that_hold_the_pose_are_read_and_noise_is_not() -> None:
 
 
 def test_an_episodes_identity_does_not_help() -> None:
-    """Features that only say which episode it is fit the episodes known and fail on those held
-    out.
-    """
+    """Features that only identify the episode fit the known ones and fail on those held out."""
     dataset = Dataset()
     identity = np.eye(20)[dataset.episode_index]
     found = probe(dataset, [features(identity, dataset)])
