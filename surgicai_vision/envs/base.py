@@ -41,6 +41,7 @@ START_DRAWS = 60
 """Draws of a start state before giving up."""
 RENDER_CAMERA = "front"
 RENDER_SIZE = (480, 640)
+"""Height and width of what `render` returns [px]."""
 
 Observation = NDArray[np.float32] | dict[str, Frame]
 

@@ -1,4 +1,4 @@
-"""Images for people: what a view shows, film strips, and the sheet of all cameras."""
+"""Contact sheet: images of states for reports: coloured, encoded, and in a grid."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

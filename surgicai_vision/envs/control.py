@@ -22,9 +22,12 @@ from surgicai_vision.scene.rotations import multiply_flat, rotvec_to_matrix_flat
 JAW_OPEN = 1.0
 """Largest commanded jaw angle [rad]; 0 is closed."""
 SQUEEZE = 0.3
+"""How far the jaw's servo is led past a closed jaw's command [rad].
+
+The motor's torque limit then sets the force of the grip.
+"""
 SQUEEZE_BELOW = 0.1
-"""Below a command of 0.1 rad the jaw's servo is led up to 0.3 rad past it, gently at first: the
-motor's torque limit then sets the force of the grip, and the pads do not slam."""
+"""Commands below which that begins [rad], gently, so that the pads do not slam."""
 WORKSPACE = ((-0.09, -0.09, 0.060), (0.09, 0.14, 0.165))
 """Corners of the box the tips may move in [m, world]."""
 COMMAND_SIZE = 12 + 1 + 6

@@ -19,8 +19,9 @@ from surgicai_vision.scene.rotations import rpy_to_matrix
 
 SPREAD_X = 0.003
 SPREAD_Y = 0.020
+"""Half widths of the needle's start about its home [m] (released code, Approach)."""
 SPREAD_TURN = math.radians(30.0)
-"""Half widths of the needle's start about its home [m, m, rad] (released code, Approach)."""
+"""Half width of its rotation [rad]."""
 
 
 def lying_needle(rng: np.random.Generator) -> np.ndarray:

@@ -19,8 +19,9 @@ GRASP_SHIFT = 0.0015
 GRASP_TILT = math.radians(20.0)
 """How far PSM1's grasp may be off at the start (paper)."""
 RETREAT = 0.025
+"""How far PSM2 is drawn back along its axis after it let go [m]."""
 RELEASED_JAW = 0.5
-"""Where PSM2 is after it let go: drawn back along its axis [m], jaw open [rad]."""
+"""How far its jaw is open then [rad]."""
 
 
 class Pullout(Subtask):

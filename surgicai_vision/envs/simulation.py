@@ -36,19 +36,17 @@ from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
 SUBSTEPS = 10
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 CLOCK_START = 1.0
-"""Time at the start of an episode [s]: not 0, so that MuJoCo's own reset to 0 shows in the first
-step too.
-"""
+"""Time at the start of an episode [s]: not 0, so that MuJoCo's own reset to 0 shows at once."""
 _SET_SEVEN = struct.Struct("7d").pack_into
 _THREE = struct.Struct("3d").unpack_from
 _NINE = struct.Struct("9d").unpack_from
 """One row of positions, of rotations, as floats: half the time of `array[row].tolist()`."""
 RELEASE_STEPS = 40
+"""Control steps in which PSM2 lets go after the handoff."""
 RELEASE_JAW = 0.1
+"""How far its jaw opens a step [rad], to 0.5 rad."""
 RELEASE_SHIFT = 0.001
-"""How PSM2 lets go after the handoff: jaw opened by 0.1 rad a step to 0.5, then drawn back 1 mm a
-step.
-"""
+"""How far it is then drawn back a step [m]."""
 
 
 _COMMANDS = TaskState.SIZE
@@ -355,10 +353,8 @@ class Simulation:
         left, right = self._pads[arm]
         first, last = self._needle_geoms
         found_left = found_right = False
-        for (
-            one,
-            other,
-        ) in self.data.contact.geom.tolist():  # MuJoCo sorts a pair by type: capsules before boxes
+        # MuJoCo sorts a pair by type: capsules before boxes.
+        for one, other in self.data.contact.geom.tolist():
             if other == left:
                 found_left = found_left or first <= one < last
             elif other == right:

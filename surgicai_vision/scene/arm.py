@@ -25,15 +25,15 @@ PAD_END = 0.0125
 PAD_WIDTH = 0.003
 PAD_THICKNESS = 0.0010
 PAD_OFFSET = BODY_RADIUS - 0.00005
-"""Inner faces of the closed jaws from their middle plane [m]: parallel when they hold the
-needle.
-"""
+"""Inner faces of the closed jaws from their middle plane [m]; parallel when they hold a needle."""
 JAW_LIMITS = (-0.06, 1.0)
 """Angle of each finger [rad]; below 0 only when the jaws close on nothing."""
 JAW_GAIN = 1.0
+"""Gain of the servo of the coupled fingers [N·m/rad]."""
 JAW_TORQUE = 0.05
+"""Largest torque of that servo [N·m]."""
 JAW_ARMATURE = 1e-4
-"""[N·m/rad, N·m, kg·m²]: the coupled fingers' servo has 70 rad/s. With an armature of 1e-5 (220
+"""[kg·m²]: the servo has a natural frequency of 70 rad/s. With an armature of 1e-5 (220
 rad/s) the closing jaws struck the needle at 12 rad/s, 0.25 mm of the pads' way in one physics step:
 with friction drawn 15 % lower it shot out of them in one grasp of three."""
 SHAFT_RADIUS = 0.004
@@ -43,8 +43,8 @@ BANDWIDTH = 100.0
 """[rad/s]"""
 LIMIT_SOLREF = [0.004, 1.0]
 LIMIT_SOLIMP = [0.99, 0.999, 0.0001, 0.5, 2.0]
-"""Of joint limits and of the fingers' coupling: a servo told to go 0.5 rad past a limit rests
-within 0.1 mrad of it; with MuJoCo's default it stood 83 mrad beyond."""
+"""Of joint limits, of the fingers' coupling and of the weld: a servo told to go 0.5 rad past a
+limit rests within 0.1 mrad of it; with MuJoCo's default it stood 83 mrad beyond."""
 ARMATURE = (0.02, 0.02, 0.5, 2e-4, 1e-4, 1e-4)
 MASSES = (0.01, 0.01, 0.05, 0.005, 0.005, 0.004)
 """Link masses [kg]; small beside the armature, which stands for the geared motors."""
@@ -67,6 +67,7 @@ def add_arm(
         bits: collision bits of the instrument.
     """
     body = base
+    # The six links of the DH table, with the physical shape of shaft and wrist.
     for index, name in enumerate(DVRK_JOINTS):
         body = _add_link(body, arm, name, index, instrument)
         _add_servo(spec, f"{arm}_{name}", index)
@@ -78,6 +79,7 @@ def add_arm(
             _capsule(
                 body, f"{arm}_wrist", [0, 0, 0, instrument.pitch_to_yaw, 0, 0], WRIST_RADIUS, bits
             )
+    # The jaws: tip and grasp frames, two coupled fingers.
     tip = body.add_body(
         name=f"{arm}_tip", quat=_frame(instrument.dh[6].alpha, instrument.dh[6].offset)
     )
@@ -198,12 +200,7 @@ def add_weld(spec: mujoco.MjSpec, arm: str) -> None:
     weld.name1 = f"{arm}_tip"
     weld.name2 = "needle"
     weld.active = False
-    weld.data[:11] = [0.0] * 6 + [
-        1.0,
-        0.0,
-        0.0,
-        0.0,
-        0.01,
-    ]  # anchor, pose in the jaws, torque scale [m]
-    weld.solref = [0.004, 1.0]
-    weld.solimp = [0.99, 0.999, 0.0001, 0.5, 2.0]
+    # Anchor, pose in the jaws, torque scale [m].
+    weld.data[:11] = [*[0.0] * 6, 1.0, 0.0, 0.0, 0.0, 0.01]
+    weld.solref = LIMIT_SOLREF
+    weld.solimp = LIMIT_SOLIMP

@@ -1,4 +1,4 @@
-"""Cameras: where they stand, and the matrices that take a point of the world into a pixel.
+"""Cameras: their poses, and the matrices that project a point of the world to a pixel.
 
 Pixels and camera frames follow OpenCV: x right, y down, z forward; the centre of the first pixel is
 (0, 0), so the principal point of a W × H image is ((W - 1) / 2, (H - 1) / 2). A point p of the
@@ -10,9 +10,8 @@ the right one; "back" the camera opposite to them. The surgical robotics challen
 camera on each insertion link; there it looks along the shaft and sees little else, so ours stand
 off it and aim at the jaws.
 
-"front_psm2" and its like follow an arm's jaws from where "front" or "back" stands: what one cuts
-out of an image of higher resolution about the jaws, whose place the arm's joints tell, and scales
-to the size of the others.
+"front_psm2" and its like follow an arm's jaws from where "front" or "back" stands: a crop of an
+image of higher resolution about the jaws, whose place is known from the arm's joints.
 """
 
 import math
@@ -118,16 +117,17 @@ ENDOSCOPE_FOVY = 0.9
 """The endoscope's middle [m], its direction, and the vertical field of view [rad] of both its
 cameras.
 
-SurgicAI's stands at (0, 114.2, 148.8) mm, looks along (0, -0.642, -0.765) and sees 1.2 rad at 640 ×
-480. There, at 224 × 224, the needle covers 31 pixels at the end of a handoff even with both arms
-     taken away; and PSM2 holds it along
-the wound, which is the line of sight, so that placing ends with 5 to 15 pixels in view. 8 mm to
-PSM2's side, 14 mm forwards, 11 mm up and 0.9 rad bring it above 25 at the end of grasp, place,
-insert and handoff, with both arms still in view at the start (`tests/test_visibility.py`).
+SurgicAI's endoscope is at (0, 114.2, 148.8) mm, looks along (0, -0.642, -0.765) and sees 1.2 rad at
+640 × 480. There, at 224 × 224, the needle covers 31 pixels at the end of a handoff even without the
+arms; and PSM2 holds it along the wound, which is the line of sight, so that placing ends with 5 to
+15 pixels in view. Moved 8 mm to PSM2's side, 14 mm forwards and 11 mm up, with 0.9 rad, it sees
+more than 25 at the end of grasp, place, insert and handoff, and both arms at the start
+(`tests/scene/test_visibility.py`).
 """
 BASELINE = 0.004
+"""Distance between the endoscope's two cameras [m] (SurgicAI)."""
 TOE_IN = 0.040
-"""Between the endoscope's two cameras [m]; x of each one's direction, 2.3° (SurgicAI)."""
+"""x of the direction of each of them, 2.3° (SurgicAI)."""
 
 
 def _endoscope(side: float) -> CameraPose:
@@ -157,10 +157,13 @@ BACK_PSM1 = FollowingCamera(BACK, PSM1)
 BACK_PSM2 = FollowingCamera(BACK, PSM2)
 
 WRIST_ASIDE = 0.030
+"""Distance of the wrist camera from the shaft [m]."""
 WRIST_BACK = 0.030
-"""From the wrist's pitch axis to the wrist camera: beside the shaft and up along it [m]. So the
-view meets the shaft at 33°: far enough to look past it at the jaws, and clear of the tissue in
-every grasp of the five subtasks."""
+"""Distance from the wrist's pitch axis to the wrist camera, up along the shaft [m].
+
+With both, the view meets the shaft at 33°: far enough to look past it at the jaws, and clear of the
+tissue in every grasp of the five subtasks.
+"""
 WRIST_SIDE = MappingProxyType(
     {PSM1: (-math.sqrt(0.5), -math.sqrt(0.5)), PSM2: (-math.sqrt(0.5), math.sqrt(0.5))}
 )
@@ -168,13 +171,9 @@ WRIST_SIDE = MappingProxyType(
 outside, where of eight sides tried the jaws, the needle and the holes were seen best at the ends of
 all subtasks."""
 WRIST_TARGET = 0.017
-"""Point beyond the wrist's pitch axis at which the wrist camera aims [m]: 2 mm short of the jaws'
-grasp point.
-"""
+"""Point beyond the wrist's pitch axis at which the wrist camera aims [m]: 2 mm before the grasp."""
 WRIST_FOVY = 0.8
-"""Vertical field of view of the wrist cameras [rad]: about 47 mm of the scene at the jaws, more
-than two needles.
-"""
+"""Vertical field of view of the wrist cameras [rad]: about 47 mm at the jaws, over two needles."""
 
 
 def wrist_camera(arm: str, instrument: str) -> CameraPose:

@@ -236,9 +236,7 @@ def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = No
     # origin and the tip.
     ex, ey, ez = py * az - pz * ay, pz * ax - px * az, px * ay - py * ax
     norm = sqrt(ex * ex + ey * ey + ez * ez)
-    if (
-        norm < 1e-12
-    ):  # the yaw axis passes through the remote centre: every wrist yaw serves, take none
+    if norm < 1e-12:  # the yaw axis passes through the remote centre: any wrist yaw is right
         ex = yx
         ey = yy
         ez = yz
@@ -254,14 +252,11 @@ def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = No
     depth = sqrt(wx * wx + wy * wy + wz * wz)
     offset = length.rcc - length.tool
     geometry = (ux, uy, uz, ex, ey, ez, ax, ay, az)
-    if (
-        depth < 1e-12
-    ):  # the wrist lies in the remote centre: any shaft will do, take the pitch link's own
+    if depth < 1e-12:  # the wrist is in the remote centre: any shaft is right, take the pitch link
         return _checked((*_shaft(ux, uy, uz, offset, geometry, near), q6), length)
     joints = (*_shaft(wx / depth, wy / depth, wz / depth, depth + offset, geometry, near), q6)
-    if (
-        depth <= 2.0 * offset
-    ):  # the wrist may be behind the remote centre: 400006 inserted by less than 23 mm
+    # The wrist may be behind the remote centre: instrument 400006 inserted by less than 23 mm.
+    if depth <= 2.0 * offset:
         behind = (
             *_shaft(-wx / depth, -wy / depth, -wz / depth, offset - depth, geometry, near),
             q6,

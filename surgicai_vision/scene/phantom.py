@@ -28,12 +28,13 @@ DENT = 0.0025
 CREST = 0.0012
 """Radius of the ridge's rounded top [m]."""
 BEYOND = 0.006
-"""How far the ridge goes on beyond the first and the last hole pair [m]: short, because the tools
-come along the wound and their wrists stand there."""
+"""How far the ridge extends beyond the first and the last hole pair [m]: not far, because the tools
+come along the wound and their wrists need the room."""
 
 TRAY_RIM = 0.007
+"""How far the tray under the phantom extends beyond it [m]."""
 TRAY_HEIGHT = 0.012
-"""How far the tray on which the phantom lies reaches beyond it, and its height [m]."""
+"""Height of that tray [m]."""
 CLEARANCE = 0.002
 """Between the phantom's underside and the table [m]; the phantom stands sunk into the tray."""
 TABLE = SURFACE - SIZE[2] - CLEARANCE

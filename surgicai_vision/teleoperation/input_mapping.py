@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.envs import poses
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.scene.cameras import extrinsics
@@ -68,8 +69,8 @@ class InputMapping:
         arm = self.env.subtask.arm
         simulation = self.env.simulation
         if self.frame == "tool":
-            return np.array(simulation.commands[arm].pose[3:]).reshape(3, 3)
-        base = np.array(simulation.bases[arm][3:]).reshape(3, 3)
+            return np.reshape(poses.rotation(simulation.commands[arm].pose), (3, 3))
+        base = np.reshape(poses.rotation(simulation.bases[arm]), (3, 3))
         camera: NDArray[np.float64] = extrinsics(self.env.model, self.env.data, view)[:3, :3]
         return base.T @ camera
 

@@ -74,9 +74,8 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
             specular=[0.5 * strength] * 3,
             castshadow=name == "key",
         )
-    spec.visual.map.shadowclip = (
-        9.0  # times the extent: a smaller map shows stripes towards its edge
-    )
+    # Times the extent: a smaller shadow map shows stripes towards its edge.
+    spec.visual.map.shadowclip = 9.0
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,

@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 LIFT = 0.00005
 """Of the skin above the boxes [m], so that they never shine through it."""
 INK_LIFT = 0.0001
+"""Of the ink above the boxes [m]."""
 INK_WIDTH = 0.0009
-"""Of the ink above the boxes, and of its ring [m]."""
+"""Of the ring of ink [m]."""
 FILLET = 0.0015
 """Length over which the ridge's foot is rounded [m]."""
 RAMP = 0.0015
@@ -30,10 +31,11 @@ RAMP = 0.0015
 MARGIN = 0.0012
 """Along the wound beside a hole, where the skin still lies on the boxes [m]."""
 BESIDE = 8
+"""Points across the flat tissue on each side of the ridge; lighting is per point."""
 FLAT_ROWS = 7
+"""Rows of points before and behind the ridge."""
 STRIP = 0.0005
-"""Points across the flat tissue on each side of the ridge, rows before and behind it (lighting is
-per point), and the length of the row next to it [m]."""
+"""Length of the row next to the ridge [m]."""
 
 
 def add_skin(spec: mujoco.MjSpec, layout: str) -> None:
@@ -180,11 +182,9 @@ def _add_walls(mesh: Mesh, near: Array, far: Array, y: float) -> None:
     grid = np.array(
         [[[edge[i, 0], y + shift, edge[i, 1]] for i, shift in loop] for edge in (near, far)]
     )
-    for walls in (
-        grid,
-        grid[:, ::-1],
-    ):  # seen from either side: the entry's order is the exit's reversed
-        mesh.add_grid(walls)
+    # Visible from either side: the entry's order is the exit's reversed.
+    mesh.add_grid(grid)
+    mesh.add_grid(grid[:, ::-1])
 
 
 def _ink(pairs: tuple[HolePair, ...]) -> Mesh:
