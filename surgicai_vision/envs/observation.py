@@ -1,23 +1,20 @@
 """Observation: what a policy may see, chosen by one argument.
 
-`state`             (21,) float32: tip now (7), tip that would meet the goal (7), error (7); each 7
-is x y z [cm],
-                    roll pitch yaw [rad], jaw [rad] in the active arm's base (released code's
-                    layout). The error's rotation is the rotation vector from now to the goal, so it
-                    never wraps.
-`goal`              Dict for hindsight relabelling: `observation` (7), `achieved_goal` (8),
-`desired_goal` (8): the
-                    measured frame that success is judged by and its goal, in world, x y z [m],
-                    rotation vector, jaw, and 1 where what success needs besides the pose holds
-                    (contact, holes passed, needle out), else 0.
-`pixels`            Dict of images: "front" is (height, width, 3) uint8 RGB; with depth=True also
-                    "front_depth" (height, width, 1) float32 [m], with segmentation=True also
-                    "front_segmentation" (height, width, 1) uint8.
-`pixels_agent_pos`  the same and `agent_pos` (7,) float32: x y z [m], roll pitch yaw [rad], jaw
-[rad] of the active
-                    arm's measured tip in its own base, as a dVRK reports it.
+* `state`: (21,) float32, three times seven values: the tip now, the tip that would meet the goal,
+  and the error. Seven values are x y z [cm], roll pitch yaw [rad], jaw [rad] in the active arm's
+  base (the released code's layout). The error's rotation is the rotation vector from now to the
+  goal, so it never wraps.
+* `goal`: Dict for hindsight relabelling: `observation` (7,), `achieved_goal` (8,) and
+  `desired_goal` (8,). The goals are the measured frame that success is judged by and its goal, in
+  world: x y z [m], rotation vector, jaw, and 1 where what success needs besides the pose holds
+  (contact, holes passed, needle out), else 0.
+* `pixels`: Dict of images: "front" is (height, width, 3) uint8 RGB; with depth=True also
+  "front_depth" (height, width, 1) float32 [m], with segmentation=True also "front_segmentation"
+  (height, width, 1) uint8.
+* `pixels_agent_pos`: the same and `agent_pos` (7,) float32: x y z [m], roll pitch yaw [rad], jaw
+  [rad] of the active arm's measured tip in its own base, as a dVRK reports it.
 
-Images and proprioception are all that vision types hold: no goal, no needle pose.
+Vision types hold images and proprioception only: no goal, no needle pose.
 """
 
 import struct
