@@ -41,9 +41,7 @@ WRIST_CAMERAS = ("wrist_psm1", "wrist_psm2")
 FOLLOWING_CAMERAS = ("front_psm1", "front_psm2", "back_psm1", "back_psm2")
 """Crops of a fixed camera around an arm's jaws, enlarged (`scene.cameras`)."""
 CAMERAS = (*FIXED_CAMERAS, *WRIST_CAMERAS, *FOLLOWING_CAMERAS)
-DEPTH_VIEWS = tuple(f"{camera}_depth" for camera in CAMERAS)
-"""Depth of a camera as a grey image, which a policy may see instead of colours."""
-VIEWS = (*CAMERAS, *DEPTH_VIEWS)
+"""Our cameras; `core.cameras` knows those of other distributions too, and every view."""
 RGB = "rgb"
 DEPTH = "depth"
 SEGMENTATION = "segmentation"
@@ -99,7 +97,7 @@ def camera_of(view: str) -> str:
 
 
 def is_depth_view(view: str) -> bool:
-    """Return True for a view that shows a camera's depth."""
+    """Return True for a view that shows a camera's depth as a grey image."""
     return view.endswith("_depth")
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgicai_vision.core import names
+from surgicai_vision.core.cameras import view_names
+from surgicai_vision.core.tasks import task_names
 
 COUNT = re.compile(r"^(\d+)([a-z]+)$")
 """A change of a recipe that is a number: "2epochs"."""
@@ -138,11 +139,10 @@ def order(condition: Condition) -> tuple[Any, ...]:
     """By task; in it trained policies first, by encoder, views and what else they are, then the
     references.
     """
-    views = [
-        names.VIEWS.index(view) if view in names.VIEWS else len(names.VIEWS)
-        for view in condition.views
-    ]
-    task = names.TASKS.index(condition.task) if condition.task in names.TASKS else len(names.TASKS)
+    known = view_names()
+    views = [known.index(view) if view in known else len(known) for view in condition.views]
+    tasks = task_names()
+    task = tasks.index(condition.task) if condition.task in tasks else len(tasks)
     more = (
         condition.variant,
         condition.demonstrations or 0,
