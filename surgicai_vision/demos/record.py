@@ -24,7 +24,6 @@ from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError,
 from surgicai_vision.core.executor import Job, RunContext, building, job, run, work_folder
 from surgicai_vision.core.files import (
     check_output,
-    code_version,
     read_json,
     sha256_file,
     whole_folder,
@@ -179,7 +178,7 @@ def record(
             for index, path in enumerate(kept):
                 shutil.copyfile(path, folder / f"episode_{index:06d}.safetensors")
             details = {"request": request, "skipped": skipped, "episodes": episodes}
-            write_marker(folder, config.task, demonstrator, code=code_version(), **details)
+            write_marker(folder, config.task, demonstrator, **details)
     return list_demos(out)
 
 

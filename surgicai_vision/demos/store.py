@@ -21,7 +21,7 @@ from safetensors.numpy import save
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError
-from surgicai_vision.core.files import read_json, sha256_file, write_bytes, write_json
+from surgicai_vision.core.files import code_version, read_json, sha256_file, write_bytes, write_json
 
 FORMAT = "surgicai-vision-demos"
 VERSION = 2
@@ -179,7 +179,7 @@ def read_demo(path: Path) -> Demo:
 
 
 def write_marker(folder: Path, task: str, demonstrator: str, **details: Any) -> None:
-    """Write `demos.json`, which says what the folder holds."""
+    """Write `demos.json`, which says what the folder holds and which code wrote it."""
     write_json(
         folder / MARKER,
         {
@@ -187,6 +187,7 @@ def write_marker(folder: Path, task: str, demonstrator: str, **details: Any) -> 
             "version": VERSION,
             "task": task,
             "demonstrator": demonstrator,
+            "code": code_version(),
             **details,
         },
     )

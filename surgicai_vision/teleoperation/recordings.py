@@ -15,7 +15,7 @@ from filelock import Timeout
 
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, OutputExists, SurgicaiError
-from surgicai_vision.core.files import TEMPORARY, check_output, code_version, locked
+from surgicai_vision.core.files import TEMPORARY, check_output, locked
 from surgicai_vision.demos.store import (
     MARKER,
     Demo,
@@ -76,9 +76,7 @@ class Recordings:
             "skipped": self.skipped,
             "episodes": len(self.seeds),
         }
-        write_marker(
-            self.folder, self._request["task"]["task"], DEMONSTRATOR, code=code_version(), **details
-        )
+        write_marker(self.folder, self._request["task"]["task"], DEMONSTRATOR, **details)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, STEPS, TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnreachablePose, check_name
 from surgicai_vision.core.executor import building
-from surgicai_vision.core.files import check_output, code_version, sha256_file, whole_folder
+from surgicai_vision.core.files import check_output, sha256_file, whole_folder
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.demos.imports.replay import Episode, Replay, fitting_step, grip_error, trimmed
 from surgicai_vision.demos.imports.sandbox import read_sandboxed
@@ -103,7 +103,7 @@ def import_demos(
             }
             kept = len(episodes) - len(skipped)
             details = {"request": request, "skipped": skipped, "episodes": kept, "notes": notes}
-            write_marker(folder, task, "surgicai", code=code_version(), **details)
+            write_marker(folder, task, "surgicai", **details)
     marker = read_marker(out)
     return ImportSummary(
         tuple(list_demos(out)), skipped=tuple(marker["skipped"]), **marker["notes"]

@@ -24,7 +24,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, UnreachablePose, check_name
 from surgicai_vision.core.executor import building
-from surgicai_vision.core.files import check_output, code_version, sha256_file, whole_folder
+from surgicai_vision.core.files import check_output, sha256_file, whole_folder
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.demos.imports.replay import Replay, Track, fitting_step, motion_actions
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
@@ -206,7 +206,7 @@ def _build(
             "episodes": count,
             "notes": {"step": step, **counts},
         }
-        write_marker(folder, task, "bag", code=code_version(), **details)
+        write_marker(folder, task, "bag", **details)
 
 
 def as_demonstration(replay: Replay, track: Track) -> tuple[Demo, int]:
