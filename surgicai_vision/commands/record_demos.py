@@ -91,7 +91,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     config = task_config(options.task, options.env)
     out = options.out or folders.demos_folder(options.task)
     folders.check_folder(out, "demos.json")
-    taught = _taught(options.from_, options.demos_used) if options.from_ else []
+    demos = _first_demos(options.from_, options.demos_used) if options.from_ else []
     learner = _learner(options.learner, config) if options.learner else None
     paths = record(
         config,
@@ -101,7 +101,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         seed=options.seed,
         disturbance=Disturbance(options.noise, options.perturb_start_fraction, options.noise_from),
         post_success_steps=options.post_success_steps,
-        demos=taught,
+        demos=demos,
         learner=learner,
         context=context,
     )
@@ -130,7 +130,7 @@ def _learner(folder: Path, config: TaskConfig) -> Any:
     return learner_of(folder, config)
 
 
-def _taught(folder: Path, count: int) -> list[Path]:
+def _first_demos(folder: Path, count: int) -> list[Path]:
     """Return the first `count` demonstrations of a folder."""
     from surgicai_vision.demos.store import list_demos
 

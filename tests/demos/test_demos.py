@@ -189,7 +189,7 @@ def test_demo_refuses_bad_lengths_quoting_both(demo):
         dataclasses.replace(demo, state=np.full_like(demo.state, np.nan))
 
 
-@pytest.mark.parametrize("spoil", ["empty", "half", "text", "flipped", "foreign"])
+@pytest.mark.parametrize("spoil", ["empty", "half", "text", "flipped", "unrelated"])
 def test_damaged_episode_is_a_bad_file(tmp_path, demo, spoil):
     path = write_demo(tmp_path, 0, demo)
     content = path.read_bytes()
@@ -200,7 +200,7 @@ def test_damaged_episode_is_a_bad_file(tmp_path, demo, spoil):
             "half": content[: len(content) // 2],
             "text": b"hello",
             "flipped": content.replace(b"surgicai-vision-demos", b"surgicai-vision-demoz"),
-            "foreign": len(header).to_bytes(8, "little") + header + bytes(4),
+            "unrelated": len(header).to_bytes(8, "little") + header + bytes(4),
         }[spoil]
     )
     with pytest.raises(BadFile) as caught:

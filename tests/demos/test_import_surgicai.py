@@ -304,8 +304,9 @@ def test_a_pickle_that_names_os_system_is_refused_and_not_run(tmp_path):
 
 
 LIMITED = """
-from surgicai_vision.demos import foreign
-foreign._limit()
+from surgicai_vision.demos.imports import sandbox
+sandbox._limit()
+print("limited", flush=True)
 {code}
 print("survived")
 """
@@ -329,7 +330,7 @@ def test_the_reading_process_cannot_leave_its_limits(tmp_path, name):
     script = LIMITED.format(code=code)
     child = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert child.returncode != 0
-    assert "survived" not in child.stdout
+    assert child.stdout.split() == ["limited"], child.stderr
     assert not (tmp_path / "other").exists()
 
 
