@@ -36,7 +36,7 @@ import json, sys, time
 from pathlib import Path
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 import surgicai_vision.envs as envs
-from surgicai_vision import names
+from surgicai_vision.core import names
 from surgicai_vision.demos.store import list_demos, read_demo
 if __name__ == "__main__":
     demos, out, _, size = sys.argv[1:]
