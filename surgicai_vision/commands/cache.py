@@ -79,5 +79,5 @@ def _text(manifest: Mapping[str, Any] | None) -> str:
 
 
 def _row(folder: Path, size: int, manifest: Mapping[str, Any] | None) -> dict[str, object]:
-    keys = ("dataset", "convert", "encoder", "pool", "length", "dim")
+    keys = ("dataset", "view", "encoder", "pool", "length", "dim")
     return {"key": folder.name, "bytes": size, **{key: (manifest or {}).get(key) for key in keys}}

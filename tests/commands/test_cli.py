@@ -15,7 +15,7 @@ import yaml
 from cyclopts import Parameter
 from read_options import read_options
 
-from surgicai_vision.commands import COMMANDS, dataset, evaluate, quickstart
+from surgicai_vision.commands import COMMANDS, dataset, evaluate, policy, quickstart
 from surgicai_vision.commands.console import QuietConsole
 from surgicai_vision.commands.main import INTERRUPTED, main
 from surgicai_vision.commands.options import COUNT, FILE_ONLY, VIEWS
@@ -23,9 +23,10 @@ from surgicai_vision.core.config import SceneConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.core.files import configs_folder
 
+GROUPS = {"dataset": dataset, "policy": policy}
 ALL_COMMANDS = (
-    *(name for name in COMMANDS if name != "dataset"),
-    *(f"dataset {name}" for name in dataset.COMMANDS),
+    *(name for name in COMMANDS if name not in GROUPS),
+    *(f"{group} {name}" for group, package in GROUPS.items() for name in package.COMMANDS),
 )
 HEAVY = {"torch", "lerobot", "mujoco", "scipy", "cv2", "pandas", "matplotlib", "transformers"}
 PROGRAM = Path(sys.executable).with_name("surgicai-vision")
@@ -66,11 +67,13 @@ def test_help_names_every_command_in_the_order_of_the_flow(capsys):
 
 
 def test_help_of_a_group_names_its_commands(capsys):
-    assert main(["dataset"]) == 2
-    assert main(["dataset", "--help"]) == 0
-    text = capsys.readouterr().out
-    assert "Usage: surgicai-vision dataset COMMAND" in text
-    assert all(f"│ {command} " in text for command in dataset.COMMANDS)
+    for group, package in GROUPS.items():
+        assert main([group]) == 2
+        capsys.readouterr()
+        assert main([group, "--help"]) == 0
+        text = capsys.readouterr().out
+        assert f"Usage: surgicai-vision {group} COMMAND" in text
+        assert all(f"│ {command} " in text for command in package.COMMANDS)
 
 
 def test_help_imports_nothing_heavy():
@@ -91,7 +94,8 @@ def test_help_of_all_imports_no_command():
         "from surgicai_vision.commands.main import main\n"
         "with contextlib.redirect_stdout(io.StringIO()):\n"
         "    main(['--help'])\n"
-        "print(sorted(name for name in sys.modules if name.startswith('surgicai_vision.commands.')))"
+        "package = 'surgicai_vision.commands.'\n"
+        "print(sorted(name for name in sys.modules if name.startswith(package)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == str(

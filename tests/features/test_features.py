@@ -94,7 +94,7 @@ def test_damaged_progress_starts_over(tmp_path: Path) -> None:
     np.testing.assert_array_equal(entry.rows, expected())
 
 
-@pytest.mark.parametrize("change", ["dataset", "convert", "encoder"])
+@pytest.mark.parametrize("change", ["dataset", "view", "encoder"])
 def test_a_change_never_meets_an_old_entry(tmp_path: Path, change: str) -> None:
     first = encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
     dataset = replace(FakeDataset(), fingerprint="other") if change == "dataset" else FakeDataset()
