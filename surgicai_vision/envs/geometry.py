@@ -13,7 +13,7 @@ below the horizontal. A circle of the needle's radius R through both centres has
 21° off the holes' axes. No rigid arc of this radius is perpendicular at both holes, so the needle
 starts perpendicular at the entry (place), turns those 21° about its tip while the tip enters, then
 follows the circle. In the 3.8 mm openings the needle's skin keeps at least 0.7 mm of clearance all
-the way (0.71 to 0.82 mm by pair; `tests/test_scene.py` measures it).
+the way (0.71 to 0.82 mm by pair; `tests/scene/test_scene.py` measures it).
 
 Room for PSM2's jaws: at the end of the insertion the needle's point at
 `angle_at_entry(INSERT_ANGLE, INSERT_DEPTH)` is in the entry, 100° - 11.3° - 2 asin(gap / 2R), and

@@ -30,7 +30,7 @@ def test_gymnasium_accepts_every_env(task, obs_type):
     env.close()
 
 
-def test_render_gives_a_image():
+def test_render_gives_an_image():
     env = gymnasium.make(names.ENV_IDS["grasp"], render_mode="rgb_array")
     env.reset(seed=0)
     image = env.render()
