@@ -82,7 +82,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     rows = []
     with (
         console.stage("rendering", "views") as progress,
-        contact_sheet.stage(config, options.size, options.quality) as see,
+        contact_sheet.state_renderer(config, options.size, options.quality) as see,
     ):
         for done, view in enumerate(options.view):
             rows.append(
@@ -128,7 +128,7 @@ def _film(path: Path, options: Options, console: Console) -> dict[str, object]:
                 episode.film.states[round(last * share / (FILM_FRAMES - 1))]
                 for share in range(FILM_FRAMES)
             ]
-            with contact_sheet.stage(config, options.size, options.quality) as see:
+            with contact_sheet.state_renderer(config, options.size, options.quality) as see:
                 rows.append(
                     (subtask, [see(state, options.view[0], names.RGB) for state in moments])
                 )

@@ -42,7 +42,7 @@ class Draw(Protocol):
 
 
 @contextmanager
-def stage(config: TaskConfig, size: int, quality: str = "high") -> Iterator[Draw]:
+def state_renderer(config: TaskConfig, size: int, quality: str = "high") -> Iterator[Draw]:
     """Yield what draws states of a task's env."""
     env = make(config, obs_type="state")
     env.reset(seed=0)

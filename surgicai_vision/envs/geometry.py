@@ -20,7 +20,7 @@ Room for PSM2's jaws: at the end of the insertion the needle's point at
 the jaws, `PAD_WIDTH` wide, must still be outside. With the `EXTRA` drive that makes room for PSM1
 this leaves grasps up to 27° in `simple` and up to 8° to 15° in `3dmed_straight` (gaps 9.8 to 10.9
 mm): there PSM2 grasps nearer the base. The gaps of `3dmed` (12.2 to 14.1 mm, 74° to 88° of the
-needle's 120°) leave less than nothing: a third of this needle cannot stand out of the exit while
+needle's 120°) leave no room: a third of this needle cannot stand out of the exit while
 PSM2 holds its base. Those holes are for their challenge's needle of 133°. In `3dmed` grasp and
 place are possible; what follows is refused.
 """
@@ -45,23 +45,19 @@ GRASP_SIGNS = {PSM1: -1.0, PSM2: 1.0}
 WOUND = np.array([0.0, 1.0, 0.0])
 """Direction of the wound in world: the normal of the needle's plane during the stitch."""
 INSERT_ANGLE = math.radians(100.0)
-"""The needle's point that the insertion brings to `INSERT_DEPTH` beyond the exit (released
-code).
-"""
+"""The needle's point that the insertion brings beyond the exit (released code)."""
 INSERT_DEPTH = 0.002
+"""How far beyond the exit it brings it [m]."""
 EXTRA = 0.0014
-"""How far the expert drives the insertion past its goal where the episode lets it [m]: room for
-PSM1's jaws.
-"""
+"""How far the expert goes on past that goal, to make room for PSM1's jaws [m]."""
 FIRST_GRASP = math.radians(6.5)
 """Needle angle from which on a grasp off by its error has the needle between the pads."""
 HANDOFF_ANGLE = math.radians(105.0)
 """The needle's point that PSM1 grasps (released code)."""
 PULLOUT_SHIFT = np.array([0.030, 0.0, 0.030])
+"""End of the pull-out from the exit [m, world] (released code)."""
 PULLOUT_TURN = math.radians(-50.0)
-"""End of the pull-out: the exit shifted by `PULLOUT_SHIFT`, the handoff grasp turned about y
-(released code).
-"""
+"""Rotation of the handoff grasp about y at that end (released code)."""
 
 
 def grasp_in_needle(

@@ -18,8 +18,9 @@ from surgicai_vision.scene.kinematics import Pose
 DRIVEN = (0.0, 0.002)
 """How far the insertion went past its goal [m]: room for PSM1's jaws beside the exit."""
 OFF_PATH = 0.0003
+"""Scatter of the inserted needle about the circle [m], inside the openings' clearance."""
 OFF_TURN = math.radians(2.0)
-"""Scatter of the inserted needle about the circle [m, rad], inside the openings' clearance."""
+"""Scatter of its rotation [rad]."""
 
 STRAIGHT = math.radians(4.0)
 """How far the grip may have turned the needle when it closed [rad]."""

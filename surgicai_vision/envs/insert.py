@@ -16,8 +16,9 @@ from surgicai_vision.scene import needle
 from surgicai_vision.scene.kinematics import Pose
 
 START_SHIFT = 0.0055
+"""How far the tip may be off the entry at the start [m] (paper)."""
 START_TURN = math.radians(12.0)
-"""How far the tip may be off the entry at the start (paper)."""
+"""How far the needle may be turned then [rad] (paper)."""
 
 
 class Insert(Subtask):

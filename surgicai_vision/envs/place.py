@@ -22,8 +22,9 @@ from surgicai_vision.scene import needle
 from surgicai_vision.scene.kinematics import Pose
 
 GRASP_SHIFT = 0.0015
+"""How far PSM2's grasp may be off at the start of place and insert [m] (paper)."""
 GRASP_TILT = math.radians(12.0)
-"""How far PSM2's grasp may be off at the start of place and insert (paper)."""
+"""How far it may be tilted then [rad] (paper)."""
 
 
 def draw_psm2_grasp(

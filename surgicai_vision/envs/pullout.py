@@ -16,8 +16,9 @@ from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
 from surgicai_vision.scene.kinematics import Pose
 
 GRASP_SHIFT = 0.0015
+"""How far PSM1's grasp may be off at the start [m] (paper)."""
 GRASP_TILT = math.radians(20.0)
-"""How far PSM1's grasp may be off at the start (paper)."""
+"""How far it may be tilted then [rad] (paper)."""
 RETREAT = 0.025
 """How far PSM2 is drawn back along its axis after it let go [m]."""
 RELEASED_JAW = 0.5

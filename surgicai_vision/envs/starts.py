@@ -23,18 +23,15 @@ Matrix = NDArray[np.float64]
 SETTLE = 60
 """Physics steps (2 ms) a start state settles."""
 REST_SPEED = 0.010
+"""A held needle faster than this [m/s] is slipping out, as after one closing of the jaws in 150."""
 REST_TURN = 1.0
-"""A held needle faster than this [m/s, rad/s] is slipping out: one closing of the jaws in 150 does
-that.
-"""
+"""The same for its rotation [rad/s]."""
 CLOSED_JAW = (needle.BODY_RADIUS - PAD_OFFSET) / GRASP_DEPTH
 """Finger angle [rad] at which the pads touch the needle."""
 GRASP_ANGLES = (math.radians(5.0), math.radians(20.0))
 """Needle angle of PSM2's grasp (released code, Approach)."""
 SAFE_ANGLES = (FIRST_GRASP, math.radians(27.0))
-"""Where a grasp off by its error still has the needle between the pads and passes the entry of
-`simple`.
-"""
+"""Needle angles at which an imperfect grasp still holds the needle and passes the entry."""
 
 
 class GraspError(NamedTuple):
@@ -51,10 +48,8 @@ class GraspError(NamedTuple):
 def draw_grasp_error(rng: np.random.Generator, shift: float, angle: float) -> GraspError:
     """Draw how far a grasp is off: at most `shift` [m] and `angle` [rad].
 
-    The shift is along the needle and in depth, the angle about two axes.
-
-    The third rotation and the third translation do not exist: the jaws' flat pads take them away on
-    closing.
+    The shift is along the needle and in depth, the angle about two axes. The jaws' flat pads take
+    the third translation and the third rotation away when they close.
     """
     along = rng.uniform(-shift, shift)
     depth = rng.uniform(-0.6, 0.2) * math.sqrt(shift**2 - along**2)

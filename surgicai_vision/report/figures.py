@@ -87,7 +87,7 @@ def _strip(choice: Choice | None, kind: str) -> dict[str, object]:
     condition = choice.group.condition
     view = next(iter(condition.views), "front")
     film = read_film(choice.result.folder, row["seed"])
-    with contact_sheet.stage(choice.result.config, SIZE) as image:
+    with contact_sheet.state_renderer(choice.result.config, SIZE) as image:
         frames = [
             {"step": int(step), "data": _data(contact_sheet.jpeg(image(state, *sight(view))))}
             for step, state in zip(film.steps, film.states, strict=True)
@@ -132,7 +132,7 @@ def _views(groups: Sequence[Group]) -> list[dict[str, object]]:
     film = read_film(chosen.result.folder, chosen.row["seed"])
     start = chosen.row["seed"]
     views: list[dict[str, object]] = []
-    with contact_sheet.stage(chosen.result.config, SIZE) as image:
+    with contact_sheet.state_renderer(chosen.result.config, SIZE) as image:
         for view in shown:
             frames = {
                 modality: image(film.states[0], view, modality) for modality in names.MODALITIES

@@ -176,7 +176,7 @@ def _render(choices: Sequence[Choice]) -> Iterator[Strip]:
     for choice in choices:
         scenes.setdefault(repr(sorted(to_mapping(choice.result.config).items())), []).append(choice)
     for members in scenes.values():
-        with contact_sheet.stage(members[0].result.config, SIZE, "fast") as image:
+        with contact_sheet.state_renderer(members[0].result.config, SIZE, "fast") as image:
             for choice in members:
                 strip = _strip(choice, image)
                 if strip is not None:

@@ -32,13 +32,17 @@ USER_DATA = 176
 state.
 """
 
+# Collision bits.
 SURFACES = 1
+"""Needle on tissue."""
 GRIP = 2
+"""Needle in jaws."""
 FIRM = 4
+"""Instruments on firm tissue."""
 ARMS = 8
+"""Instrument on instrument."""
 THREAD = 16
-"""Collision bits: needle on tissue, needle in jaws, instruments on firm tissue, instrument on
-instrument, thread on tissue and instruments."""
+"""Thread on tissue and instruments."""
 
 
 @dataclass(frozen=True)
