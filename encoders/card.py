@@ -36,8 +36,8 @@ class EncoderCard:
         note: what a user must know before comparing it with others.
         layers: where each pool's feature is taken.
         channel_order: order in which the channels are handed to the network, "RGB" or "BGR".
-        batch: images a CPU thread computes at once; few where maps are large, lest they leave its
-            cache.
+        batch: images a CPU thread computes at once; few where maps are large, so that they stay in
+            its cache.
     """
 
     name: str

@@ -61,8 +61,8 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     if path is None:
         raise BadFile(f"Encoder '{card.name}' needs a weights file.")
     name = card.architecture.removeprefix("timm ")
-    # A size other than the one trained at has to be told to networks with position embeddings, and
-    # only them.
+    # Networks with position embeddings, and only they, take an image size other than that of their
+    # training as an argument.
     resized = {} if card.input_size == _trained_size(name) else {"img_size": card.input_size}
     with torch.random.fork_rng(devices=[]):
         try:

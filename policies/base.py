@@ -225,7 +225,7 @@ class Policy(nn.Module, abc.ABC):
 
     @final
     def train(self, mode: bool = True) -> "Policy":
-        """Switch to training or evaluation; the copy that acts is made anew afterwards."""
+        """Switch to training or evaluation; the copy that acts is made again later."""
         object.__setattr__(self, "_exact", None)
         super().train(mode)
         return self

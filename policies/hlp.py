@@ -17,10 +17,12 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
 
 AHEAD = 10
-"""Frames by which labels are ahead. In our recordings a subtask goes on for 15 frames after its
-success, while hardly anything moves; labelled as they stand, its last frame and the first of the
-next subtask could not be told apart, and a policy asked there would name the old one for ever. What
-is due there is the next."""
+"""Frames by which labels are ahead.
+
+In our recordings a subtask continues for 15 frames after its success, while hardly anything moves.
+Without the shift its last frames and the first of the next subtask would look alike with different
+labels, and a policy would name the old subtask for ever; what is due there is the next one.
+"""
 
 
 @final

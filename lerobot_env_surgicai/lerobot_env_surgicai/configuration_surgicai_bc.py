@@ -22,7 +22,8 @@ class SurgicaiBcConfig(PreTrainedConfig):
 
     Attributes:
         encoder: frozen encoder of the images; null sees no image.
-        encoder_weights: file with its pretrained weights, where it needs one that is not at hand.
+        encoder_weights: file with its pretrained weights, where it needs one that is not found
+            by itself.
         encoder_pool: "global", "spatial" or "tokens".
         encoder_sha256: hash of the encoder's weights; written in training, verified afterwards.
         encoder_identity: hash of weights, preprocessing and pool; written in training, verified

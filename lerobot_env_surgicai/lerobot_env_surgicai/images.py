@@ -13,7 +13,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.features import encoders
-from surgicai_vision.training.checkpoint import SEEN
+from surgicai_vision.training.checkpoint import PREPROCESSING
 
 
 class FrameEncoder(Protocol):
@@ -38,7 +38,7 @@ def identity(encoder: Encoder) -> str:
     plain = {
         "weights": encoder.weights_sha256,
         "pool": encoder.pool,
-        **{key: card[key] for key in SEEN},
+        **{key: card[key] for key in PREPROCESSING},
     }
     return digest(plain)
 
@@ -68,7 +68,7 @@ def as_uint8(images: torch.Tensor) -> np.ndarray:
 
 @final
 class FeatureMemory:
-    """An encoder that encodes an image once: LeRobot shows every image anew in each epoch.
+    """An encoder that encodes each image once; LeRobot decodes every image again in each epoch.
 
     An image is known by the hash of its bytes, so another dataset or an augmented image is never
     mistaken for it. Features are kept as the float16 values they are (`encoders.base`), nothing is

@@ -73,7 +73,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
 
         Raises:
             BadFile: the weights are damaged or of another network.
-            InputError: the encoder at hand is not the one it was trained on.
+            InputError: this is not the encoder it was trained on.
         """
         try:
             return super().from_pretrained(pretrained_name_or_path, strict=strict, **arguments)

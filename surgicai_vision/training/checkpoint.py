@@ -189,7 +189,7 @@ def read_tensors(checkpoint: Checkpoint) -> "dict[str, torch.Tensor]":
         raise BadFile(f"{path} is not a safetensors file ({error}); train again.") from None
 
 
-SEEN = ("input_size", "input_range", "mean", "std", "interpolation", "channel_order")
+PREPROCESSING = ("input_size", "input_range", "mean", "std", "interpolation", "channel_order")
 """Entries of a card that change what the network sees."""
 
 
@@ -209,12 +209,12 @@ def check_encoder(checkpoint: Checkpoint, encoder: "Encoder | None") -> None:
     given = {
         "weights": encoder.weights_sha256,
         "pool": encoder.pool,
-        **{key: card[key] for key in SEEN},
+        **{key: card[key] for key in PREPROCESSING},
     }
     trained = {
         "weights": wanted.weights_sha256,
         "pool": wanted.pool,
-        **{key: wanted.card[key] for key in SEEN},
+        **{key: wanted.card[key] for key in PREPROCESSING},
     }
     for key, value in trained.items():
         if given[key] != value:
