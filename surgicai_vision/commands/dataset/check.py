@@ -22,7 +22,7 @@ class Options:
     """Options of `dataset check`.
 
     Attributes:
-        dataset: A dataset that render-demos made; for any other LeRobot dataset see lerobot-salvage.
+        dataset: A dataset that render-demos made; lerobot-salvage checks any other.
     """
 
     dataset: Annotated[Path, DIRECTORY] = field(kw_only=False)

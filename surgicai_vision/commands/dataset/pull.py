@@ -24,7 +24,7 @@ class Options:
     """Options of `dataset pull`.
 
     Attributes:
-        repo: A LeRobot v3 dataset on the Hub.
+        repo: A dataset on the Hub that dataset push shared.
         out: Folder to make.
         revision: Branch, tag or commit.
     """
