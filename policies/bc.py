@@ -26,7 +26,8 @@ class BCPolicy(Policy):
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
         """Return actions (B, 7) in [-1, 1] for normalised inputs."""
-        return self.network(observed).tanh()
+        answers: torch.Tensor = self.network(observed)
+        return answers.tanh()
 
     def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the mean squared error of the actions (B, 7)."""

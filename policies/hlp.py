@@ -9,6 +9,7 @@ from typing import final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from policies.base import Inputs, Plugin, Policy, Recipe
@@ -37,19 +38,22 @@ class HighLevelPolicy(Policy):
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
         """Return the logits (B, 5) of the subtasks for normalised inputs."""
-        return self.network(observed)
+        logits: torch.Tensor = self.network(observed)
+        return logits
 
     def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the cross-entropy against phases (B,) int64."""
         return nn.functional.cross_entropy(self(observed), target)
 
-    def choose(self, features: np.ndarray | None, both_arms: np.ndarray) -> np.ndarray:
+    def choose(
+        self, features: NDArray[np.float32] | None, both_arms: NDArray[np.float32]
+    ) -> NDArray[np.int64]:
         """Return the subtask that is due for a batch as `act` takes it.
 
         Returns:
             (B,) indices in `names.SUBTASKS`.
         """
-        return self.act(features, both_arms).argmax(axis=1)
+        return np.asarray(self.act(features, both_arms).argmax(axis=1), np.int64)
 
 
 HLP = Plugin("hlp", Recipe, HighLevelPolicy, names.PHASE, AHEAD)

@@ -54,7 +54,8 @@ class SpatialSoftmax(nn.Module):
             (B, 2 · POINTS): x and y in [-1, 1].
         """
         scores = self.patterns(rows.unflatten(1, self.shape)).flatten(2).softmax(dim=2)
-        return (scores @ self.places).flatten(1)
+        places: torch.Tensor = scores @ self.places
+        return places.flatten(1)
 
 
 @final
@@ -85,7 +86,8 @@ class MapConvolutions(nn.Module):
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Return (B, `FEATURES`) for flattened maps (B, C·h·w)."""
-        return self.layers(rows.unflatten(1, self.shape))
+        numbers: torch.Tensor = self.layers(rows.unflatten(1, self.shape))
+        return numbers
 
 
 @final
@@ -101,7 +103,9 @@ class TokenAttention(nn.Module):
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Return the weighted mean token (B, C) for flattened tokens (B, N·C)."""
         tokens = rows.unflatten(1, self.shape)
-        return (self.query(tokens).softmax(dim=1) * tokens).sum(dim=1)
+        weights: torch.Tensor = self.query(tokens).softmax(dim=1)
+        mean: torch.Tensor = (weights * tokens).sum(dim=1)
+        return mean
 
 
 Head = GlobalFeature | SpatialSoftmax | MapConvolutions | TokenAttention
@@ -149,4 +153,5 @@ class FeatureMLP(nn.Module):
         sizes = [math.prod(shape) for shape in self.inputs.visual]
         *rows, vector = observed.split([*sizes, self.inputs.dim - self.inputs.features], dim=1)
         seen = [head(row) for head, row in zip(self.heads, rows, strict=True)]
-        return self.layers(torch.cat([*seen, vector], dim=1))
+        answers: torch.Tensor = self.layers(torch.cat([*seen, vector], dim=1))
+        return answers

@@ -17,7 +17,7 @@ from surgicai_vision.training import policies
 
 @PreTrainedConfig.register_subclass("surgicai_bc")
 @dataclass
-class SurgicaiBcConfig(PreTrainedConfig):
+class SurgicaiBcConfig(PreTrainedConfig):  # type: ignore[misc]  # mypy skips LeRobot
     """Settings of `surgicai_bc`; the defaults are the recipe "paper" (configs/recipes/paper.yaml).
 
     Attributes:
@@ -68,13 +68,14 @@ class SurgicaiBcConfig(PreTrainedConfig):
 
     def recipe(self) -> Recipe:
         """Return the same settings as a recipe of `bc`."""
-        return replace(
+        recipe: Recipe = replace(
             policies.load_recipe("bc", "paper"),
             hidden=tuple(self.hidden),
             batch_norm=self.batch_norm,
             proprioception=self.proprioception,
             learning_rate=self.learning_rate,
         )
+        return recipe
 
     def validate_features(self) -> None:
         """Keep the inputs this policy takes and drop the rest (depth, segmentation, other views).

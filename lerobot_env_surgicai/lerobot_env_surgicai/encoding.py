@@ -13,7 +13,7 @@ from surgicai_vision.core import names
 
 @ProcessorStepRegistry.register("surgicai_encode_views")
 @dataclass
-class EncodeViews(ObservationProcessorStep):
+class EncodeViews(ObservationProcessorStep):  # type: ignore[misc]  # mypy skips LeRobot
     """Replace the views' images by their features.
 
     They are `observation.environment_state`, (B, views × dim).

@@ -22,6 +22,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from numpy.typing import NDArray
 
 from lerobot_env_surgicai.encoding import EncodeViews
 from surgicai_vision.core import names
@@ -38,7 +39,7 @@ TASK_FIELDS = tuple(field.name for field in dataclasses.fields(TaskConfig))
 
 @EnvConfig.register_subclass("surgicai")
 @dataclass
-class SurgicaiEnv(EnvConfig):
+class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
     """An env of surgicai-vision.
 
     What is None is taken from `dataset`, and without one is the default of `TaskConfig`, two views
@@ -180,7 +181,8 @@ def make_one(gym_id: str, disable_env_checker: bool, arguments: dict[str, Any]) 
     A function of this module, so that a worker process that unpickles it registers the ids.
     """
     env = gymnasium.make(gym_id, disable_env_checker=disable_env_checker, **arguments)
-    return FreezeAfterEpisodeEnd(NestImages(env))
+    frozen: gymnasium.Env = FreezeAfterEpisodeEnd(NestImages(env))
+    return frozen
 
 
 class NestImages(gymnasium.ObservationWrapper):
@@ -195,7 +197,7 @@ class NestImages(gymnasium.ObservationWrapper):
             {"pixels": spaces.Dict(images), AGENT_POS: flat[AGENT_POS]}
         )
 
-    def observation(self, observation: dict[str, np.ndarray]) -> dict[str, object]:
+    def observation(self, observation: dict[str, NDArray[np.float32]]) -> dict[str, object]:
         """Return the observation with its images under "pixels"."""
         images = {view: frame for view, frame in observation.items() if view != AGENT_POS}
         return {"pixels": images, AGENT_POS: observation[AGENT_POS]}

@@ -7,6 +7,7 @@ from typing import Protocol, final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from encoders.base import Encoder
 from surgicai_vision.core import names
@@ -19,7 +20,7 @@ from surgicai_vision.training.checkpoint import PREPROCESSING
 class FrameEncoder(Protocol):
     """What encodes frames: an encoder, or a `FeatureMemory` of one."""
 
-    def __call__(self, frames: np.ndarray) -> np.ndarray:
+    def __call__(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the features (B, dim) float32 of images (B, H, W, 3) uint8."""
 
 
@@ -57,7 +58,7 @@ def check_identity(encoder: Encoder, weights_sha256: str, wanted: str, where: st
         )
 
 
-def as_uint8(images: torch.Tensor) -> np.ndarray:
+def as_uint8(images: torch.Tensor) -> NDArray[np.uint8]:
     """Return (B, 3, H, W) float images in [0, 1] as (B, H, W, 3) uint8.
 
     Images that were uint8 come back exactly.
@@ -81,17 +82,17 @@ class FeatureMemory:
 
     def __init__(self, encoder: FrameEncoder, limit: int = 2 << 30):
         self._encoder = encoder
-        self._rows: dict[bytes, np.ndarray] = {}
+        self._rows: dict[bytes, NDArray[np.float16]] = {}
         self._left = limit
 
-    def __call__(self, frames: np.ndarray) -> np.ndarray:
+    def __call__(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the features (B, dim) float32 of images (B, H, W, 3) uint8."""
         keys = [
             hashlib.blake2b(np.ascontiguousarray(frame).data, digest_size=16).digest()
             for frame in frames
         ]
         new = {key: at for at, key in enumerate(keys) if key not in self._rows}
-        fresh: dict[bytes, np.ndarray] = {}
+        fresh: dict[bytes, NDArray[np.float16]] = {}
         if new:
             rows = self._encoder(frames[list(new.values())]).astype(np.float16)
             fresh = dict(zip(new, rows, strict=True))
@@ -106,7 +107,7 @@ class FeatureMemory:
 
 def encode(
     encoder: FrameEncoder, batch: Mapping[str, torch.Tensor], views: Sequence[str]
-) -> np.ndarray:
+) -> NDArray[np.float32]:
     """Return the features of the views side by side, (B, views × dim) float32."""
     return np.concatenate(
         [encoder(as_uint8(batch[names.image_key(view)])) for view in views], axis=1

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
+from numpy.typing import NDArray
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
@@ -33,7 +34,7 @@ from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.training import policies
 
 
-class SurgicaiBcPolicy(PreTrainedPolicy):
+class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips LeRobot
     """Behaviour cloning: frozen features and the tip's pose in, one action out.
 
     Attributes:
@@ -76,12 +77,15 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
             InputError: this is not the encoder it was trained on.
         """
         try:
-            return super().from_pretrained(pretrained_name_or_path, strict=strict, **arguments)
+            policy: SurgicaiBcPolicy = super().from_pretrained(
+                pretrained_name_or_path, strict=strict, **arguments
+            )
         except (RuntimeError, SafetensorError) as error:
             reason = " ".join(str(error).split())[:200]
             raise BadFile(
                 f"{pretrained_name_or_path} holds no whole weights of surgicai_bc ({reason})."
             ) from None
+        return policy
 
     def get_optim_params(self) -> Iterator[nn.Parameter]:
         """Return the parameters that are trained: the network's."""
@@ -136,7 +140,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):
 
     def _features(
         self, batch: dict[str, Tensor], encoder: FrameEncoder | None
-    ) -> np.ndarray | None:
+    ) -> NDArray[np.float32] | None:
         """Return the views' features side by side (B, F) float32; None without images."""
         if encoder is None:
             return None

@@ -21,4 +21,7 @@ def make_surgicai_bc_pre_post_processors(
         std = torch.as_tensor(statistics[OBS_STATE]["std"])
         std = torch.where(std < SMALLEST_STD, torch.ones_like(std), std)
         statistics[OBS_STATE] = {**statistics[OBS_STATE], "std": std}
-    return make_default_pre_post_processors(config, statistics)
+    before: PolicyProcessorPipeline
+    after: PolicyProcessorPipeline
+    before, after = make_default_pre_post_processors(config, statistics)
+    return before, after

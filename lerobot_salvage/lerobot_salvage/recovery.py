@@ -131,7 +131,7 @@ def recover(path: Path, sample: pa.Table, to: Path, writing: Writing = LEROBOT) 
     pq.write_table(
         sample,
         buffer,
-        compression=writing.compression,  # type: ignore[arg-type]
+        compression=writing.compression,
         use_dictionary=writing.dictionary,
     )
     footer = _footer(buffer.getvalue())

@@ -133,7 +133,8 @@ def _write(kind: int, value: Any) -> bytes:
     if kind == DOUBLE:
         return struct.pack("<d", value)
     if kind == BINARY:
-        return _write_unsigned(len(value)) + value
+        content: bytes = value
+        return _write_unsigned(len(content)) + content
     if kind == STRUCT:
         return write_struct(value)
     element, values = value

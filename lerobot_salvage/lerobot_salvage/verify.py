@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from lerobot_salvage.recovery import open_or_recover
 from surgicai_vision.core import names
@@ -124,7 +125,7 @@ class Verifier:
         return [name for name in table.column_names if name not in self.files.image_keys]
 
     def _shape(self, key: str) -> tuple[int, ...]:
-        return self.files.features.get(key, {"shape": (1,)})["shape"]
+        return tuple(self.files.features.get(key, {"shape": (1,)})["shape"])
 
     def _digested(self) -> list[str]:
         """Return the image columns of a dataset of ours, in the order of its digest."""
@@ -133,7 +134,9 @@ class Verifier:
         options = (self.ours["views"], self.ours["depth"], self.ours["segmentation"])
         return [key for key, _, _ in schema.image_keys(*options)]
 
-    def _check_indices(self, number: int, start: int, columns: Mapping[str, np.ndarray]) -> None:
+    def _check_indices(
+        self, number: int, start: int, columns: Mapping[str, NDArray[np.generic]]
+    ) -> None:
         count = len(columns["index"])
         expected = {
             "episode_index": np.full(count, number),
@@ -148,8 +151,8 @@ class Verifier:
                 )
         if not np.allclose(columns["timestamp"], np.arange(count) / self.files.fps, atol=1e-3):
             raise _Unfit(f"its timestamp is not frame_index / {self.files.fps:g}.")
-        for key, values in columns.items():
-            if values.dtype.kind == "f" and not np.isfinite(values).all():
+        for key, column in columns.items():
+            if column.dtype.kind == "f" and not np.isfinite(column).all():
                 raise _Unfit(f"{key} holds numbers that are not finite.")
         rows = self.files.rows
         if number < len(rows) and rows[number].get("length") != count:
@@ -161,7 +164,7 @@ class Verifier:
         self,
         key: str,
         table: pa.Table,
-        columns: Mapping[str, np.ndarray],
+        columns: Mapping[str, NDArray[np.generic]],
         digest: schema.EpisodeDigest,
     ) -> tuple[pa.Table, Statistics]:
         """Verify one image column; return the table with the bytes of images that lay beside it."""
@@ -181,19 +184,21 @@ class Verifier:
         return table.set_column(table.schema.get_field_index(key), key, column), statistics.result()
 
     def _watch(
-        self, key: str, columns: Mapping[str, np.ndarray], lossless: bool
+        self, key: str, columns: Mapping[str, NDArray[np.generic]], lossless: bool
     ) -> ImageWatch | None:
         if not self.ours:
             return None
         return ImageWatch(key, self.ours["image_size"], self.ours["views"], columns, lossless)
 
-    def _look(self, watch: ImageWatch | None, key: str, index: int, frame: np.ndarray) -> None:
+    def _look(
+        self, watch: ImageWatch | None, key: str, index: int, frame: NDArray[np.uint8 | np.float32]
+    ) -> None:
         """Refuse an image that a dataset of ours cannot hold."""
         problem = watch.problem(index, frame) if watch else ""
         if problem:
             raise _Unfit(f"frame {index} of {key}: {problem}.")
 
-    def _check_shape(self, key: str, index: int, frame: np.ndarray) -> None:
+    def _check_shape(self, key: str, index: int, frame: NDArray[np.uint8 | np.float32]) -> None:
         shape = self._shape(key)
         if frame.shape not in (shape, (*shape[1:], shape[0])):
             raise _Unfit(f"frame {index} of {key} is {frame.shape}, not {shape}.")
@@ -206,7 +211,11 @@ class Verifier:
         return path.read_bytes()
 
     def _video(
-        self, key: str, number: int, columns: Mapping[str, np.ndarray], digest: schema.EpisodeDigest
+        self,
+        key: str,
+        number: int,
+        columns: Mapping[str, NDArray[np.generic]],
+        digest: schema.EpisodeDigest,
     ) -> tuple[tuple[int, float, float], Statistics | None]:
         """Verify an episode's frames in a video; return where they are and their statistics."""
         count = len(columns["index"])
@@ -275,7 +284,7 @@ def _contents(column: pa.ChunkedArray) -> list[tuple[bytes | None, str | None]]:
     return list(zip(content, pc.struct_field(whole, "path").to_pylist(), strict=True))
 
 
-def _array(column: pa.ChunkedArray, features: Features, key: str) -> np.ndarray:
+def _array(column: pa.ChunkedArray, features: Features, key: str) -> NDArray[np.generic]:
     """Return a column as (T,), (T, n), … ; text as objects."""
     if column.null_count:
         raise _Unfit(f"{key} has {column.null_count} values missing.")
@@ -291,7 +300,7 @@ def _array(column: pa.ChunkedArray, features: Features, key: str) -> np.ndarray:
     return values.reshape(whole)
 
 
-def _statistics(values: np.ndarray, shape: tuple[int, ...]) -> Statistics:
+def _statistics(values: NDArray[np.generic], shape: tuple[int, ...]) -> Statistics:
     """Return a column's statistics over all axes but the last, as LeRobot's."""
     table = column_statistics(values.reshape(-1, shape[-1]))
     return {**table, "count": [len(values)]}

@@ -23,6 +23,7 @@ from surgicai_vision.core.tasks import SUBTASK_STEPS, check_task, task_steps
 if TYPE_CHECKING:
     import numpy as np
     from _typeshed import DataclassInstance
+    from numpy.typing import NDArray
 
 T = TypeVar("T")
 
@@ -224,7 +225,8 @@ def convert(hint: object, value: object, where: str) -> object:
 
 def to_mapping(config: "DataclassInstance") -> dict[str, JSON]:
     """Return a frozen dataclass as plain JSON data."""
-    return json.loads(json.dumps(dataclasses.asdict(config)))
+    plain: dict[str, JSON] = json.loads(json.dumps(dataclasses.asdict(config)))
+    return plain
 
 
 def read_changes(texts: Iterable[str]) -> dict[str, JSON]:
@@ -272,7 +274,7 @@ def check_frame_stride(frame_stride: int) -> None:
         )
 
 
-def clock(steps: "np.ndarray") -> "np.ndarray":
+def clock(steps: "NDArray[np.int64]") -> "NDArray[np.float32]":
     """Encode the control steps (N,) since a subtask began for a policy, as (N, 3) float32.
 
     The share of `SUBTASK_STEPS`, and sine and cosine of a hand that goes round once in

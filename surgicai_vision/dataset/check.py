@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, first_line
@@ -99,7 +100,7 @@ def first_problems(problems: list[str]) -> tuple[str, ...]:
 
 
 def _check_order(
-    dataset: RenderedDataset, columns: Mapping[str, np.ndarray], problems: list[str]
+    dataset: RenderedDataset, columns: Mapping[str, NDArray[np.generic]], problems: list[str]
 ) -> None:
     """Check the index columns and the ends of the episodes."""
     if not np.array_equal(columns["index"], np.arange(dataset.length)):
@@ -119,7 +120,7 @@ def _check_order(
 
 def _check_lerobot(
     dataset: RenderedDataset,
-    columns: Mapping[str, np.ndarray],
+    columns: Mapping[str, NDArray[np.generic]],
     keys: list[str],
     problems: list[str],
 ) -> None:
@@ -149,7 +150,9 @@ def _check_lerobot(
     )
 
 
-def _check_statistics(key: str, recorded: object, values: np.ndarray, problems: list[str]) -> None:
+def _check_statistics(
+    key: str, recorded: object, values: NDArray[np.generic], problems: list[str]
+) -> None:
     """Check a column's recorded statistics against its values."""
     if not isinstance(recorded, dict):
         problems.append(f"meta/stats.json: no statistics of {key}.")
@@ -168,7 +171,7 @@ def _check_episode(
     keys: list[str],
     start: int,
     stop: int,
-    rows: Mapping[str, np.ndarray],
+    rows: Mapping[str, NDArray[np.generic]],
     problems: list[str],
 ) -> str:
     """Check one episode's images; return the digest of its content."""
@@ -187,7 +190,7 @@ def _check_episode(
 
 def _frames(
     dataset: RenderedDataset, key: str, start: int, stop: int, problems: list[str]
-) -> Iterator[np.ndarray]:
+) -> Iterator[NDArray[np.uint8 | np.float32]]:
     """Yield an episode's images of one column; those before the first that cannot be decoded."""
     try:
         yield from dataset.decoded(key, start, stop)

@@ -4,6 +4,7 @@ from collections.abc import Buffer
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import BadFile
 
@@ -17,7 +18,7 @@ filter chosen for each row and run lengths it is 1 % smaller and takes 1.5 times
 level 6 is 6 % smaller and takes seven times as long."""
 
 
-def encode(frame: np.ndarray) -> bytes:
+def encode(frame: NDArray[np.uint8 | np.float32]) -> bytes:
     """Encode an image.
 
     Args:
@@ -47,13 +48,13 @@ The needle, the instruments and the phantom's middle are within them in every ca
 """
 
 
-def grey(depth: np.ndarray) -> np.ndarray:
+def grey(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return depth (…, 1) float32 [m] as a grey image (…, 3) uint8; near is dark."""
     share = (depth - DEPTH_NEAR) * (255 / (DEPTH_FAR - DEPTH_NEAR))
     return np.repeat(np.clip(np.rint(share), 0, 255).astype(np.uint8), 3, axis=-1)
 
 
-def decode(content: Buffer | None, where: str) -> np.ndarray:
+def decode(content: Buffer | None, where: str) -> NDArray[np.uint8 | np.float32]:
     """Decode the buffer of an image to (H, W, 3) uint8 RGB or (H, W, 1) float32.
 
     Raises:
@@ -64,5 +65,7 @@ def decode(content: Buffer | None, where: str) -> np.ndarray:
     if frame is None:
         raise BadFile(f"{where}: its image cannot be decoded.")
     if frame.ndim == 2:
-        return frame[..., None]
-    return cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+        depth: NDArray[np.float32] = frame[..., None]
+        return depth
+    rgb: NDArray[np.uint8] = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+    return rgb

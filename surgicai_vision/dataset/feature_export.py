@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, OutputExists
@@ -27,7 +28,7 @@ from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, assemble,
 
 
 def export_features(
-    dataset: RenderedDataset, rows: Sequence[np.ndarray], about: Table, out: Path
+    dataset: RenderedDataset, rows: Sequence[NDArray[np.floating]], about: Table, out: Path
 ) -> None:
     """Write `out`: the columns of `dataset` and its features, no images.
 
@@ -76,7 +77,7 @@ def export_features(
         assemble(shards, out, features, task_text(dataset.task), meta)
 
 
-def _write_shard(folder: Path, columns: Mapping[str, np.ndarray]) -> Path:
+def _write_shard(folder: Path, columns: Mapping[str, NDArray[np.generic]]) -> Path:
     """Write one episode as `assemble` reads it."""
     folder.mkdir()
     arrays = {key: column_array(values) for key, values in columns.items()}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.config import TaskConfig
 
@@ -53,20 +54,20 @@ class Dataset(Protocol):
         """Hash (hex) of everything the frames and columns depend on."""
 
     @property
-    def episode_index(self) -> np.ndarray:
+    def episode_index(self) -> NDArray[np.int64]:
         """Episode of every frame, (N,) int64, rising."""
 
     def bounds(self) -> list[tuple[int, int]]:
         """Return (first frame, frame after the last) of every episode."""
 
-    def columns(self) -> dict[str, np.ndarray]:
+    def columns(self) -> dict[str, NDArray[np.generic]]:
         """Return every column that is no image, (N,) or (N, n), by its key."""
 
-    def frames(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+    def frames(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
         """Return the images of one of the `sights`, (stop - start, H, W, 3) uint8 RGB."""
 
 
-def episode_bounds(episode_index: np.ndarray) -> list[tuple[int, int]]:
+def episode_bounds(episode_index: NDArray[np.int64]) -> list[tuple[int, int]]:
     """Return (first frame, frame after the last) of every episode in `episode_index`, (N,)."""
     count = len(episode_index)
     starts = [0, *(np.flatnonzero(np.diff(episode_index)) + 1).tolist(), count]

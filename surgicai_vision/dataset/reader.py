@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
@@ -106,9 +107,9 @@ class RenderedDataset:
         return total.hexdigest()
 
     @functools.cached_property
-    def episode_index(self) -> np.ndarray:
+    def episode_index(self) -> NDArray[np.int64]:
         """Episode of every frame, (N,) int64."""
-        return self._column("episode_index")
+        return self._column("episode_index").astype(np.int64, copy=False)
 
     @property
     def sights(self) -> tuple[str, ...]:
@@ -131,28 +132,29 @@ class RenderedDataset:
         """Return (first frame, frame after the last) of every episode."""
         return episode_bounds(self.episode_index)
 
-    def columns(self) -> dict[str, np.ndarray]:
+    def columns(self) -> dict[str, NDArray[np.generic]]:
         """Return every column that is no image, (N,) or (N, n), by its key."""
         keys = (*schema.COLUMNS, "frame_index", "timestamp", "index")
         return {key: self._column(key) for key in keys}
 
-    def frames(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+    def frames(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
         """Return the images of one of the `sights`, (stop - start, H, W, 3) uint8 RGB."""
         if names.is_depth_view(view):
             return codecs.grey(self.depth(names.camera_of(view), start, stop))
-        return self._images(names.image_key(self._view(view)), start, stop)
+        return self._images(names.image_key(self._view(view)), start, stop, np.uint8)
 
-    def depth(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+    def depth(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.float32]:
         """Return the depth images of a view, (stop - start, H, W, 1) float32 [m]."""
         self._check("depth", self.has_depth)
-        return self._images(names.depth_key(self._view(view)), start, stop)
+        return self._images(names.depth_key(self._view(view)), start, stop, np.float32)
 
-    def segmentation(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+    def segmentation(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
         """Return indices in `names.PARTS` of a view's pixels, (stop - start, H, W, 1) uint8."""
         self._check("segmentation", self.has_segmentation)
-        return self._images(names.segmentation_key(self._view(view)), start, stop)[..., :1]
+        key = names.segmentation_key(self._view(view))
+        return self._images(key, start, stop, np.uint8)[..., :1]
 
-    def decoded(self, key: str, start: int, stop: int) -> Iterator[np.ndarray]:
+    def decoded(self, key: str, start: int, stop: int) -> Iterator[NDArray[np.uint8 | np.float32]]:
         """Yield the images start … stop - 1 of a column as they decode, whatever their size."""
         if key in self.video_keys:
             yield from self._from_videos(key, start, stop)
@@ -165,7 +167,9 @@ class RenderedDataset:
                 where = f"{self.path}: {key}, frame {index}"
                 yield codecs.decode(content[index - group.start], where)
 
-    def _from_videos(self, key: str, start: int, stop: int) -> Iterator[np.ndarray]:
+    def _from_videos(
+        self, key: str, start: int, stop: int
+    ) -> Iterator[NDArray[np.uint8 | np.float32]]:
         """Yield the frames start … stop - 1 of a video column."""
         for row in self._rows:
             first = row["dataset_from_index"]
@@ -200,12 +204,12 @@ class RenderedDataset:
         if not present:
             raise BadFile(f"{self.path} holds no {what}; render it again with --{what}.")
 
-    def _column(self, key: str) -> np.ndarray:
+    def _column(self, key: str) -> NDArray[np.generic]:
         """Return one column, (N,) or (N, n)."""
         parts = [self._read(file, None, key) for file in range(len(self._files))]
         column = pa.chunked_array([chunk for part in parts for chunk in part.chunks])
         if pa.types.is_fixed_size_list(column.type):
-            values: np.ndarray = np.asarray(pc.list_flatten(column)).reshape(
+            values: NDArray[np.generic] = np.asarray(pc.list_flatten(column)).reshape(
                 -1, column.type.list_size
             )
         else:
@@ -216,16 +220,18 @@ class RenderedDataset:
             )
         return values
 
-    def _images(self, key: str, start: int, stop: int | None) -> np.ndarray:
-        """Return the decoded images start … stop - 1 of a column."""
+    def _images[T: (np.uint8, np.float32)](
+        self, key: str, start: int, stop: int | None, dtype: type[T]
+    ) -> NDArray[T]:
+        """Return the decoded images start … stop - 1 of a column; depth is the float32 one."""
         stop = self.length if stop is None else stop
         if not 0 <= start <= stop <= self.length:
             raise InputError(
                 f"frames {start} to {stop} were asked; the dataset has 0 to {self.length}."
             )
-        depth = key in [names.depth_key(view) for view in self.views]
-        shape = (stop - start, self.image_size, self.image_size, 1 if depth else 3)
-        batch = np.empty(shape, np.float32 if depth else np.uint8)
+        channels = 1 if dtype is np.float32 else 3
+        shape = (stop - start, self.image_size, self.image_size, channels)
+        batch = np.empty(shape, dtype)
         for index, frame in enumerate(self.decoded(key, start, stop)):
             if frame.shape != shape[1:] or frame.dtype != batch.dtype:
                 raise BadFile(

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from surgicai_vision import envs
 from surgicai_vision.core import names
@@ -27,7 +28,7 @@ from surgicai_vision.demos.store import Demo, read_demo
 from surgicai_vision.scene.cameras import extrinsics, intrinsics
 from surgicai_vision.scene.rendering import renderer_string
 
-MEASURED: Mapping[str, Callable[[envs.SuturingEnv], np.ndarray]] = {
+MEASURED: Mapping[str, Callable[[envs.SuturingEnv], NDArray[np.float32]]] = {
     names.STATE: lambda env: env.agent_pos(),
     names.NEEDLE_POSE: lambda env: env.needle_pose(),
     names.BOTH_ARMS: lambda env: env.both_arms(),
@@ -75,7 +76,7 @@ def render_episode(
     content: dict[str, list[bytes]] = {key: [] for key, _, _ in keys}
     statistics = {key: ImageStatistics() for key in content}
     digest = schema.EpisodeDigest(content)
-    measured: dict[str, list[np.ndarray]] = {key: [] for key in MEASURED}
+    measured: dict[str, list[NDArray[np.float32]]] = {key: [] for key in MEASURED}
     for state in episode.state[:-1:frame_stride]:
         env.set_state_vector(state)
         observation = env.observe()
@@ -107,8 +108,8 @@ def render_episode(
 
 
 def _columns(
-    demo: Demo, frame_stride: int, measured: Mapping[str, Sequence[np.ndarray]]
-) -> dict[str, np.ndarray]:
+    demo: Demo, frame_stride: int, measured: Mapping[str, Sequence[NDArray[np.float32]]]
+) -> dict[str, NDArray[np.generic]]:
     """Return every column of `schema.COLUMNS`, (T,) or (T, n), for the T frames rendered."""
     frames = len(measured[names.STATE])
     return {
@@ -126,7 +127,7 @@ def _columns(
 def _write_episode(
     folder: Path,
     content: Mapping[str, list[bytes]],
-    columns: Mapping[str, np.ndarray],
+    columns: Mapping[str, NDArray[np.generic]],
     depth_keys: Sequence[str],
 ) -> None:
     """Write one episode as parquet, images as LeRobot's (bytes, path) pairs."""
@@ -148,7 +149,7 @@ def _renderer() -> str:
     return renderer_string()
 
 
-def _camera(env: envs.SuturingEnv, view: str, size: int, states: np.ndarray) -> Table:
+def _camera(env: envs.SuturingEnv, view: str, size: int, states: NDArray[np.float64]) -> Table:
     """Return a camera's geometry.
 
     Returns:

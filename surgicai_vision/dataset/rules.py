@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.dataset import schema
@@ -11,7 +12,9 @@ MOVED = 0.001
 """An arm or a needle that went further between two frames [m] must be seen to have moved."""
 
 
-def episode_problems(number: int, columns: Mapping[str, np.ndarray], fps: float) -> Iterator[str]:
+def episode_problems(
+    number: int, columns: Mapping[str, NDArray[np.generic]], fps: float
+) -> Iterator[str]:
     """Yield what is wrong with the order, the end and the seed of one episode.
 
     Args:
@@ -31,7 +34,7 @@ def episode_problems(number: int, columns: Mapping[str, np.ndarray], fps: float)
         yield f"episode {number}: its frames have different seeds."
 
 
-def number_problems(columns: Mapping[str, np.ndarray]) -> Iterator[str]:
+def number_problems(columns: Mapping[str, NDArray[np.generic]]) -> Iterator[str]:
     """Yield which columns hold numbers that are not finite, or actions outside [-1, 1]."""
     for key in schema.COLUMNS:
         finite = np.isfinite(columns[key].astype(np.float64)).reshape(len(columns[key]), -1)
@@ -59,7 +62,7 @@ class ImageWatch:
         key: str,
         size: int,
         views: Sequence[str],
-        rows: Mapping[str, np.ndarray],
+        rows: Mapping[str, NDArray[np.generic]],
         lossless: bool = True,
     ):
         # A camera that moves along need not see what moved, and a part's outline can stay the same.
@@ -72,9 +75,9 @@ class ImageWatch:
         )
         self._size = size
         self._last = self._shown[0]
-        self._before: np.ndarray | None = None
+        self._before: NDArray[np.uint8 | np.float32] | None = None
 
-    def problem(self, index: int, frame: np.ndarray) -> str:
+    def problem(self, index: int, frame: NDArray[np.uint8 | np.float32]) -> str:
         """Return what is wrong with the episode's frame `index`, or nothing."""
         problem = image_problem(frame, self._size)
         if self._before is not None and np.array_equal(frame, self._before):
@@ -86,7 +89,7 @@ class ImageWatch:
         return problem
 
 
-def image_problem(frame: np.ndarray, size: int) -> str:
+def image_problem(frame: NDArray[np.uint8 | np.float32], size: int) -> str:
     """Return what is wrong with an image by itself, or nothing."""
     if frame.shape[:2] != (size, size):
         return f"it is {frame.shape[0]} × {frame.shape[1]}, not {size} × {size}"

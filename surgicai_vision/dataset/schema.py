@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 
@@ -78,7 +79,7 @@ def features(views: Sequence[str], size: int, depth: bool, segmentation: bool) -
     return table
 
 
-def column_bytes(key: str, values: np.ndarray) -> bytes:
+def column_bytes(key: str, values: NDArray[np.generic]) -> bytes:
     """Return the bytes of a column as they enter the digest."""
     dtype = "float32" if key in VECTORS else SCALARS[key]
     return np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
@@ -90,7 +91,7 @@ class ImageDigest:
     def __init__(self) -> None:
         self._total = hashlib.sha256()
 
-    def add(self, frame: np.ndarray) -> None:
+    def add(self, frame: NDArray[np.uint8 | np.float32]) -> None:
         """Count the next frame (H, W, channels)."""
         self._total.update(str((frame.shape, frame.dtype.name)).encode())
         self._total.update(np.ascontiguousarray(frame))
@@ -107,7 +108,7 @@ class EpisodeDigest:
         self._images = {key: ImageDigest() for key in keys}
         self._known: dict[str, str] = {}
 
-    def add(self, key: str, frame: np.ndarray) -> None:
+    def add(self, key: str, frame: NDArray[np.uint8 | np.float32]) -> None:
         """Count the next decoded frame (H, W, channels) of an image column."""
         self._images[key].add(frame)
 
@@ -115,7 +116,7 @@ class EpisodeDigest:
         """Take an image column's `ImageDigest` in the place of its frames."""
         self._known[key] = digest
 
-    def hexdigest(self, columns: Mapping[str, np.ndarray]) -> str:
+    def hexdigest(self, columns: Mapping[str, NDArray[np.generic]]) -> str:
         """Return the episode's digest."""
         total = hashlib.sha256()
         for key in COLUMNS:

@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 """LeRobot's quantiles (lerobot 0.6.1, datasets/compute_stats.py)."""
@@ -24,9 +25,9 @@ class ImageStatistics:
     def __init__(self) -> None:
         self._count = 0
         self._histogram = np.zeros((3, 256))
-        self._depths: list[np.ndarray] = []
+        self._depths: list[NDArray[np.float32]] = []
 
-    def add(self, frame: np.ndarray) -> None:
+    def add(self, frame: NDArray[np.uint8 | np.float32]) -> None:
         """Count one frame."""
         self._count += 1
         if frame.dtype == np.uint8:
@@ -34,7 +35,7 @@ class ImageStatistics:
                 counts = cv2.calcHist([frame], [channel], None, [256], [0, 256])
                 self._histogram[channel] += counts[:, 0]
         else:
-            self._depths.append(frame[::DEPTH_STRIDE, ::DEPTH_STRIDE].ravel())
+            self._depths.append(frame[::DEPTH_STRIDE, ::DEPTH_STRIDE].ravel().astype(np.float32))
 
     def result(self) -> Statistics:
         """Return the statistics; each of shape (channels, 1, 1), the count (1,)."""
@@ -46,14 +47,14 @@ class ImageStatistics:
         return {**table, "count": [self._count]}
 
 
-def column_statistics(values: np.ndarray) -> Statistics:
+def column_statistics(values: NDArray[np.generic]) -> Statistics:
     """Return the statistics of a column (T,) or (T, n); each of shape (n,), the count (1,)."""
     columns = values.reshape(len(values), -1).astype(np.float64).T
     rows = [_column_statistics(column) for column in columns]
     return {**{name: [row[name] for row in rows] for name in rows[0]}, "count": [len(values)]}
 
 
-def _column_statistics(values: np.ndarray) -> dict[str, float]:
+def _column_statistics(values: NDArray[np.float64]) -> dict[str, float]:
     quantiles = np.quantile(values, list(QUANTILES.values()))
     return {
         "min": float(values.min()),
@@ -64,7 +65,7 @@ def _column_statistics(values: np.ndarray) -> dict[str, float]:
     }
 
 
-def _histogram_statistics(histogram: np.ndarray) -> dict[str, float]:
+def _histogram_statistics(histogram: NDArray[np.float64]) -> dict[str, float]:
     """Return the statistics of values 0..255, divided by 255, from their counts."""
     levels = np.arange(256) / 255.0
     total = histogram.sum()

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, digest
@@ -113,7 +114,7 @@ class DatasetSubset:
     def __init__(
         self,
         whole: Dataset,
-        rows: np.ndarray,
+        rows: NDArray[np.int64],
         selection: Mapping[str, str | int],
         *,
         config: TaskConfig | None = None,
@@ -149,7 +150,7 @@ class DatasetSubset:
         return digest({"dataset": self._whole.fingerprint, **self._selection})
 
     @functools.cached_property
-    def episode_index(self) -> np.ndarray:
+    def episode_index(self) -> NDArray[np.int64]:
         """Episode of every frame, (N,) int64."""
         return np.asarray(self._whole.episode_index)[self.rows]
 
@@ -157,16 +158,16 @@ class DatasetSubset:
         """Return (first frame, frame after the last) of every episode."""
         return episode_bounds(self.episode_index)
 
-    def columns(self) -> dict[str, np.ndarray]:
+    def columns(self) -> dict[str, NDArray[np.generic]]:
         """Return every column that is no image, (N,) or (N, n), by its key."""
         columns = {key: values[self.rows] for key, values in self._whole.columns().items()}
         if self._restart_time:
             first = np.searchsorted(self.episode_index, self.episode_index, side="left")
             for key in ("frame_index", "timestamp"):
-                columns[key] = columns[key] - columns[key][first]
+                columns[key] = np.subtract(columns[key], columns[key][first])
         return columns
 
-    def frames(self, view: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+    def frames(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
         """Return the images of one of the `sights`, (stop - start, H, W, 3) uint8 RGB."""
         stop = self.length if stop is None else stop
         if not 0 <= start <= stop <= self.length:

@@ -9,6 +9,7 @@ from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import BadFile
 
@@ -47,7 +48,7 @@ class VideoWriter:
         self._stream = stream
         self.written = 0
 
-    def add(self, frame: np.ndarray) -> None:
+    def add(self, frame: NDArray[np.uint8]) -> None:
         """Append a frame, (H, W, 3) uint8 RGB."""
         import av
 
@@ -72,7 +73,9 @@ class VideoWriter:
         self.close() if kind is None else self._container.close()
 
 
-def read_frames(path: Path, first: int, count: int, fps: float) -> Iterator[np.ndarray]:
+def read_frames(
+    path: Path, first: int, count: int, fps: float
+) -> Iterator[NDArray[np.uint8 | np.float32]]:
     """Yield the frames first … first + count - 1 of a video, each (H, W, 3) uint8 RGB.
 
     Raises:
@@ -94,7 +97,7 @@ def read_frames(path: Path, first: int, count: int, fps: float) -> Iterator[np.n
                     continue
                 if number > wanted:
                     break
-                yield frame.to_ndarray(format="rgb24")
+                yield np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
                 wanted += 1
                 if wanted == first + count:
                     return

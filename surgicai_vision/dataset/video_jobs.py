@@ -124,7 +124,7 @@ def encode_block(folder: Path, dataset: str, video: str, view: str, first: int, 
     end = bounds[-1][1]
     with VideoWriter(path, video, data.fps, data.image_size) as writer:
         for image in data.decoded(key, begin, end):
-            writer.add(image)
+            writer.add(image.astype(np.uint8, copy=False))
     rows = []
     decoded = read_frames(path, 0, end - begin, data.fps)
     for low, high in bounds:

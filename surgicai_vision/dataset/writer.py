@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.files import read_json, whole_folder, write_json
@@ -75,7 +76,7 @@ def compression(schema: pa.Schema, depth: Sequence[str]) -> dict[str, str]:
     return codecs
 
 
-def column_array(values: np.ndarray) -> pa.Array:
+def column_array(values: NDArray[np.generic]) -> pa.Array:
     """Return a column (T,) or (T, n) as Arrow scalars or lists of fixed size."""
     flat = pa.array(np.ascontiguousarray(values).ravel())
     return pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim == 2 else flat

@@ -79,7 +79,8 @@ class Disturbance:
     ) -> NDArray[np.float32]:
         """Return what is executed in the place of `action`, (7,)."""
         noisy = action + np.append(rng.normal(0.0, deviation, 6), 0.0)
-        return np.clip(noisy, -1.0, 1.0).astype(np.float32)
+        executed: NDArray[np.float32] = np.clip(noisy, -1.0, 1.0).astype(np.float32)
+        return executed
 
 
 UNDISTURBED = Disturbance()

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
@@ -69,13 +70,13 @@ class Demo:
     demonstrator: str
     scene_hash: str
     code_version: str
-    state: np.ndarray
-    action: np.ndarray
-    phase: np.ndarray
-    reward: np.ndarray
-    success: np.ndarray
-    contact: np.ndarray
-    executed: np.ndarray | None = None
+    state: NDArray[np.float64]
+    action: NDArray[np.float32]
+    phase: NDArray[np.int8]
+    reward: NDArray[np.float32]
+    success: NDArray[np.bool_]
+    contact: NDArray[np.bool_]
+    executed: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         # Types and axes, then lengths, then the numbers themselves.
@@ -113,7 +114,7 @@ class Demo:
             raise InputError("Demo holds numbers that are not finite.")
 
     @property
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return the arrays by their names in `ARRAYS`."""
         return {
             "state": self.state,

@@ -270,7 +270,8 @@ class SuturingEnv(gymnasium.Env):
         """Return the reward of a measurement."""
         if self.config.reward == "sparse":
             return 0.0 if info["is_success"] else -1.0
-        return -(info["d_trans"] + info["d_angle"] / 10.0)
+        error: float = info["d_trans"] + info["d_angle"] / 10.0
+        return -error
 
     # -- observing ---------------------------------------------------------------------------------
 
@@ -301,7 +302,8 @@ class SuturingEnv(gymnasium.Env):
 
     def needle_pose(self) -> NDArray[np.float32]:
         """Return the needle's position [m] and quaternion (w, x, y, z) in world, (7,)."""
-        return self.data.qpos[self.scene.needle_qpos].astype(np.float32)
+        pose: NDArray[np.float32] = self.data.qpos[self.scene.needle_qpos].astype(np.float32)
+        return pose
 
     def observe(self) -> Observation:
         """Return the observation of the present state."""

@@ -64,12 +64,13 @@ def coloured(frame: Frame, modality: str) -> Image:
     if modality == names.RGB:
         return frame
     if modality == names.SEGMENTATION:
-        return PALETTE[frame[..., 0]]
+        parts: Image = PALETTE[frame[..., 0]]
+        return parts
     import cv2
 
     near, far = depth_range(frame)
     scaled = np.clip((frame[..., 0] - near) / max(far - near, 1e-6), 0, 1)
-    rgb = cv2.applyColorMap((255 * (1 - scaled)).astype(np.uint8), cv2.COLORMAP_TURBO)[
+    rgb: Image = cv2.applyColorMap((255 * (1 - scaled)).astype(np.uint8), cv2.COLORMAP_TURBO)[
         ..., ::-1
     ].copy()
     rgb[frame[..., 0] >= BEYOND] = PALETTE[0]

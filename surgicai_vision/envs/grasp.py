@@ -5,6 +5,7 @@ import math
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.names import PSM2
 from surgicai_vision.envs import poses
@@ -24,7 +25,7 @@ SPREAD_TURN = math.radians(30.0)
 """Half width of its rotation [rad]."""
 
 
-def lying_needle(rng: np.random.Generator) -> np.ndarray:
+def lying_needle(rng: np.random.Generator) -> NDArray[np.float64]:
     """Draw T_world_needle (4, 4) of a needle that lies on the tissue."""
     pose = np.eye(4)
     pose[:3, :3] = rpy_to_matrix(0.0, 0.0, rng.uniform(-SPREAD_TURN, SPREAD_TURN))

@@ -4,6 +4,7 @@ import math
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.envs.geometry import HANDOFF_ANGLE, Stitch
@@ -26,7 +27,7 @@ STRAIGHT = math.radians(4.0)
 """How far the grip may have turned the needle when it closed [rad]."""
 
 
-def inserted_needle(stitch: Stitch, rng: np.random.Generator) -> np.ndarray:
+def inserted_needle(stitch: Stitch, rng: np.random.Generator) -> NDArray[np.float64]:
     """Draw T_world_needle (4, 4) of a needle through both holes."""
     pose = stitch.inserted(rng.uniform(*DRIVEN))
     return about_point(pose, pose[:3, 3], draw_rotation(rng, OFF_TURN), draw_in_ball(rng, OFF_PATH))

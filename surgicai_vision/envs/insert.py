@@ -4,6 +4,7 @@ import math
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.names import PSM2
 from surgicai_vision.envs import poses
@@ -51,7 +52,10 @@ class Insert(Subtask):
         ), stitch.insert_point
 
 
-def draw_in_ball(rng: np.random.Generator, radius: float) -> np.ndarray:
+def draw_in_ball(rng: np.random.Generator, radius: float) -> NDArray[np.float64]:
     """Draw a point (3,) in a ball [m]."""
     direction = rng.normal(size=3)
-    return direction / np.linalg.norm(direction) * radius * rng.uniform() ** (1 / 3)
+    point: NDArray[np.float64] = (
+        direction / np.linalg.norm(direction) * radius * rng.uniform() ** (1 / 3)
+    )
+    return point

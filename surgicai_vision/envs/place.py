@@ -4,6 +4,7 @@ import math
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.names import PSM2
 from surgicai_vision.envs import poses
@@ -28,8 +29,8 @@ GRASP_TILT = math.radians(12.0)
 
 
 def draw_psm2_grasp(
-    rng: np.random.Generator, needle_pose: np.ndarray, stitch: Stitch
-) -> np.ndarray:
+    rng: np.random.Generator, needle_pose: NDArray[np.float64], stitch: Stitch
+) -> NDArray[np.float64]:
     """Draw T_world_tip (4, 4) of PSM2's imperfect grasp of a needle, within the angles that work.
 
     Args:

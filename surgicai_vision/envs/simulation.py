@@ -335,7 +335,8 @@ class Simulation:
 
     def jaw(self, arm: str) -> float:
         """Return the measured angle of the left finger [rad]."""
-        return self._qpos.item(self._fingers[arm])
+        angle: float = self._qpos.item(self._fingers[arm])
+        return angle
 
     def needle_point(self, angle: float) -> tuple[float, float, float]:
         """Return the needle's point at `angle` [rad] in world [m]."""

@@ -8,8 +8,9 @@ released code. A high-level policy may choose another subtask by `enter`.
 
 from surgicai_vision.core.config import DWELL
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.envs.base import Info, SuturingEnv
+from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.simulation import RELEASE_STEPS
+from surgicai_vision.envs.success import Info
 
 PULLOUT_PHASE = 4
 

@@ -219,7 +219,7 @@ def _work(
     share: slice,
     arguments: Arguments,
     mode: AutoresetMode,
-    space: spaces.Space,
+    space: spaces.Space[object],
     memory: Tree,
 ) -> None:
     """Serve one share of the envs until the other end is closed."""
@@ -265,7 +265,7 @@ def _answer(vector: SyncVectorEnv, what: str, part: Any, seen: Tree, share: slic
 # -- trees of arrays -------------------------------------------------------------------------------
 
 
-def _reserve(space: spaces.Space) -> Tree:
+def _reserve(space: spaces.Space[object]) -> Tree:
     """Return shared memory for a batched space."""
     if isinstance(space, spaces.Dict):
         return {key: _reserve(part) for key, part in space.spaces.items()}
@@ -273,7 +273,7 @@ def _reserve(space: spaces.Space) -> Tree:
     return RawArray("b", int(np.prod(space.shape)) * space.dtype.itemsize)
 
 
-def _view(space: spaces.Space, memory: Tree) -> Tree:
+def _view(space: spaces.Space[object], memory: Tree) -> Tree:
     """Return the arrays that lie in shared memory."""
     if isinstance(space, spaces.Dict):
         return {key: _view(part, memory[key]) for key, part in space.spaces.items()}

@@ -300,4 +300,4 @@ class ChainAgent(Agent):
         """Return the subtask that is due in each env."""
         if self._high is None:
             return [env.phase for env in envs]
-        return self._high.answer(envs, observations).argmax(axis=1).tolist()
+        return [int(due) for due in self._high.answer(envs, observations).argmax(axis=1)]

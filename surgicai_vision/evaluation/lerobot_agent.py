@@ -260,7 +260,7 @@ class LeRobotAgent(Agent):
             "task": [self._text or env.task_description for env in envs],
         }
         action = self._after(policy.select_action(self._before(batch)))
-        return action.to("cpu", torch.float32).numpy()
+        return np.asarray(action.to("cpu", torch.float32).numpy(), np.float32)
 
 
 def _random(device: str) -> Any:
@@ -293,7 +293,7 @@ def _load(folder: Path, weights: WeightsSource) -> tuple[Any, Any, Any]:
         config = PreTrainedConfig.from_pretrained(folder)
         # The checkpoint holds the backbone; LeRobot would download it first, only to overwrite it.
         if getattr(config, "pretrained_backbone_weights", None):
-            config.pretrained_backbone_weights = None  # type: ignore[attr-defined]
+            config.pretrained_backbone_weights = None
         own = weights.file_for(str(getattr(config, "encoder", None)))
         if own and hasattr(config, "encoder_weights"):
             config.encoder_weights = str(own)

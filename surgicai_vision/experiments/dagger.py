@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import InputError
@@ -40,7 +41,7 @@ class MixturePolicy(BehaviourPolicy):
         self._agent.reset(0, env, seed)
         self._left = int(rng.integers(0, env.config.max_steps, endpoint=True))
 
-    def action(self, env: Any, observation: Any) -> np.ndarray | None:
+    def action(self, env: Any, observation: Any) -> NDArray[np.float32] | None:
         """Return the agent's action (7,) in [-1, 1], or None once the expert has taken over."""
         if not self._left:
             return None

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 from filelock import Timeout
+from numpy.typing import NDArray
 
 from surgicai_vision import __version__
 from surgicai_vision.core.config import digest, to_mapping
@@ -81,7 +82,7 @@ class Features:
 
     folder: Path
     manifest: Manifest
-    rows: np.ndarray
+    rows: NDArray[np.float16]
     encoded: int = 0
 
     @property
@@ -99,7 +100,7 @@ class Features:
         """Length of one row."""
         return self.rows.shape[1]
 
-    def part(self, rows: np.ndarray, dataset: str) -> "Features":
+    def part(self, rows: NDArray[np.int64], dataset: str) -> "Features":
         """Return the features of a subset of the dataset.
 
         Args:
@@ -235,7 +236,9 @@ def _fill(
     return done - start
 
 
-def _allocated(folder: Path, shape: tuple[int, int]) -> tuple[np.memmap, int]:
+def _allocated(
+    folder: Path, shape: tuple[int, int]
+) -> "tuple[np.memmap[tuple[int, int], np.dtype[np.float16]], int]":
     """Open the rows for writing; return them with the number of rows already there."""
     path = folder / ROWS
     try:
@@ -249,14 +252,14 @@ def _allocated(folder: Path, shape: tuple[int, int]) -> tuple[np.memmap, int]:
     return np.lib.format.open_memmap(path, mode="w+", dtype=np.float16, shape=shape), 0
 
 
-def _chunks(dataset: "Dataset", view: str, start: int) -> Iterator[tuple[int, np.ndarray]]:
+def _chunks(dataset: "Dataset", view: str, start: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Yield (stop, frames) chunk by chunk; the next chunk is decoded while this one is encoded."""
     starts = range(start, dataset.length, CHUNK)
     if not starts:
         return
     with ThreadPoolExecutor(1) as reader:
 
-        def read(at: int) -> np.ndarray:
+        def read(at: int) -> NDArray[np.uint8]:
             return dataset.frames(view, at, min(at + CHUNK, dataset.length))
 
         pending = reader.submit(read, starts[0])

@@ -137,7 +137,7 @@ def probe(
     )
 
 
-def spread(episode_index: np.ndarray, frames: int) -> NDArray[np.int64]:
+def spread(episode_index: NDArray[np.int64], frames: int) -> NDArray[np.int64]:
     """Return at most `frames` row numbers, evenly spread over every episode.
 
     Every episode gives equally many, a shorter one all it has.
@@ -178,7 +178,8 @@ def _targets(pose: Array) -> tuple[Array, Array]:
 def _angles(answers: Array, wanted: Array) -> Array:
     """Return the angles between two tables of orientations (n, 6) [deg]."""
     products = np.einsum("nij,nij->n", _matrices(answers), _matrices(wanted))
-    return np.degrees(np.arccos(np.clip((products - 1) / 2, -1, 1)))
+    angles: Array = np.degrees(np.arccos(np.clip((products - 1) / 2, -1, 1)))
+    return angles
 
 
 def _matrices(columns: Array) -> Array:
@@ -191,7 +192,9 @@ def _matrices(columns: Array) -> Array:
     return np.stack([x, y, np.cross(x, y)], axis=2)
 
 
-def _folds(episode: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+def _folds(
+    episode: NDArray[np.int64], count: int, generator: np.random.Generator
+) -> NDArray[np.int64]:
     """Return the fold of each row; whole episodes, evenly many a fold."""
     episodes, place = np.unique(episode, return_inverse=True)
     return (generator.permutation(len(episodes)) % count)[place]
@@ -208,7 +211,7 @@ class _Reader:
         folds: fold of each row fitted, to choose a penalty on.
     """
 
-    def __init__(self, fitted: Array, asked: Array, folds: np.ndarray) -> None:
+    def __init__(self, fitted: Array, asked: Array, folds: NDArray[np.int64]) -> None:
         mean = fitted.mean(0)
         std = fitted.std(0)
         std = np.where(std > SMALLEST_STD, std, np.inf)
@@ -262,11 +265,12 @@ class _Ridge:
         """
         mean = target.mean(0)
         turned = self._vectors.T @ (target - mean) / (self._values + penalty * self._scale)[:, None]
-        return self._projected @ turned + mean
+        answers: Array = self._projected @ turned + mean
+        return answers
 
 
 def _measure(
-    errors: Array, episode: np.ndarray, generator: np.random.Generator
+    errors: Array, episode: NDArray[np.int64], generator: np.random.Generator
 ) -> tuple[Measure, Array]:
     """Return the measure of (2, n) errors, read and chance, and each episode's median error."""
     of_episode = np.array(

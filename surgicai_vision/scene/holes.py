@@ -14,6 +14,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 OPENING = 0.0038
 """Side of the square opening [m]."""
@@ -36,14 +37,14 @@ class Hole:
         return math.cos(self.tilt), math.sin(self.tilt)
 
     @property
-    def rotation(self) -> np.ndarray:
+    def rotation(self) -> NDArray[np.float64]:
         """Return R_world_hole, shape (3, 3)."""
         cosine = math.cos(self.tilt)
         sine = math.sin(self.tilt)
         return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
     @property
-    def pose(self) -> np.ndarray:
+    def pose(self) -> NDArray[np.float64]:
         """Return T_world_hole, shape (4, 4)."""
         pose = np.eye(4)
         pose[:3, :3] = self.rotation

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from safetensors import SafetensorError
 
-from surgicai_vision.core.config import TaskConfig, digest, from_mapping, to_mapping
+from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_json, write_bytes, write_json
 
@@ -48,7 +48,7 @@ class EncoderRecord:
     """
 
     name: str
-    card: dict
+    card: dict[str, JSON]
     weights_sha256: str
     pool: str
     fingerprint: str
@@ -85,7 +85,7 @@ class Checkpoint:
 
     task: TaskConfig
     policy: str
-    recipe: dict
+    recipe: dict[str, JSON]
     recipe_name: str
     views: tuple[str, ...]
     image_size: int

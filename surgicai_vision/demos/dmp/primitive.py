@@ -73,7 +73,8 @@ def multiply(a: Array, b: Array) -> Array:
 
 def conjugate(q: Array) -> Array:
     """Return q̄, (..., 4): the inverse of a unit quaternion."""
-    return q * _CONJUGATE
+    conjugated: Array = q * _CONJUGATE
+    return conjugated
 
 
 def log_quaternion(q: Array) -> Array:
@@ -81,7 +82,8 @@ def log_quaternion(q: Array) -> Array:
     q = np.where(q[..., :1] < 0.0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, q[..., :1])
-    return q[..., 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+    vector: Array = q[..., 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+    return vector
 
 
 def exp_quaternion(turn: Array) -> Array:
@@ -191,7 +193,8 @@ class Primitive:
     def force(self, x: float) -> Array:
         """Return Σψᵢwᵢ / Σψᵢ · x at the phase x, (6,)."""
         psi = _kernels(np.array([x]), len(self.weights))[0]
-        return psi @ self.weights * (x / psi.sum())
+        force: Array = psi @ self.weights * (x / psi.sum())
+        return force
 
 
 class Execution:
@@ -330,7 +333,8 @@ def _kernels(phase: Array, count: int) -> Array:
     """Return ψ at the phases, (T, count)."""
     centres, widths = _centres(count)
     # The limit keeps the quotient of the sums finite far behind the last centre.
-    return np.exp(-np.minimum(widths * (phase[:, None] - centres) ** 2, 500.0))
+    activations: Array = np.exp(-np.minimum(widths * (phase[:, None] - centres) ** 2, 500.0))
+    return activations
 
 
 @functools.lru_cache(maxsize=8)

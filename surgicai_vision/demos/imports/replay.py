@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision import envs
 from surgicai_vision.core import names
@@ -71,11 +72,11 @@ class Episode:
         success: after the step, as recorded, (T,) bool.
     """
 
-    pose: np.ndarray
-    goal: np.ndarray
-    action: np.ndarray
-    reward: np.ndarray
-    success: np.ndarray
+    pose: NDArray[np.float64]
+    goal: NDArray[np.float64]
+    action: NDArray[np.float64]
+    reward: NDArray[np.float64]
+    success: NDArray[np.bool_]
 
     @property
     def motion(self) -> "Motion":
@@ -83,7 +84,7 @@ class Episode:
         return np.stack([pose_matrix(row) for row in self.pose]), self.pose[:, 6]
 
 
-Motion = tuple[np.ndarray, np.ndarray]
+Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
 """T_base_tip (T + 1, 4, 4) of an arm and its jaw (T + 1,) [rad]."""
 
 
@@ -96,7 +97,7 @@ def trimmed(episode: Episode, task: str) -> Episode:
     )
 
 
-def pose_matrix(seven: np.ndarray) -> np.ndarray:
+def pose_matrix(seven: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return T_base_tip (4, 4) of x y z [m] roll pitch yaw [rad] (the jaw is ignored)."""
     pose = np.eye(4)
     pose[:3, :3] = rpy_to_matrix(*seven[3:6])
@@ -104,7 +105,7 @@ def pose_matrix(seven: np.ndarray) -> np.ndarray:
     return pose
 
 
-def needle_path(episode: Episode, task: str) -> np.ndarray:
+def needle_path(episode: Episode, task: str) -> NDArray[np.float64]:
     """Return T_world_needle (T + 1, 4, 4) of an episode, by the rules in the module's docstring."""
     base = kinematics.base_in_world(names.ACTIVE_ARM[task])
     goal = base @ pose_matrix(episode.goal)
@@ -116,7 +117,7 @@ def needle_path(episode: Episode, task: str) -> np.ndarray:
     return tips @ np.linalg.inv(goal) @ _needle_at_goal(task)
 
 
-def _grasp(task: str) -> np.ndarray:
+def _grasp(task: str) -> NDArray[np.float64]:
     """Return T_needle_tip (4, 4) at the goal of grasp or handoff.
 
     The jaws come down the normal of the needle's plane; PSM1 closes along -radial, PSM2 along
@@ -133,7 +134,7 @@ def _grasp(task: str) -> np.ndarray:
     return pose
 
 
-def _needle_at_goal(task: str) -> np.ndarray:
+def _needle_at_goal(task: str) -> NDArray[np.float64]:
     """Return T_world_needle (4, 4) at the goal of place or insert, at hole pair 1 of `simple`."""
     pair = PAIRS["simple"][0]
     # Columns: radial, tangent and normal of the needle's point, in the hole's frame.
@@ -149,7 +150,8 @@ def _needle_at_goal(task: str) -> np.ndarray:
     point[:3, 0] = -needle.radial(angle)
     point[:3, 1] = needle.tangent(angle)
     point[:3, 3] = needle.point(angle)
-    return hole @ target @ np.linalg.inv(point)
+    needle_pose: NDArray[np.float64] = hole @ target @ np.linalg.inv(point)
+    return needle_pose
 
 
 def grip_error(episode: Episode, task: str) -> float:
@@ -163,7 +165,7 @@ def grip_error(episode: Episode, task: str) -> float:
     return float(max(radial, DEPTHS[0] - z, z - DEPTHS[1], 0.0))
 
 
-def motion_actions(motion: Motion, step: str) -> tuple[np.ndarray, int]:
+def motion_actions(motion: Motion, step: str) -> tuple[NDArray[np.float32], int]:
     """Return a motion as actions of our envs, (T, 7) float32, and how many had to be clipped.
 
     Args:
@@ -213,9 +215,9 @@ class Track:
     """
 
     arms: Mapping[str, Motion]
-    needle: np.ndarray
+    needle: NDArray[np.float64]
     grasp_angle: float
-    passed: np.ndarray | None = None
+    passed: NDArray[np.float64] | None = None
 
 
 class Replay:
@@ -249,7 +251,7 @@ class Replay:
         )
         return demo, clipped
 
-    def play(self, track: Track) -> tuple[np.ndarray, list[dict[str, Any]]]:
+    def play(self, track: Track) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
         """Pose the scene state by state; return the states (T + 1, n) and each one's info.
 
         Raises:
@@ -281,8 +283,17 @@ class Replay:
         """Return the env's reward of a state, given whether it counts as a success."""
         return self._env.reward({**info, "is_success": success})
 
-    def as_demo(self, demonstrator: str, states: np.ndarray, **columns: np.ndarray) -> Demo:
-        """Return states and the columns action, reward, success and contact as a demonstration."""
+    def as_demo(
+        self,
+        demonstrator: str,
+        states: NDArray[np.float64],
+        *,
+        action: NDArray[np.float32],
+        reward: NDArray[np.float32],
+        success: NDArray[np.bool_],
+        contact: NDArray[np.bool_],
+    ) -> Demo:
+        """Return states and what was done and measured in them as a demonstration."""
         return Demo(
             config=self.config,
             seed=-1,
@@ -291,10 +302,13 @@ class Replay:
             code_version=code_version(),
             state=states,
             phase=np.full(len(states) - 1, names.SUBTASKS.index(self.config.task), np.int8),
-            **columns,
+            action=action,
+            reward=reward,
+            success=success,
+            contact=contact,
         )
 
-    def _hold(self, needle_pose: np.ndarray) -> tuple[np.ndarray, float]:
+    def _hold(self, needle_pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
         """Return PSM2's pose (T_base_tip, jaw) that holds the needle near its base."""
         base = np.linalg.inv(kinematics.base_in_world(names.PSM2))
         for angle in HOLD_ANGLES:

@@ -21,6 +21,7 @@ from types import MappingProxyType
 from typing import Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import BadFile
 
@@ -63,7 +64,7 @@ class _Array:
     __slots__ = ("value",)
 
     def __init__(self) -> None:
-        self.value: np.ndarray | None = None
+        self.value: NDArray[np.generic] | None = None
 
     def __setstate__(self, state: Any) -> None:
         if not isinstance(state, tuple) or len(state) != 5:
@@ -99,7 +100,7 @@ class _Dtype:
             _refuse("a dtype's state is not that of a plain number")
         self.order = state[1]
 
-    def numpy(self) -> np.dtype:
+    def numpy(self) -> np.dtype[np.generic]:
         """Return the numpy dtype."""
         return np.dtype((self.order if self.order != "|" else "=") + self.code.lstrip("<>=|"))
 
@@ -139,7 +140,8 @@ class _Scalar:
         kind = arguments[0].numpy()
         if not isinstance(content, bytes) or len(content) != kind.itemsize:
             _refuse(f"a number of type {kind} has another length")
-        return np.frombuffer(content, kind)[0]
+        number: np.generic = np.frombuffer(content, kind)[0]
+        return number
 
 
 ADMITTED = MappingProxyType(

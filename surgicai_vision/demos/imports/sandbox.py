@@ -23,6 +23,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
@@ -51,7 +52,9 @@ REFUSED = (
 """Prefixes of the audit events that end the child."""
 
 
-def read_sandboxed(path: Path, kind: str = "surgicai", **options: JSON) -> dict[str, np.ndarray]:
+def read_sandboxed(
+    path: Path, kind: str = "surgicai", **options: JSON
+) -> dict[str, NDArray[np.generic]]:
     """Read a recording in a limited child process.
 
     Args:

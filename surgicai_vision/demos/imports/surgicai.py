@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, STEPS, TaskConfig
@@ -83,7 +84,7 @@ def import_demos(
     arrays = read_sandboxed(file)
     request = {"file": sha256_file(file), "task": task}
     if not finished(out, request):
-        episodes = split(arrays)
+        episodes = split({name: rows.astype(np.float64) for name, rows in arrays.items()})
         check_task(episodes, task)
         episodes = [trimmed(episode, task) for episode in episodes]
         step, disagreeing = infer_step(episodes)
@@ -133,7 +134,7 @@ def _write(
     return clipped, skipped
 
 
-def split(arrays: Mapping[str, np.ndarray]) -> list[Episode]:
+def split(arrays: Mapping[str, NDArray[np.float64]]) -> list[Episode]:
     """Split transitions into episodes at `done`, with metres in place of centimetres.
 
     Raises:
@@ -251,16 +252,19 @@ def infer_step(episodes: list[Episode]) -> tuple[str, int]:
     return larger[0], disagreeing
 
 
-def _unexplained(moves: np.ndarray, actions: np.ndarray, size: np.ndarray) -> int:
+def _unexplained(
+    moves: NDArray[np.float64], actions: NDArray[np.float64], size: NDArray[np.float64]
+) -> int:
     """Return how many moves (N, 7) differ from actions (N, 7) × size (7,)."""
     return int((np.abs(moves / size - actions) > AGREEMENT).any(axis=1).sum())
 
 
-def _fitted(moves: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def _fitted(moves: NDArray[np.float64], actions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a motion's step size (7,), the median of move over action, also for rotation."""
     size = np.full(7, STEPS["paper"][2])
     for axes in (slice(0, 3), slice(3, 6)):
         moved = np.abs(actions[:, axes]) > AGREEMENT
         ratios = moves[:, axes] / np.where(moved, actions[:, axes], 1.0)
         size[axes] = np.median(ratios[moved]) if moved.any() else np.inf
-    return np.maximum(size, 1e-9)
+    fitted: NDArray[np.float64] = np.maximum(size, 1e-9)
+    return fitted

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.demos.imports.safe_pickle import MAX_BYTES, unpickle
@@ -35,7 +36,7 @@ FIELDS = {
 MAX_TRANSITIONS = 1_000_000
 
 
-def read(path: Path) -> dict[str, np.ndarray]:
+def read(path: Path) -> dict[str, NDArray[np.float64]]:
     """Read a recording, a pickle or an npz by its first bytes.
 
     Raises:
@@ -51,7 +52,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
         content = path.read_bytes()
     except OSError as error:
         raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
-    rows: Mapping[str, Sequence[np.ndarray] | np.ndarray]
+    rows: Mapping[str, Sequence[NDArray[np.float64]] | NDArray[np.float64]]
     if content[:4] == b"PK\x03\x04":
         rows = _npz(path)
     else:
@@ -70,7 +71,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
     return {name: array[:, 0] if FIELDS[name] == 1 else array for name, array in arrays.items()}
 
 
-def _transitions(tree: object, path: Path) -> dict[str, list[np.ndarray]]:
+def _transitions(tree: object, path: Path) -> dict[str, list[NDArray[np.float64]]]:
     """Return the rows of a list of transitions."""
     if not isinstance(tree, (list, tuple)) or not tree:
         raise BadFile(f"{path} holds {_kind(tree)}; expected a list of transitions.")
@@ -78,7 +79,7 @@ def _transitions(tree: object, path: Path) -> dict[str, list[np.ndarray]]:
         raise BadFile(
             f"{path} holds {len(tree)} transitions; above {MAX_TRANSITIONS} are not read."
         )
-    rows: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
+    rows: dict[str, list[NDArray[np.float64]]] = {name: [] for name in FIELDS}
     for index, item in enumerate(tree):
         if not isinstance(item, Mapping):
             raise BadFile(f"{path}: transition {index} is {_kind(item)}; expected a dictionary.")
@@ -109,7 +110,7 @@ def _observation(value: Any) -> Any:
     return value["observation"] if isinstance(value, Mapping) else value
 
 
-def _npz(path: Path) -> dict[str, np.ndarray]:
+def _npz(path: Path) -> dict[str, NDArray[np.float64]]:
     """Return the rows of an npz; its arrays may not unpack to more than a recording can have."""
     names = {name: "is_success" if name == "success" else name for name in FIELDS}
     try:

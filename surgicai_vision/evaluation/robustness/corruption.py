@@ -89,11 +89,13 @@ def _clouds(seed: int, view: int, height: int, width: int) -> NDArray[np.float32
     next_column = (column + 1) % SMOKE_KNOTS
     upper = knots[row][:, column] * (1 - right) + knots[row][:, next_column] * right
     lower = knots[row + 1][:, column] * (1 - right) + knots[row + 1][:, next_column] * right
-    return upper * (1 - down) + lower * down
+    smooth: NDArray[np.float32] = upper * (1 - down) + lower * down
+    return smooth
 
 
 def _bytes(values: NDArray[np.generic]) -> Image:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    rounded: Image = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    return rounded
 
 
 Change = Callable[[Image, float, Moment], Image]

@@ -14,10 +14,11 @@ from typing import Any
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import read_json
 from surgicai_vision.core.tasks import task_steps
+from surgicai_vision.evaluation.storage import CELL_FILE
 from surgicai_vision.experiments.run import OWN, Cell
 from surgicai_vision.experiments.sweep.grid import Grid, chain_parts
 from surgicai_vision.experiments.sweep.lerobot import LEROBOT_POLICIES
-from surgicai_vision.experiments.sweep.plan import CELL_FILE, TO_DO, CellState, Jobs
+from surgicai_vision.experiments.sweep.plan import TO_DO, CellState, Jobs
 
 FRAMES: Mapping[str, int] = MappingProxyType(
     {"grasp": 70, "place": 90, "insert": 90, "handoff": 110, "pullout": 90, "suture": 450}

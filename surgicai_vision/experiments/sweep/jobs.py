@@ -25,9 +25,10 @@ from surgicai_vision.evaluation.policy_spec import (
     replay_subject,
 )
 from surgicai_vision.evaluation.run import evaluate_into
+from surgicai_vision.evaluation.storage import CELL_FILE
 from surgicai_vision.experiments.run import Cell, encode_cell, train_cell
 from surgicai_vision.experiments.sweep.lerobot import LEROBOT_POLICIES, SCRATCH, train_lerobot
-from surgicai_vision.experiments.sweep.plan import CELL_FILE, PROBE_FILE, REFERENCE_FILE
+from surgicai_vision.experiments.sweep.plan import PROBE_FILE, REFERENCE_FILE
 from surgicai_vision.features.encoders import WeightsSource
 
 Table = Mapping[str, Any]

@@ -24,6 +24,7 @@ from types import MappingProxyType
 
 import lz4.frame
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import reader as ros1_reader
@@ -99,7 +100,7 @@ _POSE_FIELDS = (
 
 def read(
     path: Path, topics: Mapping[str, str], needed: Collection[str] = ()
-) -> dict[str, np.ndarray]:
+) -> dict[str, NDArray[np.generic]]:
     """Read the messages of some topics.
 
     Args:
@@ -125,7 +126,7 @@ def read(
 
 def _read(
     reader: Reader1 | Reader2, path: Path, topics: Mapping[str, str], needed: Collection[str]
-) -> dict[str, np.ndarray]:
+) -> dict[str, NDArray[np.generic]]:
     ros1 = isinstance(reader, Reader1)
     there = {connection.topic: _plain(connection.msgtype) for connection in reader.connections}
     known = [
@@ -239,7 +240,7 @@ class _Column:
             self._numbers.extend(value)
             self._width = len(value)
 
-    def arrays(self, kind: str) -> dict[str, np.ndarray]:
+    def arrays(self, kind: str) -> dict[str, NDArray[np.generic]]:
         """Return the role's arrays.
 
         Raises:

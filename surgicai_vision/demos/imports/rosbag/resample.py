@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from surgicai_vision.core import names
@@ -33,7 +34,7 @@ COMMANDS = ("servo_jp", "move_jp")
 ENDOSCOPE_FRAMES = ("ecm", "cam")
 """Parts of the names of frames that are relative to the endoscope, not an arm's base."""
 
-Arrays = Mapping[str, np.ndarray]
+Arrays = Mapping[str, NDArray[np.generic]]
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,8 @@ class Arm:
         jaw: one finger's angle, (N,) [rad], or None where it was not recorded.
     """
 
-    tip: np.ndarray
-    jaw: np.ndarray | None
+    tip: NDArray[np.float64]
+    jaw: NDArray[np.float64] | None
 
 
 @dataclass(frozen=True)
@@ -63,10 +64,10 @@ class Recording:
     """
 
     arms: Mapping[str, Arm]
-    needle: np.ndarray | None
-    label: np.ndarray | None
-    valid: np.ndarray
-    time: np.ndarray
+    needle: NDArray[np.float64] | None
+    label: NDArray[np.str_] | None
+    valid: NDArray[np.bool_]
+    time: NDArray[np.float64]
     topics: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -98,7 +99,8 @@ def resample(arrays: Arrays, config: BagConfig, instrument: str) -> Recording:
         )
     step = 1e9 / RATE * config.speed
     grid = np.arange(0.0, (end - begin) + 1e-6 * step, step)
-    tracks = {role: _distinct(times[role], arrays[f"{role}.value"], begin) for role in roles}
+    values = {role: arrays[f"{role}.value"].astype(np.float64, copy=False) for role in roles}
+    tracks = {role: _distinct(times[role], values[role], begin) for role in roles}
     valid = np.ones(len(grid), bool)
     for role in steady:
         valid &= _covered(tracks[role][0], grid, config.max_gap * 1e9)
@@ -121,15 +123,18 @@ def _is_command(role: str, config: BagConfig) -> bool:
     return role.endswith("_jaw") and config.all_topics[role].rsplit("/", 1)[-1] in COMMANDS
 
 
-def _last(track: "Track", grid: np.ndarray) -> np.ndarray:
+def _last[T: np.generic](
+    track: tuple[NDArray[np.float64], NDArray[T]], grid: NDArray[np.float64]
+) -> NDArray[T]:
     """Return the last value at each sample, before the first one the first."""
     times, values = track
-    return values[np.maximum(np.searchsorted(times, grid, side="right") - 1, 0)]
+    held: NDArray[T] = values[np.maximum(np.searchsorted(times, grid, side="right") - 1, 0)]
+    return held
 
 
 def _jaw(
-    role: str, tracks: Mapping[str, "Track"], grid: np.ndarray, config: BagConfig
-) -> np.ndarray | None:
+    role: str, tracks: Mapping[str, "Track"], grid: NDArray[np.float64], config: BagConfig
+) -> NDArray[np.float64] | None:
     """Return one finger's angle (N,) [rad]; None where it was not recorded."""
     if role not in tracks:
         return None
@@ -160,21 +165,24 @@ def _roles(arrays: Arrays, config: BagConfig) -> list[str]:
     return [*roles, "needle"] if "needle.value" in arrays else roles
 
 
-def _times(arrays: Arrays, config: BagConfig) -> dict[str, np.ndarray]:
+def _times(arrays: Arrays, config: BagConfig) -> dict[str, NDArray[np.int64]]:
     """Return each role's times [ns], int64, on one clock."""
     roles = [key.removesuffix(".time") for key in arrays if key.endswith(".time")]
-    stamped = [role for role in roles if (arrays[f"{role}.stamp"] > 0).all()]
-    times = {role: arrays[f"{role}.time"] for role in roles}
+    times = {role: arrays[f"{role}.time"].astype(np.int64, copy=False) for role in roles}
+    stamps = {role: arrays[f"{role}.stamp"].astype(np.int64, copy=False) for role in roles}
+    stamped = [role for role in roles if (stamps[role] > 0).all()]
     if config.clock == "bag" or (config.clock == "auto" and not stamped):
         return times
     if not stamped:
         raise InputError("clock is 'stamp', but the messages have no stamps; take 'bag' or 'auto'.")
-    late = np.concatenate([times[role] - arrays[f"{role}.stamp"] for role in stamped])
+    late = np.concatenate([times[role] - stamps[role] for role in stamped])
     shift = int(np.median(late))
-    return {**times, **{role: arrays[f"{role}.stamp"] + shift for role in stamped}}
+    return {**times, **{role: stamps[role] + shift for role in stamped}}
 
 
-def _distinct(times: np.ndarray, values: np.ndarray, begin: int) -> tuple[np.ndarray, np.ndarray]:
+def _distinct[T: np.generic](
+    times: NDArray[np.int64], values: NDArray[T], begin: int
+) -> tuple[NDArray[np.float64], NDArray[T]]:
     """Return increasing times since `begin` [ns] and their values, of a repeated time the last."""
     order = np.argsort(times, kind="stable")
     since = (times[order] - begin).astype(np.float64)
@@ -182,14 +190,18 @@ def _distinct(times: np.ndarray, values: np.ndarray, begin: int) -> tuple[np.nda
     return since[last], values[order][last]
 
 
-def _covered(times: np.ndarray, grid: np.ndarray, gap: float) -> np.ndarray:
+def _covered(
+    times: NDArray[np.float64], grid: NDArray[np.float64], gap: float
+) -> NDArray[np.bool_]:
     """Return for each sample whether the messages around it are at most `gap` [ns] apart."""
     after = np.clip(np.searchsorted(times, grid, side="left"), 0, len(times) - 1)
     before = np.clip(np.searchsorted(times, grid, side="right") - 1, 0, len(times) - 1)
     return times[after] - times[before] <= gap
 
 
-def resampled(times: np.ndarray, poses: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def resampled(
+    times: NDArray[np.float64], poses: NDArray[np.float64], grid: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return poses (M, 7), x y z and quaternion w x y z, at other times as matrices (N, 4, 4)."""
     found = np.tile(np.eye(4), (len(grid), 1, 1))
     for axis in range(3):
@@ -202,20 +214,25 @@ def resampled(times: np.ndarray, poses: np.ndarray, grid: np.ndarray) -> np.ndar
     return found
 
 
-def as_matrix(pose: tuple[float, ...]) -> np.ndarray:
+def as_matrix(pose: tuple[float, ...]) -> NDArray[np.float64]:
     """Return x y z [m] and a quaternion w x y z as a pose (4, 4); the identity of nothing."""
     return (
         resampled(np.zeros(1), np.array([pose], dtype=float), np.zeros(1))[0] if pose else np.eye(4)
     )
 
 
-Track = tuple[np.ndarray, np.ndarray]
+Track = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Times [ns] and values."""
 
 
 def _tip(
-    role: str, track: Track, grid: np.ndarray, arrays: Arrays, config: BagConfig, instrument: str
-) -> np.ndarray:
+    role: str,
+    track: Track,
+    grid: NDArray[np.float64],
+    arrays: Arrays,
+    config: BagConfig,
+    instrument: str,
+) -> NDArray[np.float64]:
     """Return an arm's T_base_tip (N, 4, 4) from its poses or its joints."""
     arm, kind = role.split("_")
     times, values = track
@@ -240,7 +257,9 @@ def _tip(
     )
 
 
-def _needle(track: Track, grid: np.ndarray, arrays: Arrays, config: BagConfig) -> np.ndarray:
+def _needle(
+    track: Track, grid: NDArray[np.float64], arrays: Arrays, config: BagConfig
+) -> NDArray[np.float64]:
     """Return T_world_needle (N, 4, 4)."""
     scale = config.needle_scale or (AMBF_UNIT if str(arrays["needle.type"]) in AMBF else 1.0)
     poses = resampled(track[0], track[1] * np.array([scale] * 3 + [1.0] * 4), grid)

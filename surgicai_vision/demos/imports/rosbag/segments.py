@@ -21,6 +21,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from surgicai_vision.core import names
@@ -171,13 +172,13 @@ def _by_events(recording: Recording, pair: HolePair) -> list[Segment]:
     return found
 
 
-def _next(event: np.ndarray, start: int) -> int:
+def _next(event: NDArray[np.bool_], start: int) -> int:
     """Return the first sample from `start` on that an event holds, or the last sample."""
     found = np.flatnonzero(event[start:])
     return start + int(found[0]) if len(found) else len(event) - 1
 
 
-def holds(recording: Recording, arm: str) -> np.ndarray:
+def holds(recording: Recording, arm: str) -> NDArray[np.bool_]:
     """Return for each sample whether an arm holds the needle, by the geometry alone, (N,)."""
     motion = recording.arms.get(arm)
     if motion is None or motion.jaw is None or recording.needle is None:
@@ -185,7 +186,9 @@ def holds(recording: Recording, arm: str) -> np.ndarray:
     return held(arm, motion.tip, motion.jaw, recording.needle)
 
 
-def held(arm: str, tip: np.ndarray, jaw: np.ndarray, needle_poses: np.ndarray) -> np.ndarray:
+def held(
+    arm: str, tip: NDArray[np.float64], jaw: NDArray[np.float64], needle_poses: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Return for each sample whether an arm holds the needle, (N,) bool.
 
     Args:
@@ -210,7 +213,7 @@ def held(arm: str, tip: np.ndarray, jaw: np.ndarray, needle_poses: np.ndarray) -
     return sustained((jaw < HOLD_JAW) & (jaw <= later + STILL) & (distance < HOLD_REACH))
 
 
-def sustained(event: np.ndarray) -> np.ndarray:
+def sustained(event: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return an event (N,) without runs shorter than `SUSTAINED`, except one at the very end."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], event.astype(int), [0]])))
     kept = np.zeros(len(event), bool)
@@ -235,7 +238,7 @@ class _NeedleAlone:
         return x, y, z
 
 
-def holes_passed(needle_poses: np.ndarray, pair: HolePair) -> np.ndarray:
+def holes_passed(needle_poses: NDArray[np.float64], pair: HolePair) -> NDArray[np.float64]:
     """Return `TaskState.holes_passed` of each needle pose (N, 4, 4) in an episode, (N,).
 
     A needle that is out and comes back to the entry begins the next stitch, with none passed.
@@ -257,7 +260,7 @@ def holes_passed(needle_poses: np.ndarray, pair: HolePair) -> np.ndarray:
     return np.array(passed)
 
 
-def _near_entry(pose: np.ndarray, pair: HolePair) -> bool:
+def _near_entry(pose: NDArray[np.float64], pair: HolePair) -> bool:
     """Return True if a needle is as near to the goal of place as an insertion starts."""
     goal = Stitch.of(pair).place()
     tip = needle_frame(needle.TIP_ANGLE)
@@ -265,7 +268,7 @@ def _near_entry(pose: np.ndarray, pair: HolePair) -> bool:
     return bool(away <= START_SHIFT and geodesic_angle(pose[:3, :3], goal[:3, :3]) <= START_TURN)
 
 
-def _arrival(needle_poses: np.ndarray, start: int, stop: int) -> int:
+def _arrival(needle_poses: NDArray[np.float64], start: int, stop: int) -> int:
     """Return the sample in [start, stop] from which the needle stays where it is at `stop`."""
     goal = needle_poses[stop]
     path = needle_poses[start : stop + 1]
@@ -275,7 +278,7 @@ def _arrival(needle_poses: np.ndarray, start: int, stop: int) -> int:
     return start + int(far[-1]) + 1 if len(far) else start
 
 
-def _release(holding: np.ndarray, needle_poses: np.ndarray, start: int) -> int:
+def _release(holding: NDArray[np.bool_], needle_poses: NDArray[np.float64], start: int) -> int:
     """Return the sample of the needle's last move in PSM1's jaws."""
     released = np.flatnonzero(~holding[start:])
     end = start + int(released[0]) - 1 if len(released) else len(holding) - 1
@@ -285,7 +288,7 @@ def _release(holding: np.ndarray, needle_poses: np.ndarray, start: int) -> int:
 # -- pauses ----------------------------------------------------------------------------------------
 
 
-def moving(tip: np.ndarray, jaw: np.ndarray) -> np.ndarray:
+def moving(tip: NDArray[np.float64], jaw: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the indices of the samples outside pauses, the first and the last always among them.
 
     Args:

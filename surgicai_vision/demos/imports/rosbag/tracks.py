@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, TaskConfig
@@ -109,7 +110,7 @@ def _row(bag: str, task: str, begin: float, end: float, reason: str) -> dict[str
 
 def _track(
     recording: Recording,
-    passed: np.ndarray | None,
+    passed: NDArray[np.float64] | None,
     segment: Segment,
     config: BagConfig,
     base: TaskConfig,
@@ -130,7 +131,7 @@ def _track(
             f"The topics are {topic_list(recording.topics, wanted)}."
         )
     tip, jaw = arms[active]
-    index = np.arange(segment.start, segment.stop + 1)
+    index: NDArray[np.int64] = np.arange(segment.start, segment.stop + 1)
     if config.drop_pauses:
         index = segment.start + moving(tip[whole], jaw[whole])
     if len(index) < 3:
@@ -147,7 +148,7 @@ def _track(
     ), segment.stop - segment.start + 1 - len(index)
 
 
-def _jaw(recording: Recording, arm: str, task: str, config: BagConfig) -> np.ndarray:
+def _jaw(recording: Recording, arm: str, task: str, config: BagConfig) -> NDArray[np.float64]:
     """Return an arm's jaw (N,) [rad], as recorded or as the subtask has it."""
     motion: Arm = recording.arms[arm]
     if motion.jaw is not None:
@@ -163,13 +164,15 @@ def _jaw(recording: Recording, arm: str, task: str, config: BagConfig) -> np.nda
     return np.full(len(recording), 0.0 if holding else START_JAW)
 
 
-def _grasp_angle(arm: str, tip: np.ndarray, needle_pose: np.ndarray) -> float:
+def _grasp_angle(arm: str, tip: NDArray[np.float64], needle_pose: NDArray[np.float64]) -> float:
     """Return the needle's point that is nearest to an arm's jaws, the demonstrated grasp [rad]."""
     x, y, _ = (np.linalg.inv(needle_pose) @ kinematics.base_in_world(arm) @ tip)[:3, 3]
     return float(np.clip(np.arctan2(y, -x), 0.0, needle.TIP_ANGLE))
 
 
-def _inferred(tip: np.ndarray, jaw: np.ndarray, task: str, base: TaskConfig) -> np.ndarray:
+def _inferred(
+    tip: NDArray[np.float64], jaw: NDArray[np.float64], task: str, base: TaskConfig
+) -> NDArray[np.float64]:
     """Return T_world_needle (T + 1, 4, 4) where the task's definition puts an unseen needle."""
     if (base.scene.layout, base.scene.hole_pair) != ("simple", 1):
         raise InputError(
