@@ -229,7 +229,7 @@ class RenderedDataset:
             raise InputError(
                 f"frames {start} to {stop} were asked; the dataset has 0 to {self.length}."
             )
-        channels = 1 if dtype is np.float32 else 3
+        channels = 1 if np.dtype(dtype).kind == "f" else 3
         shape = (stop - start, self.image_size, self.image_size, channels)
         batch = np.empty(shape, dtype)
         for index, frame in enumerate(self.decoded(key, start, stop)):

@@ -134,9 +134,10 @@ class ForcePlate:
         """Return which contacts are of the tissue with the needle or an instrument, (contacts,)."""
         one = data.contact.geom[:, 0]
         other = data.contact.geom[:, 1]
-        return (self._tissue[one] & self._presses[other]) | (
+        touching: NDArray[np.bool_] = (self._tissue[one] & self._presses[other]) | (
             self._tissue[other] & self._presses[one]
         )
+        return touching
 
     def _net(self, data: mujoco.MjData) -> NDArray[np.float64]:
         """Return the net force in world (3,) [N]."""

@@ -84,7 +84,7 @@ class ObservationConfig:
         shown = {names.RGB: True, names.DEPTH: self.depth, names.SEGMENTATION: self.segmentation}
         return tuple(modality for modality in names.MODALITIES if shown[modality])
 
-    def space(self) -> spaces.Space:
+    def space(self) -> spaces.Space[object]:
         """Return the observation space."""
         if self.obs_type == "state":
             return _box(21)
@@ -93,12 +93,12 @@ class ObservationConfig:
                 {"observation": _box(7), "achieved_goal": _box(8), "desired_goal": _box(8)}
             )
         height, width = self.image_size
-        frame_spaces: dict[str, spaces.Space] = {
+        frame_spaces: dict[str, spaces.Space[object]] = {
             names.RGB: spaces.Box(0, 255, (height, width, 3), np.uint8),
             names.DEPTH: spaces.Box(0.0, np.inf, (height, width, 1), np.float32),
             names.SEGMENTATION: spaces.Box(0, len(names.PARTS) - 1, (height, width, 1), np.uint8),
         }
-        parts: dict[str, spaces.Space] = {
+        parts: dict[str, spaces.Space[object]] = {
             names.frame_key(camera, modality): frame_spaces[modality]
             for camera in self.cameras
             for modality in self.modalities
@@ -125,7 +125,7 @@ def seven(arm: str, pose: Pose, jaw: float, scale: float = 1.0) -> list[float]:
     return [x * scale, y * scale, z * scale, roll, pitch, yaw, jaw]
 
 
-def state_vector(arm: str, now: Pose, goal: Pose, jaw: float) -> np.ndarray:
+def state_vector(arm: str, now: Pose, goal: Pose, jaw: float) -> NDArray[np.float32]:
     """Return the 21 values of obs_type "state"; poses in the arm's base."""
     current = seven(arm, now, jaw, 100.0)
     wanted = seven(arm, goal, 0.0, 100.0)
@@ -212,7 +212,7 @@ def _roll(sine: float, cosine: float) -> float:
     return roll if roll <= 0.0 else max(roll - 2.0 * pi, -LARGEST_ROLL)
 
 
-def goal_vector(pose: Pose, jaw: float, met: bool) -> np.ndarray:
+def goal_vector(pose: Pose, jaw: float, met: bool) -> NDArray[np.float32]:
     """Return a pose in world as a goal (8,).
 
     x y z [m], rotation vector [rad], jaw [rad], and 1 where what else success needs holds.
@@ -221,7 +221,9 @@ def goal_vector(pose: Pose, jaw: float, met: bool) -> np.ndarray:
     return np.array([*poses.position(pose), *turn, jaw, met], dtype=np.float32)
 
 
-def goal_errors(achieved: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def goal_errors(
+    achieved: NDArray[np.float32], desired: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return distance [m] and geodesic angle [rad] between goal vectors, (8,) or (batch, 8)."""
     from scipy.spatial.transform import Rotation
 

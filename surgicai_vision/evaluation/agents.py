@@ -120,7 +120,7 @@ class ReplayAgent(Agent):
 
 
 def mean_demonstration(
-    action: NDArray[np.float32], episode_index: NDArray[np.int64]
+    action: NDArray[np.generic], episode_index: NDArray[np.int64]
 ) -> NDArray[np.float32]:
     """Return the mean action of each control step (T, 7).
 
@@ -130,7 +130,8 @@ def mean_demonstration(
         action: (N, 7) actions of all frames.
         episode_index: (N,) their episodes.
     """
-    episodes = [action[episode_index == episode] for episode in np.unique(episode_index)]
+    actions = action.astype(np.float32, copy=False)
+    episodes = [actions[episode_index == episode] for episode in np.unique(episode_index)]
     longest = max(map(len, episodes))
     steps = [
         np.mean([e[step] for e in episodes if len(e) > step], axis=0) for step in range(longest)

@@ -14,6 +14,7 @@ import math
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 RADIUS = 0.01018
 """Radius of the arc [m]."""
@@ -44,22 +45,22 @@ two flat pads hold a round needle. With the default 0.005 m the grip crept 0.7°
 at most; with 0.01 m 0.4° and 1.2°."""
 
 
-def point(angle: float, radius: float = RADIUS) -> np.ndarray:
+def point(angle: float, radius: float = RADIUS) -> NDArray[np.float64]:
     """Return the point (3,) [m] at `angle` [rad] of an arc of `radius` [m] in its frame."""
     return np.array([-radius * math.cos(angle), radius * math.sin(angle), 0.0])
 
 
-def tangent(angle: float) -> np.ndarray:
+def tangent(angle: float) -> NDArray[np.float64]:
     """Return the unit tangent towards the tip at `angle` [rad] in the needle frame, shape (3,)."""
     return np.array([math.sin(angle), math.cos(angle), 0.0])
 
 
-def radial(angle: float) -> np.ndarray:
+def radial(angle: float) -> NDArray[np.float64]:
     """Return the unit vector (3,) from the centre to the arc at `angle` [rad]."""
     return np.array([-math.cos(angle), math.sin(angle), 0.0])
 
 
-def polyline(points: int = 61, radius: float = RADIUS) -> np.ndarray:
+def polyline(points: int = 61, radius: float = RADIUS) -> NDArray[np.float64]:
     """Return points along the needle from base to tip in its frame, shape (points, 3) [m]."""
     angles = np.linspace(0.0, TIP_ANGLE, points)
     return np.stack(

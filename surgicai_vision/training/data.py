@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import clock
@@ -14,7 +15,9 @@ if TYPE_CHECKING:
     from policies.base import Recipe
 
 
-def with_clock(columns: dict[str, np.ndarray], vector: str | None) -> dict[str, np.ndarray]:
+def with_clock(
+    columns: dict[str, NDArray[np.generic]], vector: str | None
+) -> dict[str, NDArray[np.generic]]:
     """Return the columns, with `names.CLOCKED_STATE` (N, 10) where `vector` asks for it."""
     if vector != names.CLOCKED_STATE:
         return columns
@@ -26,8 +29,8 @@ def with_clock(columns: dict[str, np.ndarray], vector: str | None) -> dict[str, 
 
 
 def split(
-    episode_index: np.ndarray, recipe: "Recipe", seed: int
-) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
+    episode_index: NDArray[np.int64], recipe: "Recipe", seed: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], tuple[int, ...]]:
     """Split the frames into training and validation.
 
     Args:

@@ -32,6 +32,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.optim.lr_scheduler import LRScheduler
 
 from policies.base import Plugin, Policy, Recipe
@@ -268,7 +269,7 @@ class _Training:
             optimiser, recipe.learning_rate, total_steps=steps
         )
 
-    def _observed(self, rows: np.ndarray) -> torch.Tensor:
+    def _observed(self, rows: NDArray[np.int64]) -> torch.Tensor:
         """Return the raw inputs of some frames, (n, inputs) float32.
 
         The views' features stand before the vector.
@@ -307,7 +308,7 @@ class _Training:
                 f"The policy to start from has other layers ({str(error).splitlines()[0]})."
             ) from None
 
-    def _batches(self) -> list[np.ndarray]:
+    def _batches(self) -> list[NDArray[np.int64]]:
         """Return the training rows of one epoch in a new order, batch by batch.
 
         A last batch of one joins the one before.

@@ -58,6 +58,9 @@ def test_wheel_holds_the_three_packages_and_nothing_else(
         if path.suffix in (".py", ".js", ".css", ".j2")
     }
     assert sources <= set(contents)
+    # PEP 561: type checkers read our annotations in an installed package as well.
+    marked = {f"{name}/py.typed" for name in ("surgicai_vision", "encoders", "policies")}
+    assert marked <= set(contents)
     configs = {
         f"surgicai_vision/{path.relative_to(root)}"
         for path in (root / "configs").rglob("*")
