@@ -42,6 +42,7 @@ from common import emit, median
 from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import SceneConfig, TaskConfig
+from surgicai_vision.core.tasks import env_id
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.scene.rendering import QUALITIES, FrameRenderer
 
@@ -257,7 +258,7 @@ def measure_workers(repeats: int, steps: int, obs_type: str, share: int) -> dict
 
 def _vector(workers: int, share: int, chosen: dict[str, Any]) -> gymnasium.vector.VectorEnv:
     """Return a vector env of the subtask insert that never truncates."""
-    task = names.ENV_IDS["insert"]
+    task = env_id("insert")
     chosen = {"max_episode_steps": 10**6, **chosen}
     if share:
         return gymnasium.make_vec(task, workers * share, workers=workers, **chosen)

@@ -13,9 +13,6 @@ class.
 SUTURE = "suture"
 TASKS = (*SUBTASKS, SUTURE)
 
-ENV_IDS = MappingProxyType({task: f"surgicai_vision/{task.capitalize()}-v0" for task in TASKS})
-"""Task name → gymnasium id."""
-
 TASK_TEXTS = MappingProxyType(
     {
         "grasp": "Grasp the needle with the right-hand instrument.",

@@ -14,6 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.core.tasks import env_id
 
 # -- gymnasium -------------------------------------------------------------------------------------
 
@@ -22,7 +23,7 @@ from surgicai_vision.core.errors import InputError, SurgicaiError
 @pytest.mark.parametrize("task", names.TASKS)
 def test_gymnasium_accepts_every_env(task, obs_type):
     chosen = {"cameras": ("back",), "image_size": 32} if "pixels" in obs_type else {}
-    env = gymnasium.make(names.ENV_IDS[task], obs_type=obs_type, **chosen)
+    env = gymnasium.make(env_id(task), obs_type=obs_type, **chosen)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*space (min|max)imum value is -?infinity.*")
@@ -31,7 +32,7 @@ def test_gymnasium_accepts_every_env(task, obs_type):
 
 
 def test_render_gives_an_image():
-    env = gymnasium.make(names.ENV_IDS["grasp"], render_mode="rgb_array")
+    env = gymnasium.make(env_id("grasp"), render_mode="rgb_array")
     env.reset(seed=0)
     image = env.render()
     assert image.shape == (480, 640, 3) and image.dtype == np.uint8 and image.std() > 10
@@ -174,9 +175,9 @@ def test_vectorised_envs_are_single_envs(mode):
     )
     kwargs = {"context": "spawn"} if mode == "async" else {}
     vector = gymnasium.make_vec(
-        names.ENV_IDS["place"], 2, vectorization_mode=mode, vector_kwargs=kwargs, **chosen
+        env_id("place"), 2, vectorization_mode=mode, vector_kwargs=kwargs, **chosen
     )
-    singles = [gymnasium.make(names.ENV_IDS["place"], **chosen) for _ in range(2)]
+    singles = [gymnasium.make(env_id("place"), **chosen) for _ in range(2)]
     moves = actions(2 * 10).reshape(10, 2, 7)
     try:
         seen = [vector.reset(seed=[7, 8])[0], *(vector.step(move)[0] for move in moves)]

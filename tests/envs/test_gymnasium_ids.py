@@ -12,6 +12,7 @@ from stable_baselines3.common.env_checker import check_env
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.tasks import env_id
 
 
 def run(code, tmp_path):
@@ -27,7 +28,7 @@ def run(code, tmp_path):
 @pytest.mark.parametrize("task", names.TASKS)
 def test_stable_baselines_accepts_every_env(task, obs_type):
     chosen = {"cameras": ("front", "back"), "image_size": 36} if "pixels" in obs_type else {}
-    env = gymnasium.make(names.ENV_IDS[task], obs_type=obs_type, **chosen)
+    env = gymnasium.make(env_id(task), obs_type=obs_type, **chosen)
     # A gymnasium wrapper hides `compute_reward`, by which a goal env is known.
     for checked in (env, env.unwrapped) if obs_type != "goal" else (env.unwrapped,):
         with warnings.catch_warnings():
@@ -42,7 +43,7 @@ def test_importing_the_package_registers_the_ids_and_loads_no_simulator(tmp_path
         "assert 'mujoco' not in sys.modules and 'surgicai_vision.envs' not in sys.modules\n"
         "print(*(name for name in gymnasium.registry if name.startswith('surgicai_vision/')))"
     )
-    assert run(code, tmp_path).split() == list(names.ENV_IDS.values())
+    assert run(code, tmp_path).split() == list(map(env_id, names.TASKS))
 
 
 def test_an_id_that_names_the_package_needs_no_import(tmp_path):
@@ -57,13 +58,13 @@ def test_an_id_that_names_the_package_needs_no_import(tmp_path):
 @pytest.mark.parametrize("task", names.TASKS)
 def test_the_spec_says_the_limit(task):
     limit = TaskConfig(task).max_steps
-    assert gymnasium.spec(names.ENV_IDS[task]).max_episode_steps == limit
-    assert gymnasium.make(names.ENV_IDS[task]).spec.max_episode_steps == limit
+    assert gymnasium.spec(env_id(task)).max_episode_steps == limit
+    assert gymnasium.make(env_id(task)).spec.max_episode_steps == limit
 
 
 @pytest.mark.parametrize("limit", [None, 3, 230])
 def test_an_episode_ends_at_the_limit_that_its_spec_says(limit):
-    env = gymnasium.make(names.ENV_IDS["grasp"], max_episode_steps=limit)
+    env = gymnasium.make(env_id("grasp"), max_episode_steps=limit)
     env.reset(seed=0)
     action = np.zeros(7, np.float32)
     steps, truncated = 0, False
@@ -79,4 +80,4 @@ def test_an_episode_ends_at_the_limit_that_its_spec_says(limit):
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
 def test_two_limits_are_refused(make):
     with pytest.raises(InputError, match="max_episode_steps=7"):
-        make(names.ENV_IDS["grasp"], max_steps=7)
+        make(env_id("grasp"), max_steps=7)

@@ -10,6 +10,7 @@ import pytest
 import surgicai_vision.envs
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.core.tasks import env_id
 from surgicai_vision.envs.vector_env import make_vector
 
 SEEDS, STEPS = (3, 4), 8
@@ -21,9 +22,9 @@ def actions():
     return np.random.default_rng(0).uniform(-1, 1, (STEPS, len(SEEDS), 7)).astype(np.float32)
 
 
-def alone(env_id, index, **arguments):
+def alone(name, index, **arguments):
     """One env's observations, rewards and infos."""
-    env = gymnasium.make(env_id, **arguments)
+    env = gymnasium.make(name, **arguments)
     observation, info = env.reset(seed=SEEDS[index])
     rows = [(observation, 0.0, info)]
     for action in actions()[:, index]:
@@ -36,7 +37,7 @@ def alone(env_id, index, **arguments):
 def make_vec(task, mode, count=2, **arguments):
     """A vector env; "workers" are our own."""
     how = {"workers": count} if mode == "workers" else {"vectorization_mode": mode}
-    return gymnasium.make_vec(names.ENV_IDS[task], num_envs=count, **how, **arguments)
+    return gymnasium.make_vec(env_id(task), num_envs=count, **how, **arguments)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -48,7 +49,6 @@ def make_vec(task, mode, count=2, **arguments):
     ],
 )
 def test_a_vector_env_gives_the_trajectories_of_single_envs(mode, task, arguments):
-    env_id = names.ENV_IDS[task]
     vector = make_vec(task, mode, **arguments)
     try:
         observation, info = vector.reset(seed=list(SEEDS))
@@ -60,7 +60,7 @@ def test_a_vector_env_gives_the_trajectories_of_single_envs(mode, task, argument
         vector.close()
     for index in range(len(SEEDS)):
         for (seen, rewards, infos), (expected, reward, single) in zip(
-            rows, alone(env_id, index, **arguments), strict=True
+            rows, alone(env_id(task), index, **arguments), strict=True
         ):
             np.testing.assert_array_equal(seen[index], expected)
             assert rewards[index] == pytest.approx(reward)
@@ -78,7 +78,7 @@ def test_images_of_workers_are_those_of_single_envs(mode):
     try:
         vector.reset(seed=list(SEEDS))
         observation = vector.step(actions()[0])[0]
-        expected = [alone(names.ENV_IDS["place"], index, **arguments)[1][0] for index in range(2)]
+        expected = [alone(env_id("place"), index, **arguments)[1][0] for index in range(2)]
         for index in range(2):
             np.testing.assert_array_equal(
                 observation["agent_pos"][index], expected[index]["agent_pos"]
@@ -101,7 +101,7 @@ def test_lerobot_finds_its_attributes(mode):
 
 
 def test_importing_registers_every_id():
-    assert set(names.ENV_IDS.values()) <= set(gymnasium.registry)
+    assert set(map(env_id, names.TASKS)) <= set(gymnasium.registry)
     assert set(surgicai_vision.envs.SUBTASKS) == set(names.SUBTASKS)
 
 
@@ -114,8 +114,7 @@ def test_shares_of_envs_are_one_sync_vector(autoreset):
         "randomisation": {"friction": 0.2},
     }
     ours, plain = (
-        gymnasium.make_vec(names.ENV_IDS["place"], 3, workers=workers, **arguments)
-        for workers in (2, 0)
+        gymnasium.make_vec(env_id("place"), 3, workers=workers, **arguments) for workers in (2, 0)
     )
     try:
         pairs = [(ours.reset(seed=5), plain.reset(seed=5))]
