@@ -1,9 +1,8 @@
 """`evaluate`: run a policy from held-out starts and count successes."""
 
-import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from cyclopts import App, Parameter
 
@@ -18,13 +17,14 @@ from surgicai_vision.commands.options import (
     TASK,
     WEIGHTS,
     default_text,
-    read_yaml,
-    task_config,
 )
 from surgicai_vision.core import names
-from surgicai_vision.core.config import from_mapping
-from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.core.config import JSON
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.features.encoders import WeightsSource
+
+if TYPE_CHECKING:
+    from surgicai_vision.evaluation.policy_spec import PolicySpec
 
 app = App(
     name="evaluate",
@@ -33,11 +33,10 @@ example:
   surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json""",
 )
 
-CHAIN_SUFFIXES = (".yaml", ".yml")
 ALL = "all"
-"""`--swap`: the chain as it is, and with every subtask swapped in turn."""
+"""`--expert-swap`: the policy as it is, and with the expert in for every subtask in turn."""
 REPLAY = "replay"
-"""The mean demonstration of a dataset, played blind."""
+"""The mean demonstration of a dataset, which observes nothing."""
 
 
 @Parameter(name="*")
@@ -46,13 +45,15 @@ class Options:
     """Options of `evaluate`.
 
     Attributes:
-        policy: A checkpoint folder, a chain.yaml, or expert, replay, random or zero.
+        policy: A checkpoint folder, a hierarchical.yaml, module:factory, or expert, replay, random
+            or zero.
         task: The task.
         episodes: Number of episodes.
         seed: Seed of the first start; each episode takes the next.
         workers: Number of processes.
         dataset: Dataset whose mean demonstration replay plays.
-        swap: For a chain, the subtask that the expert does, or all: each in turn.
+        expert_swap: For a hierarchical policy, the subtask that the expert does, or all: each in
+            turn.
         out: Folder for the rows; an earlier evaluation in it is replaced.
     """
 
@@ -66,7 +67,9 @@ class Options:
     dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
     weights: Annotated[tuple[str, ...], WEIGHTS] = ()
     accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
-    swap: Annotated[str | None, Parameter(choices=(*names.SUBTASKS, ALL), metavar="SUBTASK")] = None
+    expert_swap: Annotated[
+        str | None, Parameter(choices=(*names.SUBTASKS, ALL), metavar="SUBTASK")
+    ] = None
     out: Annotated[
         Path | None,
         DIRECTORY,
@@ -78,116 +81,90 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Evaluate, keep the rows and print the summary."""
-    from surgicai_vision.evaluation import run
+    from surgicai_vision.evaluation.run import evaluate_into
     from surgicai_vision.evaluation.storage import MARKER
 
-    if options.swap == ALL:
-        return _run_swaps(options, console)
-    subject = subject_of(options)
-    seeds = range(options.seed, options.seed + options.episodes)
-    default = folders.evaluation_folder(
-        subject.config.task, subject.name, options.seed, options.episodes
+    if options.expert_swap == ALL:
+        return _evaluate_swaps(options, console)
+    spec = open_given(
+        options.policy,
+        options.task,
+        options.env,
+        options.dataset,
+        WeightsSource.parse(options.weights, options.accept_licence),
+        options.expert_swap,
     )
+    seeds = range(options.seed, options.seed + options.episodes)
+    default = folders.evaluation_folder(spec.config.task, spec.name, options.seed, options.episodes)
     out = options.out or default
     folders.check_folder(out, MARKER)
-    title = f"evaluating {subject.name} on {subject.config.task}"
-    with console.stage(title, "steps") as progress:
-        result = run.evaluate_into(out, subject, seeds, options.workers, progress)
+    with console.stage(f"evaluating {spec.name} on {spec.config.task}", "steps") as progress:
+        result = evaluate_into(out, spec, seeds, options.workers, progress)
     console.say(summary_line(result))
     console.say(f"episodes: {out}")
     return {**result, "out": str(out)}
 
 
-def subject_of(options: Any) -> Any:
-    """Say who acts in which task: a baseline, or a checkpoint in the task it was trained for.
+def open_given(
+    policy: str,
+    task: str | None,
+    env: dict[str, object] | None,
+    dataset: Path | None,
+    weights: WeightsSource,
+    expert_swap: str | None = None,
+) -> "PolicySpec":
+    """Return what the options of this verb, or of `robustness`, evaluate."""
+    from surgicai_vision.evaluation.policy_spec import open_policy
 
-    Args:
-        options: of `evaluate`, or of a command with the same fields but `swap`.
-    """
-    from surgicai_vision.evaluation import agents, lerobot_agent, policy_spec
-
-    folder = Path(options.policy)
-    swap = getattr(options, "swap", None)
-    weights = WeightsSource.parse(options.weights, options.accept_licence)
-    if swap and folder.suffix not in CHAIN_SUFFIXES:
-        raise InputError(f"--swap {swap} is for a chain.yaml; leave it out.")
-    if options.policy == REPLAY:
-        subject = policy_spec.replay_subject(
-            folders.open_dataset(options.dataset, options.task or "grasp", ())
-        )
-        return _in_env(subject, options.env)
-    if options.dataset:
+    demonstrated = None
+    if policy == REPLAY:
+        demonstrated = folders.open_dataset(dataset, task or "grasp", ())
+    elif dataset:
         raise InputError("--dataset is for replay alone; leave it out.")
-    if folder.suffix in CHAIN_SUFFIXES:
-        return _chain(folder, options, swap)
-    if options.policy in agents.BASELINES:
-        config = task_config(options.task or "grasp", options.env)
-        return policy_spec.baseline_subject(options.policy, config)
-    if not folder.exists() and folder.parent == Path():
-        raise UnknownName(
-            "policy or checkpoint folder", options.policy, (*agents.BASELINES, REPLAY)
-        )
-    lerobot = lerobot_agent.find(folder)
-    if lerobot:
-        subject = lerobot_agent.subject(lerobot, options.task, weights)
-    else:
-        subject = policy_spec.checkpoint_subject(folder, weights)
-    trained_for = subject.config.task
-    if options.task not in (None, trained_for):
-        raise InputError(
-            f"{folder} was trained for '{trained_for}', not for --task {options.task}; "
-            "leave --task out."
-        )
-    return _in_env(subject, options.env)
-
-
-def _in_env(subject: Any, env: dict[str, Any] | None) -> Any:
-    """Put a subject into the env of the table `env`, where there is one."""
-    return (
-        dataclasses.replace(subject, config=task_config(subject.config.task, env))
-        if env
-        else subject
+    return open_policy(
+        policy,
+        task=task,
+        env=cast("dict[str, JSON] | None", env),
+        dataset=demonstrated,
+        expert_swap=expert_swap,
+        weights=weights,
     )
 
 
-def _chain(path: Path, options: Any, swap: str | None = None) -> Any:
-    """Say who acts in a chain, in the task suture."""
-    from surgicai_vision.evaluation import expert_swap, hierarchical
+def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:
+    """Evaluate a hierarchical policy as it is and with the expert in for each subtask in turn."""
+    from surgicai_vision.evaluation.expert_swap import (
+        AS_IT_IS,
+        CURVES,
+        MARK,
+        evaluate_swaps,
+        variants_of,
+    )
+    from surgicai_vision.evaluation.hierarchical import SUFFIXES
 
-    config = from_mapping(hierarchical.Chain, read_yaml(path), str(path))
-    if options.task not in (None, names.SUTURE):
+    path = Path(options.policy)
+    if path.suffix not in SUFFIXES:
         raise InputError(
-            f"{path} is a chain of the whole procedure; leave --task {options.task} out."
+            f"--expert-swap {ALL} is for the YAML file of a hierarchical policy; leave it out."
         )
-    env = {"max_steps": config.max_steps, **options.env} if options.env else None
     weights = WeightsSource.parse(options.weights, options.accept_licence)
-    if swap != ALL:
-        return _in_env(expert_swap.swapped(config, swap, weights), env)
-    variants = expert_swap.variants_of(config, weights)
-    return {name: _in_env(subject, env) for name, subject in variants.items()}
-
-
-def _run_swaps(options: Options, console: Console) -> dict[str, object]:
-    """Evaluate a chain as it is and with each subtask swapped, and print how far each comes."""
-    from surgicai_vision.evaluation.expert_swap import AS_IT_IS, CURVES, MARK, survival_curves
-
-    variants = subject_of(options)
+    variants = variants_of(path, cast("dict[str, JSON] | None", options.env), weights)
     plain = variants[AS_IT_IS]
     default = folders.evaluation_folder(
         plain.config.task, plain.name, options.seed, options.episodes
     )
-    out = options.out or default.with_name(f"{default.name}-swaps")
+    out = options.out or default.with_name(f"{default.name}-expert-swaps")
     folders.check_folder(out, MARK)
     seeds = range(options.seed, options.seed + options.episodes)
-    rows = survival_curves(variants, seeds, out, console.stage, options.workers)
-    for swap in dict.fromkeys(row["swap"] for row in rows):
-        mine = [row for row in rows if row["swap"] == swap]
-        who = f"expert in {swap}" if swap else "the chain"
+    rows = evaluate_swaps(variants, seeds, out, console.stage, options.workers)
+    for swap in dict.fromkeys(row["expert_swap"] for row in rows):
+        mine = [row for row in rows if row["expert_swap"] == swap]
+        who = f"expert in {swap}" if swap else "as it is"
         console.say(
             f"{who:<18} " + ", ".join(f"{row['subtask']} {row['k']}/{row['n']}" for row in mine)
         )
-    console.say(f"survival: {out / CURVES}")
-    return {"policy": plain.name, "task": plain.config.task, "survival": rows, "out": str(out)}
+    console.say(f"expert swaps: {out / CURVES}")
+    return {"policy": plain.name, "task": plain.config.task, "expert_swap": rows, "out": str(out)}
 
 
 def summary_line(result: dict[str, Any]) -> str:
@@ -204,8 +181,8 @@ def summary_line(result: dict[str, Any]) -> str:
         line += "; failed: " + ", ".join(
             f"{count} {kind.replace('_', ' ')}" for kind, count in result["failures"].items()
         )
-    if "survival" in result:
+    if "subtasks" in result:
         line += "; reached " + ", ".join(
-            f"{stage['subtask']} {stage['k']}" for stage in result["survival"]
+            f"{stage['subtask']} {stage['k']}" for stage in result["subtasks"]
         )
     return line

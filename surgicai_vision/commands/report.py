@@ -1,15 +1,18 @@
 """`report`: write the page and the tables of stored results."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import NOT_NEGATIVE, default_text
 from surgicai_vision.core.errors import BadFile, SurgicaiError
+
+if TYPE_CHECKING:
+    from surgicai_vision.report.reader import PlannedRun
 
 app = App(name="report", help_epilogue="example:\n  surgicai-vision report outputs/quickstart")
 STRIPS = 160
@@ -44,10 +47,10 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         raise BadFile(
             f"{folder} is no folder; give one that quickstart, evaluate or sweep has written."
         )
-    cells = _cells(folder, console)
-    found = collect(folder, cells)
+    planned = _planned(folder, console)
+    found = collect(folder, planned)
     with console.stage("report", "parts") as progress:
-        page = write_report(folder, options.out, progress, cells=cells, strips=options.strips)
+        page = write_report(folder, options.out, progress, planned=planned, strips=options.strips)
     tables = page.parent / FOLDER
     console.say(f"report: {page}")
     console.say(f"tables: {tables}")
@@ -55,28 +58,23 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     return {"report": str(page), "tables": str(tables), **counts, "bytes": page.stat().st_size}
 
 
-def _cells(folder: Path, console: Console) -> Sequence[Mapping[str, Any]]:
-    """Return every cell of the sweep in `folder` with its state.
+def _planned(folder: Path, console: Console) -> "Sequence[PlannedRun]":
+    """Return every run of the sweep in `folder` with its state; nothing where it is no sweep.
 
-    Nothing is returned where the folder holds no sweep, or a grid that this version cannot read.
+    Raises:
+        BadFile: another version wrote the sweep.
     """
-    from surgicai_vision.core.config import from_mapping, to_mapping
-    from surgicai_vision.core.files import read_json
-    from surgicai_vision.experiments.sweep import Grid, plan
-    from surgicai_vision.report import GRID_FILE
+    from surgicai_vision.evaluation.storage import GRID_FILE
+    from surgicai_vision.experiments.sweep.plan import plan, read_grid_of
 
-    path = folder / GRID_FILE
-    if not path.exists():
+    if not (folder / GRID_FILE).exists():
         return ()
+    grid = read_grid_of(folder)
     try:
-        states = plan(from_mapping(Grid, read_json(path), str(path)), folder)
+        return plan(grid, folder)
     except SurgicaiError as error:
         console.note(
-            "The grid cannot be read here, so only cells with a result or a record are reported: "
-            f"{error}"
+            "The sweep cannot be planned here, so only runs with a result or a record are "
+            f"reported: {error}"
         )
         return ()
-    return [
-        {**to_mapping(state.cell), "key": state.key, "state": state.state, "reason": state.reason}
-        for state in states
-    ]

@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.evaluate import subject_of
+from surgicai_vision.commands.evaluate import open_given
 from surgicai_vision.commands.options import (
     ACCEPT_LICENCE,
     COUNT,
@@ -22,7 +22,8 @@ from surgicai_vision.commands.options import (
     default_text,
 )
 from surgicai_vision.core import names
-from surgicai_vision.evaluation.robustness import AXES, CURVES, MARK, STRENGTHS, robustness
+from surgicai_vision.evaluation.robustness import AXES, CURVES, MARK, STRENGTHS
+from surgicai_vision.features.encoders import WeightsSource
 
 app = App(
     name="robustness",
@@ -39,7 +40,8 @@ class Options:
     """Options of `robustness`.
 
     Attributes:
-        policy: A checkpoint folder, a chain.yaml, or expert, replay, random or zero.
+        policy: A checkpoint folder, a hierarchical.yaml, module:factory, or expert, replay, random
+            or zero.
         task: The task.
         axis: What shifts.
         strength: How much, from 0 (not at all) to 1, increasing.
@@ -78,18 +80,26 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Evaluate every axis at every strength and print the curves."""
-    subject = subject_of(options)
-    name = f"{subject.config.task}-{subject.name}-starts{options.seed}+{options.episodes}"
+    from surgicai_vision.evaluation.robustness.curves import robustness
+
+    spec = open_given(
+        options.policy,
+        options.task,
+        options.env,
+        options.dataset,
+        WeightsSource.parse(options.weights, options.accept_licence),
+    )
+    name = f"{spec.config.task}-{spec.name}-starts{options.seed}+{options.episodes}"
     out = options.out or folders.OUTPUTS / "robustness" / name
     folders.check_folder(out, MARK)
     seeds = range(options.seed, options.seed + options.episodes)
     rows = robustness(
-        subject, seeds, out, console.stage, options.axis, options.strength, options.workers
+        spec, seeds, out, console.stage, options.axis, options.strength, options.workers
     )
     for axis in dict.fromkeys(row["axis"] for row in rows):
         console.say(curve_line([row for row in rows if row["axis"] == axis]))
     console.say(f"curves: {out / CURVES}")
-    return {"policy": subject.name, "task": subject.config.task, "curves": rows, "out": str(out)}
+    return {"policy": spec.name, "task": spec.config.task, "curves": rows, "out": str(out)}
 
 
 def curve_line(rows: list[dict[str, Any]]) -> str:

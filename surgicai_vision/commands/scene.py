@@ -60,7 +60,7 @@ class Options:
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Roll out the expert once and draw the start and the end as every camera sees them."""
     from surgicai_vision.envs import contact_sheet
-    from surgicai_vision.evaluation import policy_spec
+    from surgicai_vision.evaluation import agents
     from surgicai_vision.evaluation.provenance import provenance
     from surgicai_vision.evaluation.rollout import evaluate
 
@@ -71,7 +71,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     folders.check_file(path, "--sheet", FIGURE_SUFFIXES)
     with console.stage(f"rolling out the expert of {options.task}", "steps") as progress:
         episode = evaluate(
-            policy_spec.expert, config, [options.seed], workers=1, progress=progress
+            agents.ExpertAgent, config, [options.seed], workers=1, progress=progress
         )[0]
     # One row a view; the columns are the modalities at the start, then those at the end.
     moments = {
@@ -113,7 +113,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 def _film(path: Path, options: Options, console: Console) -> dict[str, object]:
     """Draw a row of images for every subtask: the expert's episode as the first view sees it."""
     from surgicai_vision.envs import contact_sheet
-    from surgicai_vision.evaluation import policy_spec
+    from surgicai_vision.evaluation import agents
     from surgicai_vision.evaluation.rollout import evaluate
 
     folders.check_file(path, "--film", FIGURE_SUFFIXES)
@@ -122,7 +122,7 @@ def _film(path: Path, options: Options, console: Console) -> dict[str, object]:
     with console.stage("filming", "subtasks") as progress:
         for done, subtask in enumerate(names.SUBTASKS):
             config = task_config(subtask, options.env)
-            episode = evaluate(policy_spec.expert, config, [options.seed], workers=1)[0]
+            episode = evaluate(agents.ExpertAgent, config, [options.seed], workers=1)[0]
             last = len(episode.film.states) - 1
             moments = [
                 episode.film.states[round(last * share / (FILM_FRAMES - 1))]

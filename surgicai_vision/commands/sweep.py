@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
@@ -18,7 +18,10 @@ from surgicai_vision.commands.options import (
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, UnknownName
 from surgicai_vision.core.files import configs_folder
-from surgicai_vision.experiments.sweep import AXES, Choice, Grid
+from surgicai_vision.experiments.sweep.grid import AXES, Grid
+
+if TYPE_CHECKING:
+    from surgicai_vision.experiments.sweep.selection import Choice
 
 app = App(
     name="sweep",
@@ -56,13 +59,14 @@ class Options:
 
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
-    """Run the sweep, or list its cells."""
+    """Run the sweep, or list its runs."""
     from surgicai_vision.core.executor import RunContext, open_engine
-    from surgicai_vision.experiments.sweep import read_choice, run_sweep
+    from surgicai_vision.experiments.sweep.driver import run_sweep
+    from surgicai_vision.experiments.sweep.selection import read_choice
 
     path = grid_file(options.grid)
     grid = read_grid(path)
-    choice = read_choice(options.only, grid.cells)
+    choice = read_choice(options.only, grid.runs)
     out = options.out or folders.OUTPUTS / "sweeps" / path.stem
     context = RunContext(options.workers, open_engine(options.executor), console.stage)
     if options.dry_run:
@@ -71,15 +75,16 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     for line in result.pop("problems"):
         console.say(line)
     told = ", ".join(f"{result[name]} {name.replace('_', ' ')}" for name in COUNTS)
-    console.say(f"{result['cells']} cells: {told}; {out}")
+    console.say(f"{result['runs']} runs: {told}; {out}")
     return {**result, "exit_code": 1 if result["failed"] else 0}
 
 
 def _list(
-    grid: Grid, out: Path, choice: Choice, workers: int, console: Console
+    grid: Grid, out: Path, choice: "Choice", workers: int, console: Console
 ) -> dict[str, object]:
-    """Print the state of each cell, and how long the rest takes."""
-    from surgicai_vision.experiments.sweep import STATES, estimate, plan
+    """Say what each run is, and how long the rest takes where a finished run tells it."""
+    from surgicai_vision.experiments.sweep.estimate import estimate
+    from surgicai_vision.experiments.sweep.plan import STATES, plan
 
     states = plan(grid, out, choice)
     for state in states:
@@ -88,13 +93,15 @@ def _list(
     counts = {
         name.replace(" ", "_"): sum(state.state == name for state in states) for name in STATES
     }
+    seconds = estimate(states, out, workers)
     told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
-    time = estimate(grid, out, states, workers)
-    console.say(
-        f"{len(states)} cells: {told}; about {_duration(time['seconds'])} with {workers} workers "
-        f"({time['source']})."
+    rest = (
+        "how long they take is known once the first is finished"
+        if seconds is None
+        else f"about {_duration(seconds)} with {workers} workers, by what the finished ones took"
     )
-    return {"cells": len(states), **counts, "seconds": time["seconds"], "dry_run": True}
+    console.say(f"{len(states)} runs: {told}; {rest}.")
+    return {"runs": len(states), **counts, "seconds": seconds, "dry_run": True}
 
 
 COUNTS = ("done", "cached", "failed", "not_run", "left")

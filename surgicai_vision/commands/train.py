@@ -22,9 +22,11 @@ from surgicai_vision.commands.options import (
     default_text,
 )
 from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
+from surgicai_vision.training.run_config import RunConfig, with_epochs
 
 if TYPE_CHECKING:
     from surgicai_vision.dataset import Dataset
@@ -51,7 +53,8 @@ class Options:
     Attributes:
         task: The dataset's task.
         dataset: Folder of the dataset.
-        subtask: Take one subtask's frames of a dataset of whole procedures, for a chain.
+        subtask: Take one subtask's frames of a dataset of whole procedures, for a hierarchical
+            policy.
         view: Views that the policy sees.
         pool: What is taken from the encoder.
         policy: The kind of policy.
@@ -108,38 +111,43 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     encoder = None if options.encoder in (NO_ENCODER, STATE) else options.encoder
     if encoder:
         encoders.find_weights(encoder, weights)
-    from surgicai_vision.experiments.run import Cell, train_cell
+    from surgicai_vision.experiments.run import train_run
 
     task = names.SUTURE if options.subtask else options.task
-    cell = Cell(
-        task,
+    run = RunConfig(
+        TaskConfig(task),
         encoder,
         _views(options, encoder),
-        options.seed,
-        options.policy,
-        options.recipe,
+        policy=options.policy,
         pool=options.pool if encoder else "global",
         privileged=options.encoder == STATE,
-        epochs=options.epochs,
-        change=options.change,
+        recipe=options.recipe,
+        changes=with_epochs(options.change, options.epochs),
+        seed=options.seed,
     )
-    policies.load_recipe(cell.policy, cell.recipe, cell.changes)
+    policies.recipe_of(run)  # refuses a recipe that does not exist before any work
     label = f"{options.subtask}-of-{task}" if options.subtask else task
-    out = options.out or folders.train_folder(label, cell.name, cell.seed)
+    out = options.out or folders.train_folder(label, run.name, run.seed)
     folders.check_folder(out, "training.json")
-    dataset: Dataset = folders.open_dataset(options.dataset, task, cell.view)
+    dataset: Dataset = folders.open_dataset(options.dataset, task, run.views)
     if options.subtask:
         from surgicai_vision.dataset.subset import of_subtask
 
         dataset = of_subtask(dataset, options.subtask)
-    cell = replace(cell, task=dataset.task)
+    run = replace(run, env=dataset.config)
     with open_log(options.log, out) as log:
-        train_cell(
-            cell, dataset, out, console.stage, weights,
-            start=options.start, save_every=options.save_every, log=log,
-        )  # fmt: skip
+        train_run(
+            run,
+            dataset,
+            out,
+            console.stage,
+            weights,
+            start=options.start,
+            save_every=options.save_every,
+            log=log,
+        )
     console.say(f"checkpoint: {out}")
-    if cell.policy == "bc":
+    if run.policy == "bc":
         console.say(f"next: surgicai-vision evaluate {out}")
     return {"checkpoint": str(out)}
 

@@ -1,4 +1,4 @@
-"""Chain: the whole procedure by a high-level policy and one low-level policy for each subtask.
+"""Hierarchical policies: the whole procedure by a high-level policy over a policy a subtask.
 
 HLP → LLP → termination → HLP: the high-level policy says which subtask is due, that subtask's
 policy moves its arm until the subtask ends, and the high-level policy is asked again. A subtask
@@ -12,58 +12,65 @@ ends
 
 After `decisions` decisions (paper: 50) both arms hold still.
 
-A chain is a YAML file, which `surgicai-vision evaluate chain.yaml` takes (docs/chain.md):
+A hierarchical policy is a YAML file, which `surgicai-vision evaluate hierarchical.yaml` takes
+(docs/hierarchical.md):
 
     hlp: outputs/train/suture-hlp-…   # a checkpoint, or `order`: the subtasks in their order
-    grasp: outputs/train/grasp-…      # a checkpoint of this subtask, LeRobot's too, or `expert`,
-    `random`, `zero` place: …                          # and so on for insert, handoff, pullout
+    grasp: outputs/train/grasp-…      # whatever `evaluate` takes for this subtask
+    place: …                          # and so on for insert, handoff, pullout
     termination: privileged
 """
 
-import functools
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast, final
 
 import numpy as np
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
-from surgicai_vision.core.config import DWELL, TaskConfig, digest, to_mapping
+from surgicai_vision.core.config import DWELL
 from surgicai_vision.core.errors import InputError, check_name
-from surgicai_vision.evaluation import lerobot_agent
-from surgicai_vision.evaluation.agent import Actions, Agent, Env, FeatureTable, Observation
-from surgicai_vision.evaluation.agents import BASELINES, PolicyAgent
-from surgicai_vision.evaluation.policy_spec import Subject, checkpoint_subject, policy_agent
-from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
+from surgicai_vision.evaluation.agent import (
+    Actions,
+    Agent,
+    Env,
+    FeatureTable,
+    MakeAgent,
+    Observation,
+)
+from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.training.run_config import TERMINATIONS
 from surgicai_vision.training.threads import one_thread
 
+if TYPE_CHECKING:
+    from surgicai_vision.envs.suture import Suture
+
 ORDER = "order"
+SUFFIXES = (".yaml", ".yml")
 GRASP = names.SUBTASKS.index("grasp")
 PATIENCE = 5
 """Observations in a row that must name another subtask before a learned termination believes them
 (0.1 s).
 """
-TERMINATIONS = ("privileged", "learned")
 MAX_STEPS = 2000
 """Control steps of an episode: ten subtasks of full length."""
 
 
 @dataclass(frozen=True)
-class Chain:
+class HierarchicalConfig:
     """Who decides, who acts, and when a subtask ends.
 
     Attributes:
         hlp: folder of the high-level policy's checkpoint, or "order".
-        grasp: folder of a checkpoint, or a baseline's name; likewise place, insert, handoff and
-            pullout.
+        grasp: what acts in the subtask, as `open_policy` takes it; likewise place, insert, handoff
+            and pullout.
         termination: one of `TERMINATIONS`.
         steps: control steps a subtask may take.
         decisions: decisions an episode may take.
         max_steps: control steps an episode may take.
         grasp_hold: control steps a grasp must hold before it ends as `privileged`, at most the
-            env's own `DWELL`; a policy that learned to search (`demos.searching`) lets go again
+            env's own `DWELL`; a policy that learned to search (`demos.search_expert`) lets go again
             sooner than that.
     """
 
@@ -81,9 +88,10 @@ class Chain:
 
     def __post_init__(self) -> None:
         check_name("termination", self.termination, TERMINATIONS)
-        for name in ("steps", "decisions", "max_steps"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1.")
+        limits = {"steps": self.steps, "decisions": self.decisions, "max_steps": self.max_steps}
+        for name, limit in limits.items():
+            if limit < 1:
+                raise InputError(f"{name} is {limit}; it must be at least 1.")
         if not 1 <= self.grasp_hold <= DWELL:
             raise InputError(f"grasp_hold is {self.grasp_hold}; allowed: 1 to {DWELL}.")
         if self.hlp == ORDER and self.termination == "learned":
@@ -92,73 +100,15 @@ class Chain:
             )
 
     @property
-    def low(self) -> tuple[str, ...]:
-        """The low-level policies in the order of the subtasks."""
-        return tuple(getattr(self, subtask) for subtask in names.SUBTASKS)
-
-
-def subject(chain: Chain, weights: WeightsSource = ANYWHERE) -> Subject:
-    """Return the subject of a chain, every checkpoint checked.
-
-    Args:
-        chain: who decides and who acts.
-        weights: where pretrained weights come from.
-
-    Raises:
-        BadFile: a folder that is no checkpoint.
-        InputError: a policy of another subtask or scene than it is to act in.
-    """
-    from surgicai_vision.training.checkpoint import read_checkpoint
-
-    configs = {}
-    for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True):
-        if policy not in BASELINES:
-            configs[subtask] = _low_subject(policy, subtask, weights).config
-            if configs[subtask].task != subtask:
-                raise InputError(
-                    f"{policy} was trained for '{configs[subtask].task}', not for '{subtask}'."
-                )
-    about: dict[str, Any] = {"chain": to_mapping(chain)}
-    if chain.hlp != ORDER:
-        checkpoint = read_checkpoint(Path(chain.hlp))
-        if checkpoint.policy != "hlp" or checkpoint.task.task != names.SUTURE:
-            raise InputError(
-                f"{chain.hlp} is '{checkpoint.policy}' of '{checkpoint.task.task}'; hlp: takes an 'hlp'."
-            )
-        configs["hlp"] = checkpoint.task
-    base = configs.values() or [TaskConfig()]
-    made = [replace(config, task=names.SUTURE, max_steps=chain.max_steps) for config in base]
-    if len(set(made)) > 1:
-        raise InputError(
-            "The chain's policies were trained in different scenes or with different steps; give one kind."
-        )
-    about["views"] = list(_views(chain, weights))
-    name = f"chain-{chain.termination}-{digest(chain)[:8]}"
-    return Subject(name, made[0], functools.partial(ChainAgent, name, chain, weights), about)
-
-
-def _low_subject(policy: str, subtask: str, weights: WeightsSource) -> Subject:
-    """Return the subject of a low-level policy's folder, ours or LeRobot's."""
-    lerobot = lerobot_agent.find(Path(policy))
-    if lerobot:
-        return lerobot_agent.subject(lerobot, subtask, weights)
-    return checkpoint_subject(Path(policy), weights)
-
-
-def _views(chain: Chain, weights: WeightsSource) -> tuple[str, ...]:
-    """Every view some policy of the chain sees."""
-    from surgicai_vision.training.checkpoint import read_checkpoint
-
-    seen = set() if chain.hlp == ORDER else set(read_checkpoint(Path(chain.hlp)).views)
-    for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True):
-        if policy not in BASELINES:
-            seen.update(_low_subject(policy, subtask, weights).about["views"])
-    return tuple(view for view in camera_names() if view in seen)
+    def low(self) -> dict[str, str]:
+        """Subtask → what acts in it, in the order of the subtasks."""
+        policies = (self.grasp, self.place, self.insert, self.handoff, self.pullout)
+        return dict(zip(names.SUBTASKS, policies, strict=True))
 
 
 @dataclass
 class _Progress:
-    """Where one episode of a chain stands.
+    """Where one episode stands.
 
     Attributes:
         subtask: the one that is on; -1 before the first decision.
@@ -174,30 +124,36 @@ class _Progress:
 
 
 @final
-class ChainAgent(Agent):
+class HierarchicalAgent(Agent):
     """A high-level policy over low-level ones; see the module's docstring.
 
     It asks the env for nothing but both arms' measured poses and, with a privileged termination,
     whether the present subtask has ended; it tells it which subtask, and so which arm, is on.
+
+    Args:
+        config: when a subtask ends.
+        low: makes the low-level policies, in the order of the subtasks.
+        high: makes the high-level policy; None takes the subtasks in their order.
     """
 
-    def __init__(self, name: str, chain: Chain, weights: WeightsSource = ANYWHERE):
-        self.name, self.chain = name, chain
-        self.cameras = _views(chain, weights)
-        self._low: list[Agent] = [
-            BASELINES[policy]()
-            if policy in BASELINES
-            else _low_subject(policy, subtask, weights).make_agent()
-            for subtask, policy in zip(names.SUBTASKS, chain.low, strict=True)
-        ]
-        self._high: PolicyAgent | None = None
-        if chain.hlp != ORDER:
-            self._high = policy_agent(Path(chain.hlp), weights)
+    name = "hierarchical"
+
+    def __init__(
+        self,
+        config: HierarchicalConfig,
+        low: Sequence[MakeAgent],
+        high: Callable[[], PolicyAgent] | None = None,
+    ):
+        self.config = config
+        self._low = [make() for make in low]
+        self._high = high() if high is not None else None
         self._agents = [*self._low, *([self._high] if self._high else [])]
+        seen = {camera for agent in self._agents for camera in agent.cameras}
+        self.cameras = tuple(camera for camera in camera_names() if camera in seen)
         sizes = {agent.image_size for agent in self._agents if agent.cameras}
         if len(sizes) > 1:
             raise InputError(
-                f"The chain's policies see images of {sorted(sizes)} pixels; give policies of one size."
+                f"The policies see images of {sorted(sizes)} pixels; give policies of one size."
             )
         self.image_size = sizes.pop() if sizes else 224
         self._slots: dict[int, _Progress] = {}
@@ -214,13 +170,11 @@ class ChainAgent(Agent):
     def act(
         self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
     ) -> Actions:
-        """Return the actions (n, 7) of the subtasks that are on, decided anew where one has
-        ended.
-        """
+        """Return the actions (n, 7) of the subtasks that are on, decided anew where one ended."""
         self._features.clear()
         states = [self._slots[slot] for slot in slots]
         with one_thread():
-            self._decide(slots, states, envs, observations)
+            self._decide(slots, states, cast("Sequence[Suture]", envs), observations)
         actions = np.zeros((len(slots), len(names.ACTION_NAMES)), np.float32)
         for subtask, agent in enumerate(self._low):
             rows = [
@@ -239,15 +193,15 @@ class ChainAgent(Agent):
         return actions
 
     def _may_act(self, state: _Progress) -> bool:
-        """Say whether a decision is still being carried out; without one both arms hold still."""
-        return state.decisions <= self.chain.decisions
+        """Return True if a decision is still being carried out; else both arms hold still."""
+        return state.decisions <= self.config.decisions
 
     def _decide(
         self,
         slots: Sequence[int],
         states: Sequence[_Progress],
-        envs: Sequence[Any],
-        observations: Sequence[Any],
+        envs: "Sequence[Suture]",
+        observations: Sequence[Observation],
     ) -> None:
         """Ask the high-level policy wherever it is due, and begin what it says."""
         for state, env in zip(states, envs, strict=True):
@@ -262,41 +216,40 @@ class ChainAgent(Agent):
             return
         chosen = self._choose([envs[row] for row in asked], [observations[row] for row in asked])
         for row, choice in zip(asked, chosen, strict=True):
-            state, env = states[row], envs[row]
+            state = states[row]
+            env = envs[row]
             if self._believes(state, env, choice):
-                state.subtask, state.steps, state.doubts = choice, 0, 0
+                state.subtask = choice
+                state.steps = 0
+                state.doubts = 0
                 state.decisions += 1
                 self._low[choice].restart(slots[row])
             if self._may_act(state):
                 env.enter(state.subtask)
 
-    def _is_asked(self, state: _Progress, env: Any) -> bool:
-        if state.subtask < 0 or state.steps >= self.chain.steps:
+    def _is_asked(self, state: _Progress, env: "Suture") -> bool:
+        if state.subtask < 0 or state.steps >= self.config.steps:
             return True
-        return self.chain.termination == "learned" or env.phase != state.subtask
+        return self.config.termination == "learned" or env.phase != state.subtask
 
-    def _has_grasped(self, state: _Progress, env: Any) -> bool:
-        """Say whether a grasp has held for as long as this chain asks, before the env itself goes
-        on.
-        """
-        if self.chain.termination != "privileged" or not state.subtask == env.phase == GRASP:
+    def _has_grasped(self, state: _Progress, env: "Suture") -> bool:
+        """Return True if a grasp has held for `grasp_hold` steps, before the env itself goes on."""
+        if self.config.termination != "privileged" or not state.subtask == env.phase == GRASP:
             return False
-        return bool(env.dwell >= self.chain.grasp_hold)
+        return bool(env.dwell >= self.config.grasp_hold)
 
-    def _believes(self, state: _Progress, env: Any, choice: int) -> bool:
-        """Say whether a choice is a decision: always but where a learned termination must wait for
-        more.
-        """
+    def _believes(self, state: _Progress, env: "Suture", choice: int) -> bool:
+        """Return True if a choice is a decision; a learned termination must wait for more."""
         if (
             state.subtask < 0
-            or state.steps >= self.chain.steps
-            or self.chain.termination == "privileged"
+            or state.steps >= self.config.steps
+            or self.config.termination == "privileged"
         ):
             return True
         state.doubts = state.doubts + 1 if choice != state.subtask else 0
         return state.doubts >= PATIENCE
 
-    def _choose(self, envs: Sequence[Any], observations: Sequence[Any]) -> list[int]:
+    def _choose(self, envs: "Sequence[Suture]", observations: Sequence[Observation]) -> list[int]:
         """Return the subtask that is due in each env."""
         if self._high is None:
             return [env.phase for env in envs]

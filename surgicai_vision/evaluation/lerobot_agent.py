@@ -1,11 +1,11 @@
-"""LeRobot's policies in our evaluation: a checkpoint of `lerobot-train` becomes the subject of
-`evaluate`.
+"""LeRobot's policies in our evaluation: `evaluate` takes a checkpoint of `lerobot-train`.
 
 Interface:
 
 * `find(folder) -> Path | None`: the folder with config.json and model.safetensors, looked for in a
   training's output, in one of its checkpoints, or in `pretrained_model` itself.
-* `subject(folder, task, weights) -> subjects.Subject`.
+* `read(folder, task) -> LeRobotCheckpoint`: what the policy was trained for and what it sees.
+* `LeRobotAgent`: the policy as an agent.
 
 The policy runs through LeRobot's own pipeline, as in `lerobot-eval`. So that a result depends
 neither on the batch nor on the processes, every slot has a policy of its own (sharing weights) with
@@ -16,7 +16,6 @@ gets all slots in one batch. Importing LeRobot takes ten seconds and happens in 
 import contextlib
 import copy
 import dataclasses
-import functools
 import itertools
 import sys
 from collections.abc import Mapping, Sequence
@@ -31,10 +30,9 @@ from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
-from surgicai_vision.core.tasks import task_text
 from surgicai_vision.evaluation.agent import Actions, Agent, Env, Observation, frame_of
-from surgicai_vision.evaluation.policy_spec import Subject
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
+from surgicai_vision.training.run_config import OWN
 from surgicai_vision.training.threads import one_thread
 
 CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
@@ -54,7 +52,7 @@ def find(folder: Path) -> Path | None:
 
 
 @dataclass(frozen=True)
-class Sight:
+class Inputs:
     """What the policy sees.
 
     Attributes:
@@ -70,13 +68,31 @@ class Sight:
     sha256: str = ""
 
 
-def subject(folder: Path, task: str | None = None, weights: WeightsSource = ANYWHERE) -> Subject:
-    """Return the subject of a checkpoint folder of `find`.
+@dataclass(frozen=True)
+class LeRobotCheckpoint:
+    """What is known of a checkpoint without loading it.
+
+    Attributes:
+        policy: LeRobot's type of the policy.
+        config: the task it was trained for.
+        inputs: what it sees.
+        encoder: the frozen encoder, ours or the policy's own; None for a policy without images.
+        policy_sha256: hash of its weights.
+    """
+
+    policy: str
+    config: TaskConfig
+    inputs: Inputs
+    encoder: str | None
+    policy_sha256: str
+
+
+def read(folder: Path, task: str | None = None) -> LeRobotCheckpoint:
+    """Read a checkpoint folder of `find`.
 
     Args:
         folder: holds config.json and model.safetensors.
         task: the task, where the checkpoint does not say it.
-        weights: where pretrained weights come from.
 
     Raises:
         BadFile: a checkpoint that is damaged.
@@ -84,27 +100,16 @@ def subject(folder: Path, task: str | None = None, weights: WeightsSource = ANYW
     """
     policy = _table(folder / CONFIG)
     training = _table(folder / TRAINING) if (folder / TRAINING).is_file() else {}
-    config, sight = _circumstances(training, folder, task, policy)
-    encoder, views = (
-        sight.encoder or policy.get("encoder"),
-        "+".join(sight.cameras) or "proprioception",
-    )
-    name = "-".join(part for part in (policy["type"], encoder, views) if part)
-    text = task_text(config.task)
-    about = {
-        "checkpoint": {"policy_sha256": sha256_file(folder / WEIGHTS), "policy": policy["type"]},
-        "folder": str(folder),
-        "views": list(sight.cameras),
-        "encoder": encoder or "own",
-    }
-    return Subject(
-        name, config, functools.partial(LeRobotAgent, name, folder, sight, weights, text), about
-    )
+    config, inputs = _circumstances(training, folder, task, policy)
+    named = inputs.encoder or policy.get("encoder")
+    encoder = (named or OWN) if inputs.cameras else None
+    sha256 = sha256_file(folder / WEIGHTS)
+    return LeRobotCheckpoint(str(policy["type"]), config, inputs, encoder, sha256)
 
 
 def _circumstances(
     training: Mapping[str, Any], folder: Path, task: str | None, policy: Mapping[str, Any]
-) -> tuple[TaskConfig, Sight]:
+) -> tuple[TaskConfig, Inputs]:
     """Return the task the policy was trained for and what it sees, from its env, its dataset or
     `task`.
     """
@@ -133,23 +138,24 @@ def _circumstances(
         config = TaskConfig(task=task)
     else:
         raise InputError(f"{folder} does not say what it was trained for; give --task.")
-    return config, _sight(folder, policy.get("input_features") or {}, features)
+    return config, _inputs(folder, policy.get("input_features") or {}, features)
 
 
-def _sight(folder: Path, inputs: Mapping[str, Any], features: Mapping[str, Any]) -> Sight:
+def _inputs(folder: Path, seen: Mapping[str, Any], features: Mapping[str, Any]) -> Inputs:
     """Return what a policy with these inputs sees."""
-    if names.ENVIRONMENT_STATE in inputs:
+    if names.ENVIRONMENT_STATE in seen:
         if not features:
             raise InputError(
-                f"{folder} sees {names.ENVIRONMENT_STATE}, and neither its env nor its dataset says of which encoder."
+                f"{folder} sees {names.ENVIRONMENT_STATE}, and neither its env nor its dataset "
+                "says of which encoder; train it on an exported dataset of ours."
             )
-        return Sight(
+        return Inputs(
             tuple(features["views"]),
             features["size"],
             features["encoder"],
             features["weights_sha256"],
         )
-    shapes = {key: value["shape"] for key, value in inputs.items() if value["type"] == VISUAL}
+    shapes = {key: value["shape"] for key, value in seen.items() if value["type"] == VISUAL}
     known = {names.image_key(view): view for view in camera_names()}
     for key in shapes:
         check_name(f"image of {folder}", key, known)
@@ -158,7 +164,7 @@ def _sight(folder: Path, inputs: Mapping[str, Any], features: Mapping[str, Any])
         raise InputError(
             f"{folder} sees images of {sorted(sizes)}; our envs show square ones of one size."
         )
-    return Sight(tuple(known[key] for key in shapes), next(iter(sizes))[0] if sizes else 224)
+    return Inputs(tuple(known[key] for key in shapes), next(iter(sizes))[0] if sizes else 224)
 
 
 def _table(path: Path) -> dict[str, Any]:
@@ -176,7 +182,7 @@ class LeRobotAgent(Agent):
     Args:
         name: how tables call it.
         folder: its checkpoint.
-        sight: what it sees.
+        inputs: what it sees.
         weights: where pretrained weights come from.
         text: the task in words, as its dataset says it; empty for the env's own.
     """
@@ -185,15 +191,17 @@ class LeRobotAgent(Agent):
         self,
         name: str,
         folder: Path,
-        sight: Sight,
+        inputs: Inputs,
         weights: WeightsSource = ANYWHERE,
         text: str = "",
     ):
-        self.name, self.cameras, self.image_size = name, sight.cameras, sight.image_size
+        self.name = name
+        self.cameras = inputs.cameras
+        self.image_size = inputs.image_size
         self._policy, self._before, self._after = _load(folder, weights)
         self._text = text
         self._together = bool(getattr(self._policy, "memoryless", False))
-        self._encoder = _encoder(sight, weights) if sight.encoder else None
+        self._encoder = _encoder(inputs, weights) if inputs.encoder else None
         device = str(next(self._policy.parameters()).device)
         self._devices = ("cpu",) if device == "cpu" else ("cpu", device)
         self._slots: dict[int, tuple[Any, dict[str, Any]]] = {}
@@ -314,12 +322,12 @@ def _load(folder: Path, weights: WeightsSource) -> tuple[Any, Any, Any]:
     return policy.eval(), before, after
 
 
-def _encoder(sight: Sight, weights: WeightsSource) -> Any:
+def _encoder(inputs: Inputs, weights: WeightsSource) -> Any:
     """Load the encoder whose features the policy sees, verified."""
-    encoder = load_encoder(str(sight.encoder), weights=weights)
-    if sight.sha256 and encoder.weights_sha256 != sight.sha256:
+    encoder = load_encoder(str(inputs.encoder), weights=weights)
+    if inputs.sha256 and encoder.weights_sha256 != inputs.sha256:
         raise InputError(
-            f"The policy was trained on encoder '{sight.encoder}' with weights sha256 {sight.sha256}, got "
-            f"{encoder.weights_sha256}; hand over the same with --weights."
+            f"The policy was trained on encoder '{inputs.encoder}' with weights sha256 "
+            f"{inputs.sha256}, got {encoder.weights_sha256}; hand over the same with --weights."
         )
     return encoder

@@ -1,4 +1,4 @@
-"""Rows: what is kept of one episode, and the summary of many. `docs/evaluation.md` explains every
+"""Metrics: what is kept of one episode, and the summary of many. `docs/evaluation.md` explains every
 column.
 
 All lengths, angles and forces are read from the measured physical state, never from a command.
@@ -113,14 +113,14 @@ def summary(rows: Sequence[EpisodeMetrics]) -> dict[str, Any]:
         "failures": {kind: failures.count(kind) for kind in KINDS if kind in failures},
         "first_seed": min(row.seed for row in rows),
         **(
-            {"reached": _reached(rows), "survival": survival(rows)}
+            {"reached": _reached(rows), "subtasks": subtask_successes(rows)}
             if first.task == names.SUTURE
             else {}
         ),
     }
 
 
-def survival(rows: Sequence[EpisodeMetrics]) -> list[dict[str, Any]]:
+def subtask_successes(rows: Sequence[EpisodeMetrics]) -> list[dict[str, Any]]:
     """Return for each subtask how many episodes finished it and all before it: k of n, with the
     exact interval.
     """

@@ -1,16 +1,28 @@
-"""Subjects: who is evaluated in which task: a baseline, blind replay, the policy of a checkpoint
-folder.
+"""What is evaluated: `open_policy` is the only place that decides it.
+
+open_policy("expert", task="grasp")          # or random, zero
+open_policy("replay", dataset=dataset)       # the mean demonstration, without observing
+open_policy("outputs/train/grasp-…")         # a checkpoint of ours or of LeRobot's
+open_policy("hierarchical.yaml")             # a high-level policy over low-level ones
+open_policy("my_package.my_module:factory")  # a function that returns an `agent.Agent`
 """
 
+import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import yaml
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.cameras import view_names
+from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
+from surgicai_vision.core.errors import BadFile, InputError, UnknownName, check_name
+from surgicai_vision.core.plugins import resolve
+from surgicai_vision.core.tasks import task_text
+from surgicai_vision.evaluation import lerobot_agent
 from surgicai_vision.evaluation.agent import Agent, MakeAgent
 from surgicai_vision.evaluation.agents import (
     BASELINES,
@@ -18,121 +30,217 @@ from surgicai_vision.evaluation.agents import (
     ReplayAgent,
     mean_demonstration,
 )
+from surgicai_vision.evaluation.hierarchical import (
+    ORDER,
+    SUFFIXES,
+    HierarchicalAgent,
+    HierarchicalConfig,
+)
+from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
+from surgicai_vision.training import policies
+from surgicai_vision.training.run_config import OWN, RunConfig
 
 if TYPE_CHECKING:
     from surgicai_vision.dataset.protocol import Dataset
 
+REPLAY = ReplayAgent.name
+
 
 @dataclass(frozen=True)
-class Subject:
-    """Who is evaluated in which task.
+class PolicySpec:
+    """What is evaluated in which task.
 
     Attributes:
-        name: how tables call it.
-        config: the task.
-        make_agent: makes the agent in a worker process.
-        about: more to be kept beside the result.
+        run: what it is, as data; `run.env` is the task.
+        make: makes the agent in a worker process.
+        about: more to be kept beside the result: hashes and folders.
     """
 
-    name: str
-    config: TaskConfig
-    make_agent: MakeAgent
-    about: dict[str, Any] = field(default_factory=dict)
+    run: RunConfig
+    make: MakeAgent
+    about: Mapping[str, JSON] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """How tables call it."""
+        return self.run.name
+
+    @property
+    def config(self) -> TaskConfig:
+        """The task."""
+        return self.run.env
+
+    @property
+    def make_agent(self) -> MakeAgent:
+        """Makes the agent, called as tables call it."""
+        return functools.partial(_named, self.make, self.name)
 
 
-def policy_name(
-    encoder: str | None,
-    views: Sequence[str],
-    pool: str = "global",
-    privileged: bool = False,
-    policy: str = "bc",
-    recipe: str = "paper",
-) -> str:
-    """Name a policy by its inputs, and by what is not as usual."""
-    name = (
-        f"{encoder}-{'+'.join(views)}" if encoder else "state" if privileged else "proprioception"
-    )
-    unusual = [part for part, usual in ((pool, "global"), (recipe, "paper")) if part != usual]
-    return "-".join([*([] if policy == "bc" else [policy]), name.replace(":", "-"), *unusual])
+def _named(make: MakeAgent, name: str) -> Agent:
+    """Make an agent and name it (in a worker process)."""
+    agent = make()
+    agent.name = name
+    return agent
 
 
-def baseline_subject(name: str, config: TaskConfig) -> Subject:
-    """Return the subject of a baseline: expert, random or zero."""
-    return Subject(name, config, functools.partial(baseline, name))
+def open_policy(
+    given: str | Path,
+    *,
+    task: str | None = None,
+    env: Mapping[str, JSON] | None = None,
+    dataset: "Dataset | None" = None,
+    expert_swap: str | None = None,
+    weights: WeightsSource = ANYWHERE,
+) -> PolicySpec:
+    """Return what `given` names; checkpoints are read and their weights looked up at once.
+
+    Args:
+        given: a baseline's name, "replay", a checkpoint folder of ours or LeRobot's, the YAML file
+            of a hierarchical policy, or "module:factory".
+        task: the task; None takes the checkpoint's, else grasp.
+        env: fields of `TaskConfig` that differ from the default's; None keeps the env a policy was
+            trained in.
+        dataset: whose mean demonstration "replay" plays.
+        expert_swap: the subtask of a hierarchical policy that the expert does in its place.
+        weights: where pretrained weights come from.
+
+    Raises:
+        UnknownName: a name that stands for nothing.
+        BadFile: a folder or file that is no policy.
+        InputError: a policy of another task, or an option that does not go with this policy.
+        MissingWeights: an encoder's weights are not at hand.
+    """
+    text, path = str(given), Path(given)
+    if expert_swap is not None and path.suffix not in SUFFIXES:
+        raise InputError(
+            f"--expert-swap {expert_swap} is for the YAML file of a hierarchical policy; "
+            f"leave it out for {text}."
+        )
+    if text == REPLAY:
+        if dataset is None:
+            raise InputError("replay plays the mean demonstration of a dataset; give a dataset.")
+        spec = _replay(dataset)
+    elif text in BASELINES:
+        config = TaskConfig(task or "grasp")
+        spec = PolicySpec(RunConfig(config, policy=text), BASELINES[text])
+    elif path.suffix in SUFFIXES:
+        spec = hierarchical_policy(read_hierarchical(path), expert_swap, weights)
+    elif ":" in text and not path.exists():
+        spec = _from_factory(text, TaskConfig(task or "grasp"))
+    elif not path.exists() and path.parent == Path():
+        raise UnknownName("policy or checkpoint folder", text, (*BASELINES, REPLAY))
+    else:
+        spec = _from_folder(path, task, weights)
+    if task not in (None, spec.config.task):
+        raise InputError(
+            f"{text} was trained for '{spec.config.task}', not for '{task}'; "
+            "leave the task out, or give a policy of that task."
+        )
+    return _in_env(spec, env)
 
 
-def replay_subject(dataset: "Dataset") -> Subject:
-    """Return the subject that replays the mean demonstration of an opened dataset, blind.
+def _in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
+    """Put what is evaluated into the env of the table `env`, where there is one."""
+    if not env:
+        return spec
+    if "task" in env:
+        raise InputError("env: the task is an option of its own; write `task:` beside `env:`.")
+    limit = {"max_steps": spec.config.max_steps} if spec.run.is_hierarchical else {}
+    config = from_mapping(TaskConfig, {**limit, **env, "task": spec.config.task}, "env")
+    return dataclasses.replace(spec, run=dataclasses.replace(spec.run, env=config))
+
+
+def _replay(dataset: "Dataset") -> PolicySpec:
+    """Return the mean demonstration of an opened dataset.
 
     Raises:
         InputError: a dataset without every step's frame.
     """
     if dataset.fps != names.FPS:
         raise InputError(
-            f"{dataset.path} holds {dataset.fps} frames a second; a replay needs each step's: {names.FPS}."
+            f"{dataset.path} holds {dataset.fps} frames a second; "
+            f"a replay needs each step's: {names.FPS}."
         )
     actions = mean_demonstration(dataset.columns()[names.ACTION], dataset.episode_index)
-    about = {"dataset": dataset.fingerprint}
-    return Subject(ReplayAgent.name, dataset.config, functools.partial(ReplayAgent, actions), about)
+    run = RunConfig(dataset.config, policy=REPLAY)
+    about: dict[str, JSON] = {"dataset": dataset.fingerprint}
+    return PolicySpec(run, functools.partial(ReplayAgent, actions), about)
 
 
-def checkpoint_subject(folder: Path, weights: WeightsSource = ANYWHERE) -> Subject:
-    """Return the subject of a checkpoint folder; its weights are looked up at once.
+def _from_factory(target: str, config: TaskConfig) -> PolicySpec:
+    """Return what a function elsewhere makes: "module:factory", called in each worker process."""
+    agent = make_from_factory(target)
+    encoder = OWN if agent.cameras else None
+    run = RunConfig(config, encoder, agent.cameras, policy=target)
+    return PolicySpec(run, functools.partial(make_from_factory, target))
+
+
+def make_from_factory(target: str) -> Agent:
+    """Call "module:factory" for an agent.
+
+    Raises:
+        InputError: there is no such function, or it returns something else.
+    """
+    try:
+        factory = resolve(target)
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"{target} cannot be imported: {error}; give module:factory.") from error
+    agent = factory() if callable(factory) else factory
+    if not isinstance(agent, Agent):
+        raise InputError(
+            f"{target} gives {type(agent).__name__}; "
+            "it must be a function that returns a surgicai_vision.evaluation.agent.Agent."
+        )
+    return agent
+
+
+def _from_folder(folder: Path, task: str | None, weights: WeightsSource) -> PolicySpec:
+    """Return the policy of a checkpoint folder, LeRobot's or ours."""
+    lerobot = lerobot_agent.find(folder)
+    if lerobot is None:
+        return _from_checkpoint(folder, weights)
+    known = lerobot_agent.read(lerobot, task)
+    run = RunConfig(known.config, known.encoder, known.inputs.cameras, policy=known.policy)
+    text = task_text(known.config.task)
+    make = functools.partial(
+        lerobot_agent.LeRobotAgent, run.name, lerobot, known.inputs, weights, text
+    )
+    about: dict[str, JSON] = {
+        "checkpoint": {"policy_sha256": known.policy_sha256},
+        "folder": str(lerobot),
+    }
+    return PolicySpec(run, make, about)
+
+
+def _from_checkpoint(folder: Path, weights: WeightsSource) -> PolicySpec:
+    """Return the policy of a checkpoint folder of ours.
 
     Raises:
         BadFile: no checkpoint folder.
+        InputError: a high-level policy.
         MissingWeights: the encoder's weights are not at hand.
     """
-    from surgicai_vision.features import encoders
-    from surgicai_vision.training import policies
     from surgicai_vision.training.checkpoint import read_checkpoint
 
     checkpoint = read_checkpoint(folder)
     if policies.policy_plugin(checkpoint.policy).target != names.ACTION:
         raise InputError(
-            f"{folder} chooses subtasks and does not act; name it as hlp: in the file of a chain (docs/chain.md)."
+            f"{folder} chooses subtasks and does not act; "
+            "name it as hlp: in the file of a hierarchical policy (docs/hierarchical.md)."
         )
     encoder = checkpoint.encoder
     if encoder:
         encoders.find_weights(encoder.name, weights)
-    about = {
+    about: dict[str, JSON] = {
         "checkpoint": {
             "weights_sha256": encoder.weights_sha256 if encoder else None,
             "policy_sha256": checkpoint.policy_sha256,
-            "policy": checkpoint.policy,
-            "recipe": checkpoint.recipe_name,
-            "seed": checkpoint.seed,
             "dataset": checkpoint.dataset,
-            "demonstrations": checkpoint.demonstrations,
         },
         "folder": str(folder),
-        "views": list(checkpoint.views),
-        "encoder": encoder.name if encoder else checkpoint_name(checkpoint),
     }
-    make = functools.partial(policy_agent, folder, weights)
-    return Subject(checkpoint_name(checkpoint), checkpoint.task, make, about)
-
-
-def checkpoint_name(checkpoint: Any) -> str:
-    """How tables call a checkpoint's policy."""
-    encoder = checkpoint.encoder
-    privileged = bool(checkpoint.recipe.get("privileged"))
-    pool = encoder.pool if encoder else "global"
-    name = encoder.name if encoder else None
-    return policy_name(
-        name, checkpoint.views, pool, privileged, checkpoint.policy, checkpoint.recipe_name
-    )
-
-
-def expert() -> Agent:
-    """Make the expert (in a worker process)."""
-    return baseline("expert")
-
-
-def baseline(name: str) -> Agent:
-    """Make a baseline agent (in a worker process)."""
-    return BASELINES[name]()
+    return PolicySpec(checkpoint.run, functools.partial(policy_agent, folder, weights), about)
 
 
 def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent:
@@ -141,10 +249,88 @@ def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent
     Raises:
         InputError: the encoder at hand is not the one the policy was trained on.
     """
-    from surgicai_vision.training import policies
-
     policy = policies.load_policy(folder)
     checkpoint = policy.checkpoint
     encoder = policies.load_encoder_of(checkpoint, weights)
-    name, vector = checkpoint_name(checkpoint), policy.inputs.vector or names.STATE
-    return PolicyAgent(name, policy, encoder, checkpoint.views, checkpoint.image_size, vector)
+    return PolicyAgent(
+        checkpoint.run.name,
+        policy,
+        encoder,
+        checkpoint.views,
+        checkpoint.image_size,
+        policy.inputs.vector or names.STATE,
+    )
+
+
+def read_hierarchical(path: Path) -> HierarchicalConfig:
+    """Read the YAML file of a hierarchical policy.
+
+    Raises:
+        BadFile: it cannot be read.
+        InputError: a key or a value that is not allowed.
+    """
+    try:
+        table = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BadFile(f"Cannot read {path}: {' '.join(str(error).split())}.") from None
+    return from_mapping(HierarchicalConfig, table or {}, str(path))
+
+
+def hierarchical_policy(
+    config: HierarchicalConfig,
+    expert_swap: str | None = None,
+    weights: WeightsSource = ANYWHERE,
+) -> PolicySpec:
+    """Return a high-level policy over low-level ones, every checkpoint checked.
+
+    Args:
+        config: who decides and who acts.
+        expert_swap: the subtask that the expert does in the place of its policy.
+        weights: where pretrained weights come from.
+
+    Raises:
+        BadFile: a folder that is no checkpoint.
+        InputError: a policy of another subtask or scene than it is to act in.
+    """
+    from surgicai_vision.training.checkpoint import read_checkpoint
+
+    # With experts in every place a policy knows no scene: the task is that of all its policies.
+    known: dict[str, RunConfig] = {}
+    low: dict[str, MakeAgent] = {}
+    for subtask, policy in config.low.items():
+        spec = open_policy(policy, task=subtask, weights=weights)
+        low[subtask] = spec.make_agent
+        if spec.run.is_trained:
+            known[subtask] = spec.run
+    high: functools.partial[PolicyAgent] | None = None
+    if config.hlp != ORDER:
+        checkpoint = read_checkpoint(Path(config.hlp))
+        if checkpoint.policy != "hlp" or checkpoint.task.task != names.SUTURE:
+            raise InputError(
+                f"{config.hlp} is '{checkpoint.policy}' of '{checkpoint.task.task}'; "
+                "hlp: takes an 'hlp' of 'suture'."
+            )
+        known["hlp"] = checkpoint.run
+        high = functools.partial(policy_agent, Path(config.hlp), weights)
+    envs = {
+        dataclasses.replace(run.env, task=names.SUTURE, max_steps=config.max_steps)
+        for run in known.values()
+    } or {TaskConfig(names.SUTURE, max_steps=config.max_steps)}
+    if len(envs) > 1:
+        raise InputError(
+            "The policies were trained in different scenes or with different steps; "
+            "give policies of one scene and step size."
+        )
+    if expert_swap is not None:
+        low[check_name("subtask", expert_swap, names.SUBTASKS)] = BASELINES["expert"]
+        known.pop(expert_swap, None)
+    seen = {view for run in known.values() for view in run.views}
+    run = RunConfig(
+        envs.pop(),
+        views=tuple(view for view in view_names() if view in seen),
+        termination=config.termination,
+        parts=digest(config),
+        expert_swap=expert_swap,
+    )
+    make = functools.partial(HierarchicalAgent, config, tuple(low.values()), high)
+    return PolicySpec(run, make, {"hierarchical": to_mapping(config)})

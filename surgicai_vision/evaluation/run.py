@@ -1,60 +1,55 @@
 """Run: evaluate a policy and keep everything in a folder."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-from surgicai_vision.core import files
-from surgicai_vision.core.config import to_mapping
-from surgicai_vision.core.progress import Stage
-from surgicai_vision.evaluation.policy_spec import Subject
+from surgicai_vision.core.progress import Progress, Stage
+from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.rollout import evaluate
-from surgicai_vision.evaluation.storage import MARKER, write_evaluation
+from surgicai_vision.evaluation.storage import MARKER, Row, read_evaluation, write_evaluation
+from surgicai_vision.scene import build_scene
+from surgicai_vision.training.run_config import Starts
 
 
 def evaluate_once(
     out: Path,
-    make_subject: Callable[[], Subject],
+    open_spec: Callable[[], PolicySpec],
     seeds: Sequence[int],
     stage: Stage,
     workers: int | None,
-) -> dict[str, Any]:
+) -> Row:
     """Evaluate into the folder `out` if it holds no evaluation yet; return the summary."""
     if (out / MARKER).exists():
-        summary: dict[str, Any] = files.read_json(out / MARKER)["summary"]
-        return summary
-    subject = make_subject()
-    with stage(f"evaluation: {subject.name}", "steps") as progress:
-        return evaluate_into(out, subject, seeds, workers, progress)
+        return read_evaluation(out).summary
+    spec = open_spec()
+    with stage(f"evaluation: {spec.name}", "steps") as progress:
+        return evaluate_into(out, spec, seeds, workers, progress)
 
 
 def evaluate_into(
     out: Path,
-    subject: Subject,
+    spec: PolicySpec,
     seeds: Sequence[int],
     workers: int | None = None,
-    progress: Callable[..., None] | None = None,
-) -> dict[str, Any]:
+    progress: Progress | None = None,
+) -> Row:
     """Evaluate, store everything in the folder `out` and return the summary.
 
     Args:
         out: folder for rows, films and summary.
-        subject: who acts.
-        seeds: start seeds.
+        spec: what is evaluated.
+        seeds: start seeds, in a row.
         workers: processes.
         progress: called as progress(steps done, steps at most).
     """
-    from surgicai_vision.scene import build_scene
-
-    episodes = evaluate(
-        subject.make_agent, subject.config, seeds, workers=workers, progress=progress
-    )
+    episodes = evaluate(spec.make_agent, spec.config, seeds, workers=workers, progress=progress)
     about = {
         "command": command_line(),
         "provenance": provenance(),
-        "scene_hash": build_scene(subject.config.scene).hash,
-        **subject.about,
-        "task_config": to_mapping(subject.config),
+        "scene_hash": build_scene(spec.config.scene).hash,
+        **spec.about,
     }
-    return write_evaluation(out, episodes, about)
+    run = dataclasses.replace(spec.run, starts=Starts(int(seeds[0]), len(seeds)))
+    return write_evaluation(out, episodes, run, about)

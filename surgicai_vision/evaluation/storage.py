@@ -1,40 +1,92 @@
 """Results: an evaluation as a folder, for reports and for anyone's own analysis.
 
-`evaluation.json` (written last: it marks a whole folder) holds the summary and how it was made,
-`episodes.parquet` one row an episode, `films.safetensors` a few states of each episode.
+`evaluation.json` (written last: it marks a whole folder) holds the run, the summary and how it was
+made, `episodes.parquet` one row an episode, `films.safetensors` a few states of each episode.
 """
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core import files
+from surgicai_vision.core.config import JSON, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.evaluation.metrics import as_table, summary
 from surgicai_vision.evaluation.rollout import Episode, Film
+from surgicai_vision.training.run_config import RunConfig
 
 MARKER = "evaluation.json"
 EPISODES = "episodes.parquet"
 FILMS = "films.safetensors"
 RUN_FILE = "run.json"
 GRID_FILE = "sweep.json"
-CELL_FILE = "cell.json"
+RESULT_FILE = "result.json"
 FAILED_FILE = "failed.json"
+FORMAT = 2
+"""Version of what evaluations, sweeps and quickstarts store; 0.1 wrote none."""
+
+Row = dict[str, Any]
+"""A row of a table, or a summary: plain data."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What `evaluation.json` holds.
+
+    Attributes:
+        run: what was evaluated.
+        summary: its counts.
+        about: with what, where and by which command.
+    """
+
+    run: RunConfig
+    summary: Row
+    about: Row
+
+
+def read_versioned(path: Path) -> Row:
+    """Read a JSON table that this version wrote.
+
+    Raises:
+        BadFile: it cannot be read, or another version wrote it.
+    """
+    stored = files.read_json(path)
+    found = stored.get("format") if isinstance(stored, dict) else None
+    if found != FORMAT:
+        raise BadFile(
+            f"{path} has format {found!r}, of another version (0.1 wrote none); "
+            f"this one reads {FORMAT}. Make it again."
+        )
+    table: Row = stored
+    return table
+
+
+def read_evaluation(folder: Path) -> Evaluation:
+    """Read `evaluation.json`.
+
+    Raises:
+        BadFile: there is none, or another version wrote it.
+    """
+    stored = read_versioned(folder / MARKER)
+    run = from_mapping(RunConfig, stored["run"], str(folder / MARKER))
+    return Evaluation(run, stored["summary"], stored["about"])
 
 
 def write_evaluation(
-    folder: Path, episodes: Sequence[Episode], about: dict[str, Any]
-) -> dict[str, Any]:
+    folder: Path, episodes: Sequence[Episode], run: RunConfig, about: Mapping[str, JSON]
+) -> Row:
     """Write an evaluation; an earlier one in the same folder is replaced.
 
     Args:
         folder: made where it is missing.
         episodes: what `evaluate` returned.
-        about: how it was made: "task_config", "checkpoint", "views" and whatever else is worth
-            keeping.
+        run: what was evaluated.
+        about: how it was made: "checkpoint", "command" and whatever else is worth keeping.
 
     Returns:
         The summary.
@@ -45,17 +97,18 @@ def write_evaluation(
     (folder / MARKER).unlink(missing_ok=True)
     rows = [episode.row for episode in episodes]
     files.write_bytes(folder / EPISODES, parquet_bytes(as_table(rows)))
-    arrays: dict[str, Any] = {}
+    arrays: dict[str, NDArray[np.generic]] = {}
     for episode in episodes:
         arrays[f"{episode.row.seed}.steps"] = episode.film.steps
         arrays[f"{episode.row.seed}.states"] = episode.film.states
     files.write_bytes(folder / FILMS, save(arrays))
     result = summary(rows)
-    files.write_json(folder / MARKER, {"summary": result, "about": about})
+    stored = {"format": FORMAT, "run": to_mapping(run), "summary": result, "about": dict(about)}
+    files.write_json(folder / MARKER, stored)
     return result
 
 
-def parquet_bytes(table: list[dict[str, Any]]) -> bytes:
+def parquet_bytes(table: list[Row]) -> bytes:
     """Return rows of plain data as a Parquet file."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -65,23 +118,26 @@ def parquet_bytes(table: list[dict[str, Any]]) -> bytes:
     return buffer.getvalue()
 
 
-def read_rows(folder: Path) -> list[dict[str, Any]]:
+def read_rows(folder: Path) -> list[Row]:
     """Return the rows of an evaluation, one dictionary an episode."""
     import pyarrow.parquet as pq
 
     path = folder / EPISODES
     if not path.is_file():
         raise BadFile(f"{folder} holds no evaluation ({EPISODES} is missing).")
-    rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
+    rows: list[Row] = pq.read_table(path).to_pylist()
     return rows
 
 
 def read_film(folder: Path, seed: int) -> Film:
-    """Return the states kept of one episode."""
+    """Return the states kept of one episode; a film without states where none were kept."""
     from safetensors import safe_open
 
+    if not (folder / FILMS).is_file():
+        return Film(np.zeros(0, np.int64), np.zeros((0, 0)))
     with safe_open(str(folder / FILMS), framework="numpy") as file:
-        steps, states = file.get_tensor(f"{seed}.steps"), file.get_tensor(f"{seed}.states")
+        steps = file.get_tensor(f"{seed}.steps")
+        states = file.get_tensor(f"{seed}.states")
     return Film(np.asarray(steps), np.asarray(states))
 
 

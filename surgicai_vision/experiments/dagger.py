@@ -1,5 +1,4 @@
-"""DAgger (Ross et al. 2011): a learner drives, the expert says at each of its states what it would
-have done.
+"""DAgger (Ross et al. 2011): a learner acts, and the expert labels the states it reaches.
 
     learner = learner_of(Path("outputs/train/grasp-…"), config)
     record(config, episodes=350, demonstrator="search", learner=learner, out=Path("demos"))
@@ -18,13 +17,13 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.core.config import TaskConfig, from_mapping
+from surgicai_vision.core.config import JSON, TaskConfig, from_mapping
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import job
 from surgicai_vision.demos.demonstrator import BehaviourPolicy
 from surgicai_vision.demos.record import Learner, record_into
-from surgicai_vision.evaluation.agent import Agent
-from surgicai_vision.evaluation.policy_spec import checkpoint_subject
+from surgicai_vision.evaluation.agent import Agent, Env, Observation
+from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.rollout import env_of
 
 
@@ -36,12 +35,12 @@ class MixturePolicy(BehaviourPolicy):
         self._agent = agent
         self._left = 0
 
-    def reset(self, env: Any, seed: int, rng: np.random.Generator) -> None:
+    def reset(self, env: Env, seed: int, rng: np.random.Generator) -> None:
         """Draw the step at which the expert takes over."""
         self._agent.reset(0, env, seed)
         self._left = int(rng.integers(0, env.config.max_steps, endpoint=True))
 
-    def action(self, env: Any, observation: Any) -> NDArray[np.float32] | None:
+    def action(self, env: Env, observation: Observation) -> NDArray[np.float32] | None:
         """Return the agent's action (7,) in [-1, 1], or None once the expert has taken over."""
         if not self._left:
             return None
@@ -55,15 +54,14 @@ def learner_of(folder: Path, config: TaskConfig) -> Learner:
 
     Raises:
         BadFile: no checkpoint folder.
-        InputError: a policy of another task, or one that does not act.
+        InputError: a policy of another task, or one that is not trained or does not act.
         MissingWeights: the encoder's weights are not at hand.
     """
-    subject = checkpoint_subject(folder)
-    if subject.config.task != config.task:
-        raise InputError(
-            f"{folder} was trained for '{subject.config.task}'; '{config.task}' is to be recorded."
-        )
-    return Learner(folder, str(subject.about["checkpoint"]["policy_sha256"]))
+    spec = open_policy(folder, task=config.task)
+    checkpoint = spec.about.get("checkpoint")
+    if not isinstance(checkpoint, Mapping):
+        raise InputError(f"--learner {folder} is not trained; give a checkpoint folder.")
+    return Learner(folder, str(checkpoint["policy_sha256"]))
 
 
 @job(
@@ -74,15 +72,15 @@ def learner_of(folder: Path, config: TaskConfig) -> Learner:
     ),
     packages=("mujoco", "numpy", "torch", "timm", "lerobot"),
 )  # fmt: skip
-def record_driven(folder: Path, task: Mapping[str, Any], learner: str, **how: Any) -> None:
+def record_driven(folder: Path, task: Mapping[str, JSON], learner: str, **how: Any) -> None:
     """Job "drive-episode": as "record-episode", with a learner that drives."""
     env, mixture = _driven(from_mapping(TaskConfig, task), learner)
     record_into(folder, env, behaviour=mixture, **how)
 
 
 @functools.lru_cache(maxsize=1)
-def _driven(config: TaskConfig, learner: str) -> tuple[Any, MixturePolicy]:
+def _driven(config: TaskConfig, learner: str) -> tuple[Env, MixturePolicy]:
     """Return this process's environment with what the learner sees, and the learner."""
     atexit.register(_driven.cache_clear)  # the GL context must go before the interpreter does
-    agent = checkpoint_subject(Path(learner)).make_agent()
+    agent = open_policy(learner, task=config.task).make_agent()
     return env_of(agent, config), MixturePolicy(agent)

@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass
 
+from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, check_name
-from surgicai_vision.experiments.run import Cell
 from surgicai_vision.features import encoders
+from surgicai_vision.training.run_config import RunConfig
 
 
 @dataclass(frozen=True)
@@ -47,19 +48,32 @@ class Quickstart:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for cell in self.cells:
-            if cell.encoder:
-                encoders.check_encoder_name(cell.encoder)
-            for view in cell.view:
+        for run in self.runs:
+            if run.encoder:
+                encoders.check_encoder_name(run.encoder)
+            for view in run.views:
                 check_name("rendered view", view, self.view)
-        for name in ("demonstrations", "size", "episodes"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1.")
+        numbers = {
+            "demonstrations": self.demonstrations,
+            "size": self.size,
+            "episodes": self.episodes,
+        }
+        for name, number in numbers.items():
+            if number < 1:
+                raise InputError(f"{name} is {number}; it must be at least 1.")
 
     @property
-    def cells(self) -> list[Cell]:
-        """The policies as cells."""
+    def runs(self) -> list[RunConfig]:
+        """One run a policy."""
         return [
-            Cell(self.task, choice.encoder, choice.view, self.seed, recipe=self.recipe)
+            RunConfig(
+                TaskConfig(self.task),
+                choice.encoder,
+                choice.view,
+                recipe=self.recipe,
+                demonstrations=self.demonstrations,
+                demonstrator="expert",
+                seed=self.seed,
+            )
             for choice in self.policies
         ]

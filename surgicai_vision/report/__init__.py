@@ -1,14 +1,14 @@
 """Report: stored results → one self-contained page and tables.
 
-A results folder holds evaluations (`results.find_evaluations`) anywhere below it and, where a run
+A results folder holds evaluations (`storage.find_evaluations`) anywhere below it and, where a run
 wrote it, `run.json`: its title, command, stages with their seconds, versions and machine. A sweep's
-cells without a result are in the report too, with the reason. Images are rendered anew from the
+runs without a result are in the report too, with the reason. Images are rendered anew from the
 states kept of each episode, so results stay small and the page can be rebuilt at any time.
 
-    reading → groups (over training seeds) → pairs, curves, films → page, tables
+    reader → groups (over training seeds) → pairs, curves, films → page, tables
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from surgicai_vision.core import files
@@ -18,7 +18,13 @@ from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.pairs import compare
 from surgicai_vision.report.provenance import commands, origin
-from surgicai_vision.report.reader import REFERENCES, Result, collect, read_results
+from surgicai_vision.report.reader import (
+    REFERENCES,
+    PlannedRun,
+    Result,
+    collect,
+    read_results,
+)
 from surgicai_vision.report.tables import write_changed, write_tables
 
 __all__ = [
@@ -41,7 +47,7 @@ def write_report(
     out: Path | None = None,
     progress: Progress | None = None,
     *,
-    cells: Sequence[Mapping[str, object]] = (),
+    planned: Sequence[PlannedRun] = (),
     strips: int = filmstrips.MOST_STRIPS,
 ) -> Path:
     """Write the page and the tables of the results below `folder`; return the page's path.
@@ -50,14 +56,14 @@ def write_report(
         folder: results of quickstart, evaluate, robustness or sweep.
         out: the page, by default `folder`/report.html; `tables/` stands beside it.
         progress: called as progress(parts done, parts).
-        cells: a sweep's cells that have no result (see `reading.collect`).
+        planned: the runs of a sweep (see `reader.collect`).
         strips: film strips at most; 0 leaves the episodes' strips out.
 
     Raises:
         BadFile: a folder without a whole evaluation and without a cell that failed or was not run.
     """
     report = progress or (lambda done, total: None)
-    collected = collect(folder, cells)
+    collected = collect(folder, planned)
     groups = group(collected)
     pairs = compare(groups)
     title = collected.run.get("title", folder.resolve().name)

@@ -130,6 +130,8 @@ def _views(groups: Sequence[Group]) -> list[dict[str, object]]:
     if chosen is None:
         return []
     film = read_film(chosen.result.folder, chosen.row["seed"])
+    if not len(film.steps):
+        return []
     start = chosen.row["seed"]
     views: list[dict[str, object]] = []
     with contact_sheet.state_renderer(chosen.result.config, SIZE) as image:

@@ -20,7 +20,7 @@ FACTORS: Mapping[str, str] = MappingProxyType(
     {
         "encoder": "encoder",
         "views": "views",
-        "chain": "chain",
+        "hierarchical": "hierarchical policy",
         "trained_by": "policy",
         "pool": "pool",
         "recipe": "recipe",

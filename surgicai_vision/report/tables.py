@@ -121,7 +121,7 @@ def evaluate_command(result: Result) -> str | None:
     about = result.about
     seeds = [row["seed"] for row in result.rows]
     whole = seeds == list(range(seeds[0], seeds[0] + len(seeds)))
-    if not whole or not result.condition.plain or about.get("chain"):
+    if not whole or not result.condition.plain or result.run.is_hierarchical:
         return None
     ending = f"--task {result.summary['task']} --episodes {len(seeds)} --seed {seeds[0]} --json"
     name = result.summary["policy"]
@@ -147,7 +147,7 @@ def _identity(condition: Condition) -> dict[str, Any]:
         "demonstrations": condition.demonstrations,
         "shift": condition.axis,
         "strength": condition.strength,
-        "expert_in": condition.swap,
+        "expert_in": condition.expert_swap,
         "trained": condition.trained,
     }
 

@@ -23,6 +23,7 @@ from safetensors import SafetensorError
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_json, write_bytes, write_json
+from surgicai_vision.training.run_config import RunConfig
 
 if TYPE_CHECKING:
     import torch
@@ -60,18 +61,13 @@ class Checkpoint:
     """Everything about a trained policy.
 
     Attributes:
-        task: the task's configuration.
-        policy: registered name of the policy.
+        run: what was trained: task, inputs, policy, recipe by name, demonstrations, seed.
         recipe: the recipe's settings as plain data.
-        recipe_name: a name of configs/recipes with its changes, or "custom".
-        views: cameras, in the order of the features; empty for proprioception alone.
         image_size: side of the images it was trained on [px].
         encoder: the encoder's record; None without views.
         proprioception: True when the tip pose and jaw are fed too.
-        seed: seed of the initialisation, the split and the order of frames.
         epoch: passes made over the training frames.
         dataset: fingerprint of the dataset.
-        demonstrations: episodes trained on.
         frames: frames trained on.
         validation_episodes: indices of the episodes held out.
         train_losses: mean training loss of each epoch.
@@ -83,18 +79,13 @@ class Checkpoint:
         folder: where it lies (not stored).
     """
 
-    task: TaskConfig
-    policy: str
+    run: RunConfig
     recipe: dict[str, JSON]
-    recipe_name: str
-    views: tuple[str, ...]
     image_size: int
     encoder: EncoderRecord | None
     proprioception: bool
-    seed: int
     epoch: int
     dataset: str
-    demonstrations: int
     frames: int
     validation_episodes: tuple[int, ...]
     train_losses: tuple[float, ...]
@@ -106,10 +97,19 @@ class Checkpoint:
     folder: Path = field(default=Path("."), compare=False)
 
     @property
-    def name(self) -> str:
-        """How tables call it: policy, encoder and views."""
-        seen = f"{self.encoder.name}-{'+'.join(self.views)}" if self.encoder else "proprioception"
-        return f"{self.policy}-{seen}"
+    def task(self) -> TaskConfig:
+        """The task it was trained in."""
+        return self.run.env
+
+    @property
+    def policy(self) -> str:
+        """The registered name of the policy."""
+        return self.run.policy
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Its views, in the order of the features; empty for proprioception alone."""
+        return self.run.views
 
     @property
     def visual(self) -> tuple[tuple[int, ...], ...]:
@@ -156,7 +156,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         found = plain.get("format") if isinstance(plain, dict) else None
         raise BadFile(
-            f"{folder / CARD} has format {found!r}; this version reads {FORMAT}. Train again."
+            f"{folder / CARD} has format {found!r}, of another version; this one reads {FORMAT}. "
+            "Train again."
         )
     if plain.pop("card_sha256", None) != digest(plain):
         raise BadFile(

@@ -128,13 +128,14 @@ def _facts(checkpoint: Checkpoint) -> dict[str, str]:
     held_out = len(checkpoint.validation_episodes)
     facts = {
         "policy": (
-            f"`{checkpoint.policy}`, recipe `{checkpoint.recipe_name}`, {checkpoint.epoch} epochs"
+            f"`{checkpoint.policy}`, recipe `{checkpoint.run.recipe_label}`, "
+            f"{checkpoint.epoch} epochs"
         ),
-        "training seed": str(checkpoint.seed),
+        "training seed": str(checkpoint.run.seed),
         "views": ", ".join(checkpoint.views) or "none",
         "images": f"{checkpoint.image_size} × {checkpoint.image_size} pixels",
         "proprioception": "yes" if checkpoint.proprioception else "no",
-        "data": (f"{checkpoint.demonstrations} demonstrations trained on, {held_out} held out"),
+        "data": f"{checkpoint.run.demonstrations} demonstrations, {held_out} of them held out",
         "frames": str(checkpoint.frames),
         "dataset, fingerprint": f"`{checkpoint.dataset}`",
         "scene, sha256": f"`{build_scene(checkpoint.task.scene).hash}`",
@@ -183,7 +184,7 @@ def push_policy(
     operations.append(CommitOperationAdd(MODEL_CARD, io.BytesIO(card.encode())))
     with refusals_in_one_line(repo):
         api.create_repo(repo, repo_type="model", private=private, exist_ok=True)
-        text = f"{checkpoint.name} for {checkpoint.task.task}"
+        text = f"{checkpoint.run.name} for {checkpoint.task.task}"
         commit = api.create_commit(repo, operations, commit_message=text, repo_type="model")
     return str(commit.commit_url)
 

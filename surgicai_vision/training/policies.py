@@ -17,6 +17,7 @@ from surgicai_vision.core.errors import BadFile, check_name
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.core.plugins import POLICIES_GROUP, Registry
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
+from surgicai_vision.training.run_config import RunConfig
 
 if TYPE_CHECKING:
     from encoders.base import Encoder
@@ -80,6 +81,17 @@ def load_recipe(
     if not isinstance(values, Mapping):
         raise BadFile(f"The recipe {path} is not a table of keys.")
     return from_mapping(plugin.recipe, {**values, **(changes or {})}, f"recipe {recipe}")
+
+
+def recipe_of(run: RunConfig) -> "Recipe":
+    """Return the recipe of a run with its changes: the one place where they meet.
+
+    Raises:
+        UnknownName: a policy, recipe or key that does not exist.
+        BadFile: a recipe file that cannot be read.
+        InputError: a value that is not allowed.
+    """
+    return load_recipe(run.policy, run.recipe, run.recipe_changes)
 
 
 def load_policy(folder: Path | str) -> "Policy":

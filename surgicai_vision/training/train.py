@@ -27,7 +27,7 @@ import math
 import pickle
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +51,7 @@ from surgicai_vision.training.checkpoint import (
     write_checkpoint,
 )
 from surgicai_vision.training.data import cuts, over_places, split, with_clock
+from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
 
 REQUEST = "training.json"
@@ -76,7 +77,7 @@ def train(
     seed: int = 0,
     out: Path,
     progress: Progress | None = None,
-    recipe_name: str = "custom",
+    run: RunConfig | None = None,
     save_every: int = 0,
     start: Policy | None = None,
     device: str = "cpu",
@@ -93,7 +94,8 @@ def train(
         seed: of the initialisation, the split and the order of frames.
         out: the checkpoint folder; new, or one of the same request, which is then continued.
         progress: called with (epochs done, epochs in all).
-        recipe_name: the name the recipe goes by, recorded.
+        run: what is trained, stored in the checkpoint with what this training knows better: its
+            task, inputs and number of demonstrations.
         save_every: also keep a checkpoint every so many epochs; 0 keeps the last alone.
         start: a trained policy with the same inputs to start from (fine-tuning).
         device: torch device to train on.
@@ -104,7 +106,8 @@ def train(
         OutputExists: `out` holds something else.
         SurgicaiError: the loss is not finite.
     """
-    task = _Task(dataset, tuple(features), policy, recipe, seed, recipe_name)
+    run = run or RunConfig(recipe="custom")
+    task = _Task(dataset, tuple(features), policy, recipe, seed, run)
     out = Path(out)
     _check(task)
     request = _request(task, start)
@@ -147,7 +150,23 @@ class _Task:
     policy: Plugin
     recipe: Recipe
     seed: int
-    recipe_name: str
+    run: RunConfig
+
+    @property
+    def trained_run(self) -> RunConfig:
+        """The run with what is known of it once its features and its dataset are."""
+        first = self.features[0].manifest if self.features else None
+        return replace(
+            self.run,
+            env=self.dataset.config,
+            policy=self.policy.name,
+            encoder=first["encoder"] if first else None,
+            views=tuple(entry.view for entry in self.features),
+            pool=first["pool"] if first else "global",
+            privileged=self.recipe.privileged,
+            demonstrations=len(np.unique(self.dataset.episode_index)),
+            seed=self.seed,
+        )
 
     def untrained(self) -> Policy:
         """Return the policy as it is before training."""
@@ -205,7 +224,6 @@ class _Training:
         columns = with_clock(task.dataset.columns(), task.untrained().inputs.vector)
         index = np.asarray(task.dataset.episode_index)
         self.rows, self.held_rows, self.held_episodes = split(index, task.recipe, task.seed)
-        self.demonstrations = len(np.unique(index[self.rows]))
         if len(self.rows) < 2:
             raise InputError(
                 f"There are {len(self.rows)} frames to train on; at least 2 are needed."
@@ -386,19 +404,14 @@ class _Training:
         dataset = task.dataset
         folder.mkdir(parents=True, exist_ok=True)
         checkpoint = Checkpoint(
-            task=dataset.config,
-            policy=task.policy.name,
+            run=task.trained_run,
             recipe=to_mapping(task.recipe),
-            recipe_name=task.recipe_name,
-            views=tuple(entry.view for entry in task.features),
             image_size=dataset.image_size,
             encoder=_record(task.features[0]) if task.features else None,
             proprioception=self.vector is not None
             and self.policy.inputs.vector != names.PRIVILEGED_STATE,
-            seed=task.seed,
             epoch=len(self.losses),
             dataset=dataset.fingerprint,
-            demonstrations=self.demonstrations,
             frames=len(self.rows),
             validation_episodes=self.held_episodes,
             train_losses=tuple(self.losses),

@@ -31,7 +31,7 @@ from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
 from surgicai_vision.dataset.subset import with_frame_stride
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.store import list_demos, read_demo
-from surgicai_vision.evaluation.policy_spec import replay_subject
+from surgicai_vision.evaluation.policy_spec import open_policy
 
 CONFIG = TaskConfig(max_steps=12)
 SIZE = 32
@@ -128,7 +128,7 @@ def test_every_fifth_frame_is_one_of_all(tmp_path, fake, demos, monkeypatch):
     with pytest.raises(InputError, match=r"frame_stride is 4; .* 1, 2, 5, 10, 25, 50"):
         render(demos, tmp_path / "none", frame_stride=4)
     with pytest.raises(InputError, match="a replay needs each step's"):
-        replay_subject(few)
+        open_policy("replay", dataset=few)
 
 
 def test_frames_across_episodes_equal_single_frames(tmp_path, fake, demos):

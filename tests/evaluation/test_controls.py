@@ -14,7 +14,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.evaluation.agents import PolicyAgent, ReplayAgent, mean_demonstration
 from surgicai_vision.evaluation.rollout import evaluate
-from surgicai_vision.experiments.run import Cell
+from surgicai_vision.training.run_config import RunConfig
 
 
 def test_mean_demonstration_is_over_those_that_still_run() -> None:
@@ -76,5 +76,5 @@ def test_state_policy_sees_the_observation_of_obs_type_state() -> None:
 
 
 def test_controls_have_their_names() -> None:
-    assert Cell("grasp", None, (), privileged=True).name == "state"
-    assert Cell("grasp", None, ()).name == "proprioception"
+    assert RunConfig(privileged=True).name == "state"
+    assert RunConfig().name == "proprioception"

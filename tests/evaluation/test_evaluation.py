@@ -2,7 +2,6 @@
 keys.
 """
 
-import functools
 import json
 from types import SimpleNamespace
 
@@ -26,6 +25,7 @@ from surgicai_vision.evaluation.metrics import (
 )
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.evaluation.statistics import clopper_pearson
+from surgicai_vision.training.run_config import RunConfig
 
 SHORT = TaskConfig("grasp", max_steps=12)
 
@@ -214,7 +214,7 @@ def test_rows_and_summary_hold_what_was_measured(fake_envs, tmp_path):
     assert rows[40].tissue_force_n == pytest.approx(1.2)
     # Nothing of the episode before is left in one that could not start.
     assert np.isnan([rows[97].entry_mm, rows[3].exit_mm]).all() and rows[97].slip_mm == 0.0
-    result = storage.write_evaluation(tmp_path, episodes, {})
+    result = storage.write_evaluation(tmp_path, episodes, RunConfig(policy="zero"), {})
     assert result["entry_mm"] == {"mean": pytest.approx(0.5), "std": pytest.approx(0.0), "n": 2}
     assert result["exit_mm"] == {"mean": None, "std": None, "n": 0}
     assert result["tissue_force_n"]["n"] == 3
@@ -234,13 +234,13 @@ def test_kinds_of_failure():
     assert KINDS == ("missed", "dropped", "wrong_hole", "time", "physics", "error")
 
 
-def test_survival_counts_each_stage_and_all_before_it():
+def test_each_subtask_counts_with_all_before_it():
     rows = [row_with_stages(seed, stages) for seed, stages in enumerate((0, 2, 2, 5))]
-    survival = summary(rows)["survival"]
-    assert [(stage["subtask"], stage["k"]) for stage in survival] == [
+    subtasks = summary(rows)["subtasks"]
+    assert [(stage["subtask"], stage["k"]) for stage in subtasks] == [
         ("grasp", 3), ("place", 3), ("insert", 1), ("handoff", 1), ("pullout", 1),
     ]  # fmt: skip
-    assert (survival[0]["low"], survival[0]["high"]) == clopper_pearson(3, 4)
+    assert (subtasks[0]["low"], subtasks[0]["high"]) == clopper_pearson(3, 4)
 
 
 def row_with_stages(seed, stages):
@@ -285,11 +285,11 @@ def test_a_policy_with_images_gives_the_same_rows_for_any_batch():
 
 
 def test_expert_solves_held_out_starts():
-    subject = policy_spec.baseline_subject("expert", TaskConfig("grasp"))
+    spec = policy_spec.open_policy("expert")
     rows = rows_of(
         evaluate(
-            subject.make_agent,
-            subject.config,
+            spec.make_agent,
+            spec.config,
             range(names.TEST_SEED, names.TEST_SEED + 3),
             workers=1,
         )
@@ -298,6 +298,5 @@ def test_expert_solves_held_out_starts():
 
 
 def test_zero_fails():
-    make = functools.partial(policy_spec.baseline, "zero")
-    row = evaluate(make, SHORT, [names.TEST_SEED], workers=1)[0].row
+    row = evaluate(ZeroAgent, SHORT, [names.TEST_SEED], workers=1)[0].row
     assert (row.success, row.failure, row.steps) == (False, "missed", SHORT.max_steps)

@@ -1,6 +1,4 @@
-"""Survival: the expert in the place of the policy that fails lets a chain go on; everything is
-paired and stored.
-"""
+"""Expert swap: the expert in the place of a failing policy lets the procedure go on."""
 
 import json
 
@@ -9,53 +7,52 @@ import pytest
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
-from surgicai_vision.evaluation.expert_swap import AS_IT_IS, CURVES, swapped, variants_of
-from surgicai_vision.evaluation.hierarchical import Chain
+from surgicai_vision.evaluation.expert_swap import AS_IT_IS, CURVES, variants_of
 from surgicai_vision.evaluation.storage import MARKER, read_rows
 
-CHAIN = "hlp: order\ngrasp: expert\nplace: zero\ninsert: expert\nhandoff: random\npullout: expert\nmax_steps: 520\n"
+POLICY = (
+    "hlp: order\ngrasp: expert\nplace: zero\ninsert: expert\nhandoff: random\npullout: expert\n"
+    "max_steps: 520\n"
+)
 STARTS = ["--episodes", "2", "--workers", "1", "--json"]
 
 
 @pytest.fixture
-def chain_file(tmp_path):
-    path = tmp_path / "chain.yaml"
-    path.write_text(CHAIN)
+def policy_file(tmp_path):
+    path = tmp_path / "hierarchical.yaml"
+    path.write_text(POLICY)
     return path
 
 
-def test_variants_are_the_chain_and_each_learned_subtask():
-    config = Chain(
-        "order", grasp="expert", place="zero", insert="expert", handoff="random", pullout="expert"
-    )
-    variants = variants_of(config)
+def test_variants_are_the_policy_and_each_learned_subtask(policy_file):
+    variants = variants_of(policy_file)
     assert list(variants) == [AS_IT_IS, "place", "handoff"]
-    assert [subject.about["swap"] for subject in variants.values()] == [None, "place", "handoff"]
-    assert len({subject.name for subject in variants.values()}) == 1
-    assert len({subject.config for subject in variants.values()}) == 1
-    assert variants["place"].about["chain"]["place"] == "expert"
-    assert variants["place"].about["chain"]["handoff"] == "random"
-    assert (
-        variants["place"].make_agent().name == variants[AS_IT_IS].name == swapped(config, None).name
-    )
+    assert [spec.run.expert_swap for spec in variants.values()] == [None, "place", "handoff"]
+    assert len({spec.run.parts for spec in variants.values()}) == 1
+    assert len({spec.config for spec in variants.values()}) == 1
+    called = [spec.name for spec in variants.values()]
+    assert len(set(called)) == 3 and called[1] == f"{called[0]}-expert-place"
+    assert variants["place"].make_agent().name == called[1]
 
 
-def test_a_swapped_expert_lets_the_chain_go_on_to_the_next_weak_link(chain_file, tmp_path, capsys):
+def test_a_swapped_expert_lets_the_procedure_go_on_to_the_next_weak_link(
+    policy_file, tmp_path, capsys
+):
     out = tmp_path / "out"
-    command = ["evaluate", str(chain_file), "--swap", "all", "--out", str(out), *STARTS]
+    command = ["evaluate", str(policy_file), "--expert-swap", "all", "--out", str(out), *STARTS]
     assert main(command) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     found = {
-        swap: [row["k"] for row in result["survival"] if row["swap"] == swap]
+        swap: [row["k"] for row in result["expert_swap"] if row["expert_swap"] == swap]
         for swap in ("", "place", "handoff")
     }
     assert found == {"": [2, 0, 0, 0, 0], "place": [2, 2, 2, 0, 0], "handoff": [2, 0, 0, 0, 0]}
-    assert [row["subtask"] for row in result["survival"][:5]] == list(names.SUBTASKS)
-    assert pq.read_table(out / CURVES).to_pylist() == result["survival"]
-    assert {row["p_holm"] for row in result["survival"] if row["swap"]} == {1.0}
+    assert [row["subtask"] for row in result["expert_swap"][:5]] == list(names.SUBTASKS)
+    assert pq.read_table(out / CURVES).to_pylist() == result["expert_swap"]
+    assert {row["p_holm"] for row in result["expert_swap"] if row["expert_swap"]} == {1.0}
     stored = json.loads((out / "place" / MARKER).read_text())
-    assert stored["about"]["swap"] == "place"
-    assert [stage["k"] for stage in stored["summary"]["survival"]] == found["place"]
+    assert stored["run"]["expert_swap"] == "place"
+    assert [stage["k"] for stage in stored["summary"]["subtasks"]] == found["place"]
     assert [row["seed"] for row in read_rows(out / "place")] == [
         row["seed"] for row in read_rows(out / AS_IT_IS)
     ]
@@ -63,16 +60,16 @@ def test_a_swapped_expert_lets_the_chain_go_on_to_the_next_weak_link(chain_file,
     assert main(command) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1]) == result
     assert main([*command, "--seed", "5"]) == 2
-    assert "the survival of another" in capsys.readouterr().err
+    assert "the expert swaps of another" in capsys.readouterr().err
 
 
-def test_one_subtask_can_be_swapped_alone(chain_file, tmp_path, capsys):
+def test_one_subtask_can_be_swapped_alone(policy_file, tmp_path, capsys):
     assert (
         main(
             [
                 "evaluate",
-                str(chain_file),
-                "--swap",
+                str(policy_file),
+                "--expert-swap",
                 "place",
                 "--out",
                 str(tmp_path / "out"),
@@ -85,14 +82,14 @@ def test_one_subtask_can_be_swapped_alone(chain_file, tmp_path, capsys):
     result = json.loads(last)
     assert "failed: 2 time; reached grasp 2, place 2, insert 2, handoff 0, pullout 0" in told[0]
     assert result["reached"]["insert"] == 2
-    assert json.loads((tmp_path / "out" / MARKER).read_text())["about"]["swap"] == "place"
+    assert json.loads((tmp_path / "out" / MARKER).read_text())["run"]["expert_swap"] == "place"
 
 
 @pytest.mark.parametrize(
     ("command", "wanted"),
     [
-        (["expert", "--swap", "place"], "is for a chain.yaml"),
-        (["x.yaml", "--swap", "plaec"], "place"),
+        (["expert", "--expert-swap", "place"], "is for the YAML file of a hierarchical policy"),
+        (["x.yaml", "--expert-swap", "plaec"], "place"),
     ],
 )
 def test_wrong_swaps_end_with_one_line(command, wanted, tmp_path, capsys):

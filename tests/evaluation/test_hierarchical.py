@@ -1,4 +1,4 @@
-"""The chain: high-level policy, low-level policies, terminations, limits."""
+"""Hierarchical policies: high-level policy, low-level policies, terminations, limits."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,18 +12,23 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
-from surgicai_vision.evaluation import hierarchical
 from surgicai_vision.evaluation.agent import Agent
-from surgicai_vision.evaluation.agents import PolicyAgent
-from surgicai_vision.evaluation.hierarchical import PATIENCE, Chain, ChainAgent
+from surgicai_vision.evaluation.agents import ExpertAgent, PolicyAgent
+from surgicai_vision.evaluation.hierarchical import (
+    PATIENCE,
+    HierarchicalAgent,
+    HierarchicalConfig,
+)
 from surgicai_vision.evaluation.metrics import summary
+from surgicai_vision.evaluation.policy_spec import hierarchical_policy
 from surgicai_vision.evaluation.rollout import evaluate
+from surgicai_vision.training.run_config import TERMINATIONS
 
 EXPERTS = dict.fromkeys(names.SUBTASKS, "expert")
 
 
 class Env:
-    """Counts what a chain asks of it; the present subtask succeeds after `length` steps."""
+    """Counts what a hierarchical policy asks of it; the present subtask succeeds after `length` steps."""
 
     def __init__(self, length: int = 3):
         self.length, self.phase, self.steps, self.begun = length, 0, 0, []
@@ -60,18 +65,20 @@ class Constant(Agent):
         self.restarted.append(slot)
 
 
-def agent(classes: list[int], **changes: object) -> ChainAgent:
-    """Return a chain whose high-level policy says `classes` one after another, and whose policies
+def agent(classes: list[int], **changes: object) -> HierarchicalAgent:
+    """Return a policy whose high-level policy says `classes` one after another, and whose policies
     say their index.
     """
-    made = ChainAgent("chain", Chain("order", **{**EXPERTS, **changes}))
+    made = HierarchicalAgent(
+        HierarchicalConfig("order", **{**EXPERTS, **changes}), [ExpertAgent] * 5
+    )
     said = iter(classes)
     made._high = SimpleNamespace(answer=lambda envs, _: np.eye(5)[[next(said) for _ in envs]])
     made._low = [Constant(index / 10) for index in range(5)]
     return made
 
 
-def roll(actor: ChainAgent, env: Env, steps: int) -> list[int]:
+def roll(actor: HierarchicalAgent, env: Env, steps: int) -> list[int]:
     """Return which low-level policy acted in each step; -1 where the arms hold still."""
     actor.reset(0, env, 0)
     acted = []
@@ -93,13 +100,13 @@ def test_a_grasp_may_end_sooner_than_the_env_ends_it_and_nothing_else_may() -> N
     acted = roll(agent([0, 1, 2], grasp_hold=3), env, 17)
     assert acted == [0] * 5 + [1] * 10 + [2] * 2 and env.begun == [1]
     learned = agent([0] * 9, grasp_hold=3)
-    object.__setattr__(learned.chain, "termination", "learned")
+    object.__setattr__(learned.config, "termination", "learned")
     assert roll(learned, Env(10), 8) == [0] * 8, (
         "a learned termination asks the high-level policy alone"
     )
     for wrong in (0, 16):
         with pytest.raises(InputError, match="grasp_hold is"):
-            Chain("order", **EXPERTS, grasp_hold=wrong)
+            HierarchicalConfig("order", **EXPERTS, grasp_hold=wrong)
 
 
 def test_a_choice_moves_its_own_arm() -> None:
@@ -121,7 +128,7 @@ def test_a_policy_that_plans_ahead_forgets_its_plan_when_its_subtask_begins() ->
 
 def test_learned_termination_waits_for_the_high_level_policy() -> None:
     actor, env = agent([0] * 4 + [1] * 3 + [0] + [1] * 20), Env(2)
-    object.__setattr__(actor.chain, "termination", "learned")
+    object.__setattr__(actor.config, "termination", "learned")
     acted = roll(actor, env, 8 + PATIENCE + 2)
     assert acted == [0] * (8 + PATIENCE - 1) + [1] * 3, (
         "the env's own success must not end a subtask"
@@ -129,7 +136,7 @@ def test_learned_termination_waits_for_the_high_level_policy() -> None:
 
 
 def test_experts_in_their_order_sew_and_count_their_stages() -> None:
-    made = hierarchical.subject(Chain("order", **EXPERTS, max_steps=1000, grasp_hold=5))
+    made = hierarchical_policy(HierarchicalConfig("order", **EXPERTS, max_steps=1000, grasp_hold=5))
     assert made.config.task == "suture"
     row = evaluate(made.make_agent, made.config, [names.TEST_SEED], workers=1)[0].row
     assert row.success and row.stages == 5, row
@@ -149,12 +156,12 @@ def test_begin_changes_the_arm_and_earns_nothing() -> None:
         env.enter(5)
 
 
-def test_trained_policies_are_chained_in_any_batch(tmp_path: Path) -> None:
+def test_trained_policies_act_together_in_any_batch(tmp_path: Path) -> None:
     hlp = checkpoint(tmp_path / "hlp", "suture", "hlp")
     low = {subtask: checkpoint(tmp_path / subtask, subtask) for subtask in names.SUBTASKS}
-    for termination in hierarchical.TERMINATIONS:
-        made = hierarchical.subject(
-            Chain(hlp, **low, termination=termination, steps=4, max_steps=12)
+    for termination in TERMINATIONS:
+        made = hierarchical_policy(
+            HierarchicalConfig(hlp, **low, termination=termination, steps=4, max_steps=12)
         )
         rows = [
             [
@@ -168,7 +175,7 @@ def test_trained_policies_are_chained_in_any_batch(tmp_path: Path) -> None:
         assert repr(rows[0]) == repr(rows[1]) and rows[0][0].steps == 12  # NaN is unequal to itself
 
 
-def test_policies_of_a_chain_share_features() -> None:
+def test_low_level_policies_share_features() -> None:
     encoded: list[int] = []
 
     def encoder(frames: np.ndarray) -> np.ndarray:
@@ -190,33 +197,37 @@ def test_policies_of_a_chain_share_features() -> None:
     assert encoded == [2, 1]
 
 
-def test_wrong_chains_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_hierarchical_policies_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     grasp, hlp = (
         checkpoint(tmp_path / "grasp", "grasp"),
         checkpoint(tmp_path / "hlp", "suture", "hlp"),
     )
     with pytest.raises(InputError, match="not for 'place'"):
-        hierarchical.subject(Chain("order", **{**EXPERTS, "place": grasp}))
+        hierarchical_policy(HierarchicalConfig("order", **{**EXPERTS, "place": grasp}))
     with pytest.raises(InputError, match="takes an 'hlp'"):
-        hierarchical.subject(Chain(grasp, **EXPERTS))
+        hierarchical_policy(HierarchicalConfig(grasp, **EXPERTS))
     with pytest.raises(InputError, match="does not act"):
-        hierarchical.subject(Chain("order", **{**EXPERTS, "grasp": hlp}))
+        hierarchical_policy(HierarchicalConfig("order", **{**EXPERTS, "grasp": hlp}))
     with pytest.raises(BadFile, match="not a checkpoint"):
-        hierarchical.subject(Chain(str(tmp_path), **EXPERTS))
+        hierarchical_policy(HierarchicalConfig(str(tmp_path), **EXPERTS))
     with pytest.raises(InputError, match="needs a high-level policy"):
-        Chain("order", **EXPERTS, termination="learned")
+        HierarchicalConfig("order", **EXPERTS, termination="learned")
     with pytest.raises(UnknownName, match="termination"):
-        from_mapping(Chain, {"hlp": "order", **EXPERTS, "terminaton": "learned"})
-    (tmp_path / "chain.yaml").write_text("hlp: order\ngrasp: expert\n")
-    assert main(["evaluate", str(tmp_path / "chain.yaml")]) == 2
+        from_mapping(HierarchicalConfig, {"hlp": "order", **EXPERTS, "terminaton": "learned"})
+    (tmp_path / "hierarchical.yaml").write_text("hlp: order\ngrasp: expert\n")
+    assert main(["evaluate", str(tmp_path / "hierarchical.yaml")]) == 2
     assert "'place'" in capsys.readouterr().err
 
 
-def test_the_documented_chain_is_one(root: Path) -> None:
+def test_the_documented_hierarchical_policy_is_one(root: Path) -> None:
     import yaml
 
     text = (root / "docs" / "hierarchical.md").read_text(encoding="utf-8")
-    made = from_mapping(Chain, yaml.safe_load(text.split("```yaml\n")[1].split("```")[0]))
-    assert made.termination in hierarchical.TERMINATIONS and all(
+    made = from_mapping(
+        HierarchicalConfig, yaml.safe_load(text.split("```yaml\n")[1].split("```")[0])
+    )
+    assert made.termination in TERMINATIONS and all(
         f"{s}-of-suture-state" in getattr(made, s) for s in EXPERTS
     )

@@ -386,7 +386,7 @@ def test_lerobot_eval_and_evaluate_count_the_same_successes(dataset: Path, tmp_p
     from lerobot.policies.factory import make_policy, make_pre_post_processors
     from lerobot.scripts.lerobot_eval import eval_policy
 
-    from surgicai_vision.evaluation import lerobot_agent
+    from surgicai_vision.evaluation.policy_spec import open_policy
     from surgicai_vision.evaluation.rollout import evaluate
 
     folder = skilled(dataset, tmp_path / "policy")
@@ -402,9 +402,9 @@ def test_lerobot_eval_and_evaluate_count_the_same_successes(dataset: Path, tmp_p
         env, policy, env_before, env_after, before, after, n_episodes=episodes, start_seed=0
     )
     env.close()
-    subject = lerobot_agent.subject(lerobot_agent.find(folder), task=TASK)
+    spec = open_policy(folder, task=TASK)
     ours = evaluate(
-        subject.make_agent, TaskConfig(TASK, max_steps=steps), range(episodes), batch=3, workers=1
+        spec.make_agent, TaskConfig(TASK, max_steps=steps), range(episodes), batch=3, workers=1
     )
     assert [episode.row.success for episode in ours] == [
         row["success"] for row in theirs["per_episode"]
@@ -420,7 +420,7 @@ def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(
 ) -> None:
     """Dense rewards tell two trajectories apart in the last bit."""
     from surgicai_vision import envs
-    from surgicai_vision.evaluation import lerobot_agent
+    from surgicai_vision.evaluation.policy_spec import open_policy
     from surgicai_vision.evaluation.rollout import evaluate
 
     command(
@@ -432,11 +432,11 @@ def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(
     metrics = json.loads((trained / "eval" / "eval_info.json").read_text())["per_task"][0][
         "metrics"
     ]
-    subject = lerobot_agent.subject(lerobot_agent.find(trained))
-    assert subject.config == TaskConfig(TASK, max_steps=STEPS)
-    rows = evaluate(subject.make_agent, subject.config, [1000, 1001], workers=1)
+    spec = open_policy(trained)
+    assert spec.config == TaskConfig(TASK, max_steps=STEPS)
+    rows = evaluate(spec.make_agent, spec.config, [1000, 1001], workers=1)
     assert [episode.row.success for episode in rows] == metrics["successes"]
-    agent = subject.make_agent()
+    agent = spec.make_agent()
     for seed, wanted in zip((1000, 1001), metrics["sum_rewards"], strict=True):
         config = TaskConfig(TASK, max_steps=STEPS, reward="dense")
         env = envs.make(config, "pixels_agent_pos", agent.cameras, agent.image_size)
@@ -454,7 +454,9 @@ def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(
 
 
 def test_act_trains_beside_depth_and_is_evaluated(dataset: Path, tmp_path: Path, command) -> None:
-    from surgicai_vision.evaluation import hierarchical, lerobot_agent
+    from surgicai_vision.evaluation import lerobot_agent
+    from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
+    from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
     from surgicai_vision.evaluation.rollout import evaluate
 
     inputs = {names.image_key("back"): {"type": "VISUAL", "shape": [3, SIZE, SIZE]}}
@@ -474,16 +476,16 @@ def test_act_trains_beside_depth_and_is_evaluated(dataset: Path, tmp_path: Path,
     # A checkpoint of pretrained weights asks for them by name; they are in the checkpoint already.
     changed(found, tmp_path / "named", pretrained_backbone_weights="ResNet18_Weights.IMAGENET1K_V1")
     for place in (found, tmp_path / "named"):
-        subject = lerobot_agent.subject(place)
-        assert subject.name == "act-back"
+        spec = open_policy(place)
+        assert spec.name == "act-own-back"
         rows = [
-            evaluate(subject.make_agent, subject.config, [1, 2, 3], batch=batch, workers=1)
+            evaluate(spec.make_agent, spec.config, [1, 2, 3], batch=batch, workers=1)
             for batch in (1, 3)
         ]
         assert said(rows[0]) == said(rows[1])
     low = dict.fromkeys(names.SUBTASKS, "zero") | {open_dataset(dataset).task: str(out)}
-    made = hierarchical.subject(hierarchical.Chain("order", **low, steps=4, max_steps=10))
-    assert made.about["views"] == ["back"] and made.config.task == "suture"
+    made = hierarchical_policy(HierarchicalConfig("order", **low, steps=4, max_steps=10))
+    assert made.run.views == ("back",) and made.config.task == "suture"
     rows = [
         evaluate(lambda: chosen(made, dataset), made.config, [1, 2], batch=batch, workers=1)
         for batch in (1, 2)
@@ -491,7 +493,7 @@ def test_act_trains_beside_depth_and_is_evaluated(dataset: Path, tmp_path: Path,
     assert said(rows[0]) == said(rows[1])
     assert rows[0][0].row.steps == 10 and rows[0][0].row.trajectory_length_mm > 0
     with pytest.raises(InputError, match="not for 'pullout'"):
-        hierarchical.subject(hierarchical.Chain("order", **{**low, "pullout": str(out)}))
+        hierarchical_policy(HierarchicalConfig("order", **{**low, "pullout": str(out)}))
 
 
 def chosen(made, dataset: Path):
@@ -512,7 +514,7 @@ def test_diffusion_trains_on_frozen_features_and_is_evaluated(
     dataset: Path, tmp_path: Path, command
 ) -> None:
     from surgicai_vision.dataset import check_dataset
-    from surgicai_vision.evaluation import lerobot_agent
+    from surgicai_vision.evaluation.policy_spec import open_policy
     from surgicai_vision.evaluation.rollout import evaluate
     from surgicai_vision.features import encoders
 
@@ -544,10 +546,10 @@ def test_diffusion_trains_on_frozen_features_and_is_evaluated(
     )
     config = json.loads((out / CHECKPOINT / "config.json").read_text())
     assert set(config["input_features"]) == {names.STATE, names.ENVIRONMENT_STATE}
-    subject = lerobot_agent.subject(lerobot_agent.find(out))
-    assert subject.name == "diffusion-imagenet-lite-back"
+    spec = open_policy(out)
+    assert spec.name == "diffusion-imagenet-lite-back"
     rows = [
-        evaluate(subject.make_agent, subject.config, [1, 2, 3], batch=batch, workers=1)
+        evaluate(spec.make_agent, spec.config, [1, 2, 3], batch=batch, workers=1)
         for batch in (1, 3)
     ]
     assert said(rows[0]) == said(rows[1])
@@ -555,19 +557,20 @@ def test_diffusion_trains_on_frozen_features_and_is_evaluated(
 
 def test_what_evaluate_cannot_use_is_refused_in_one_line(trained: Path, tmp_path: Path) -> None:
     from surgicai_vision.evaluation import lerobot_agent
+    from surgicai_vision.evaluation.policy_spec import open_policy
 
     assert lerobot_agent.find(tmp_path) is None
     source = trained / CHECKPOINT
     alone = changed(source, tmp_path / "alone")
     (alone / "train_config.json").unlink()
     with pytest.raises(InputError, match="give --task"):
-        lerobot_agent.subject(alone)
-    assert lerobot_agent.subject(alone, task="grasp").config == TaskConfig("grasp")
+        open_policy(alone)
+    assert open_policy(alone, task="grasp").config == TaskConfig("grasp")
     depth = {"observation.images.back_depth": {"type": "VISUAL", "shape": [1, SIZE, SIZE]}}
     with pytest.raises(UnknownName, match="back_depth"):
-        lerobot_agent.subject(changed(source, tmp_path / "depth", input_features=depth))
+        open_policy(changed(source, tmp_path / "depth", input_features=depth))
     with pytest.raises(BadFile, match="is no configuration"):
-        lerobot_agent.subject(changed(source, tmp_path / "typeless", type=None))
+        open_policy(changed(source, tmp_path / "typeless", type=None))
 
 
 # -- LeRobot's tools on our dataset ----------------------------------------------------------------

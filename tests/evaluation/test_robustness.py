@@ -14,14 +14,15 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
-from surgicai_vision.evaluation import policy_spec
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent
-from surgicai_vision.evaluation.robustness import AXES, CURVES, axes_of, robustness, shifted
+from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
+from surgicai_vision.evaluation.robustness import AXES, CURVES, axes_of, curves, shifted
 from surgicai_vision.evaluation.robustness.corruption import CORRUPTIONS, CorruptedAgent, Moment
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.evaluation.statistics import clopper_pearson, mcnemar
 from surgicai_vision.evaluation.storage import MARKER, read_rows
+from surgicai_vision.training.run_config import OWN, RunConfig
 
 SEEDS = range(names.TEST_SEED, names.TEST_SEED + 2)
 SHORT = TaskConfig("grasp", max_steps=4)
@@ -43,8 +44,9 @@ def seeing(image_size=48):
     )
 
 
-def subject(config=SHORT):
-    return policy_spec.Subject("seeing", config, seeing, {"views": ["front", "wrist_psm2"]})
+def seeing_spec(config=SHORT):
+    run = RunConfig(config, OWN, ("front", "wrist_psm2"), policy="seeing")
+    return PolicySpec(run, seeing)
 
 
 def played(chosen, batch=8):
@@ -62,7 +64,7 @@ def silent(title, unit):
 
 @pytest.mark.parametrize("axis", AXES)
 def test_strength_0_is_the_plain_evaluation_row_by_row(axis):
-    plain, zero = played(subject()), played(shifted(subject(), axis, 0.0))
+    plain, zero = played(seeing_spec()), played(shifted(seeing_spec(), axis, 0.0))
     assert rows_of(zero) == rows_of(plain)
     for one, other in zip(zero, plain, strict=True):
         np.testing.assert_array_equal(one.film.states, other.film.states)
@@ -70,7 +72,9 @@ def test_strength_0_is_the_plain_evaluation_row_by_row(axis):
 
 @pytest.mark.parametrize("axis", AXES)
 def test_an_axis_changes_what_a_seeing_policy_does_and_not_where_it_starts(axis):
-    plain, half, full = (played(shifted(subject(), axis, strength)) for strength in (0.0, 0.5, 1.0))
+    plain, half, full = (
+        played(shifted(seeing_spec(), axis, strength)) for strength in (0.0, 0.5, 1.0)
+    )
     for one, other in ((half, plain), (full, half)):
         for mine, theirs in zip(one, other, strict=True):
             assert repr(mine.row) != repr(theirs.row)
@@ -92,7 +96,7 @@ def needle_at_start(episode):
 def test_an_episode_keeps_its_direction_and_grows_with_the_strength(axis):
     drawn = {}
     for strength in (0.5, 1.0):
-        env = envs.make(shifted(subject(), axis, strength).config)
+        env = envs.make(shifted(seeing_spec(), axis, strength).config)
         drawn[strength] = env.reset(seed=5)[1]["randomisation"]
     assert set(drawn[0.5]) == set(drawn[1.0]) == set(AXES[axis].world)
     for name, values in drawn[1.0].items():
@@ -103,7 +107,7 @@ def test_an_episode_keeps_its_direction_and_grows_with_the_strength(axis):
 
 def test_latency_is_in_whole_steps():
     steps = [
-        shifted(subject(), "latency", strength).config.randomisation.latency
+        shifted(seeing_spec(), "latency", strength).config.randomisation.latency
         for strength in (0, 0.25, 0.5, 1)
     ]
     assert steps == [0, 1, 3, 5]
@@ -112,10 +116,10 @@ def test_latency_is_in_whole_steps():
 def test_a_shift_comes_on_top_of_the_tasks_own_randomisation_up_to_what_is_possible():
     config = TaskConfig("grasp", randomisation=RandomisationConfig(light=0.3, friction=0.1))
     light = [
-        shifted(subject(config), "light", s).config.randomisation.light for s in (0.0, 0.5, 1.0)
+        shifted(seeing_spec(config), "light", s).config.randomisation.light for s in (0.0, 0.5, 1.0)
     ]
     assert light == pytest.approx([0.3, 0.7, 0.9])
-    assert shifted(subject(config), "blur", 1.0).config == config
+    assert shifted(seeing_spec(config), "blur", 1.0).config == config
 
 
 @pytest.mark.parametrize("kind", CORRUPTIONS)
@@ -152,7 +156,7 @@ def test_noise_and_smoke_are_as_strong_as_said():
 
 @pytest.mark.parametrize("axis", ["noise", "smoke"])
 def test_rows_do_not_depend_on_the_batch(axis):
-    chosen = shifted(subject(), axis, 0.5)
+    chosen = shifted(seeing_spec(), axis, 0.5)
     assert rows_of(played(chosen, 1)) == rows_of(played(chosen, 2))
 
 
@@ -207,8 +211,8 @@ class Pretend:
         self.real, self.calls = real, []
 
     def __call__(self, out, chosen, seeds, workers, progress):
-        shift = chosen.about["shift"]
-        self.calls.append((shift["axis"], shift["strength"]))
+        shift = chosen.run.shift
+        self.calls.append((shift.axis, shift.strength))
         from surgicai_vision.evaluation.metrics import EpisodeMetrics
         from surgicai_vision.evaluation.rollout import Episode, Film
         from surgicai_vision.evaluation.storage import write_evaluation
@@ -219,7 +223,7 @@ class Pretend:
                 "grasp",
                 "seeing",
                 seed,
-                4 * shift["strength"] <= index,
+                4 * shift.strength <= index,
                 1,
                 1.0,
                 1.0,
@@ -231,15 +235,13 @@ class Pretend:
             )
             for index, seed in enumerate(seeds)
         ]
-        return write_evaluation(out, [Episode(row, film) for row in rows], dict(chosen.about))
+        return write_evaluation(out, [Episode(row, film) for row in rows], chosen.run, {})
 
 
 @pytest.fixture
 def pretend(monkeypatch):
-    from surgicai_vision.evaluation import robustness as module
-
-    fake = Pretend(module.evaluate_into)
-    monkeypatch.setattr(module, "evaluate_into", fake)
+    fake = Pretend(curves.evaluate_into)
+    monkeypatch.setattr(curves, "evaluate_into", fake)
     return fake
 
 
@@ -247,7 +249,9 @@ def test_curves_count_compare_and_are_stored(tmp_path, pretend):
     import pyarrow.parquet as pq
 
     seeds = range(900_000, 900_005)
-    rows = robustness(subject(), seeds, tmp_path, silent, ("light", "blur"), (0.0, 0.5, 1.0))
+    rows = curves.robustness(
+        seeing_spec(), seeds, tmp_path, silent, ("light", "blur"), (0.0, 0.5, 1.0)
+    )
     assert [(row["axis"], row["strength"], row["k"], row["n"]) for row in rows] == [
         ("light", 0.0, 5, 5), ("light", 0.5, 3, 5), ("light", 1.0, 1, 5),
         ("blur", 0.0, 5, 5), ("blur", 0.5, 3, 5), ("blur", 1.0, 1, 5),
@@ -266,36 +270,38 @@ def test_curves_count_compare_and_are_stored(tmp_path, pretend):
         ("blur", 1.0),
     ]
     stored = json.loads((tmp_path / "blur" / "0" / MARKER).read_text())
-    assert stored["about"]["shift"] == {"axis": "blur", "strength": 0.0}
+    assert stored["run"]["shift"] == {"axis": "blur", "strength": 0.0}
     assert repr(read_rows(tmp_path / "blur" / "0")) == repr(read_rows(tmp_path / "light" / "0"))
 
 
 def test_running_again_does_only_what_is_missing(tmp_path, pretend):
     seeds = range(900_000, 900_003)
-    first = robustness(subject(), seeds, tmp_path, silent, ("light",), (0.0, 1.0))
+    first = curves.robustness(seeing_spec(), seeds, tmp_path, silent, ("light",), (0.0, 1.0))
     done = len(pretend.calls)
-    assert robustness(subject(), seeds, tmp_path, silent, ("light",), (0.0, 1.0)) == first
+    assert (
+        curves.robustness(seeing_spec(), seeds, tmp_path, silent, ("light",), (0.0, 1.0)) == first
+    )
     assert len(pretend.calls) == done
-    robustness(subject(), seeds, tmp_path, silent, ("light", "smoke"), (0.0, 0.5, 1.0))
+    curves.robustness(seeing_spec(), seeds, tmp_path, silent, ("light", "smoke"), (0.0, 0.5, 1.0))
     assert pretend.calls[done:] == [("light", 0.5), ("smoke", 0.5), ("smoke", 1.0)]
     with pytest.raises(OutputExists, match="of another policy"):
-        robustness(subject(), range(5), tmp_path, silent, ("light",))
+        curves.robustness(seeing_spec(), range(5), tmp_path, silent, ("light",))
 
 
 def test_without_images_only_the_arm_can_shift(tmp_path):
-    blind = policy_spec.baseline_subject("expert", SHORT)
+    blind = open_policy("expert", env={"max_steps": 4})
     assert axes_of(blind) == ("latency", "kinematic_error")
-    assert axes_of(subject()) == tuple(AXES)
+    assert axes_of(seeing_spec()) == tuple(AXES)
     with pytest.raises(InputError, match="sees no images"):
-        robustness(blind, SEEDS, tmp_path, silent, ("blur",))
+        curves.robustness(blind, SEEDS, tmp_path, silent, ("blur",))
 
 
 def test_wrong_axes_and_strengths_are_refused(tmp_path):
     with pytest.raises(UnknownName, match="blur"):
-        robustness(subject(), SEEDS, tmp_path, silent, ("blurr",))
+        curves.robustness(seeing_spec(), SEEDS, tmp_path, silent, ("blurr",))
     for strengths in ((), (0.5, 0.5), (1.0, 0.0), (0.0, 1.5), (float("nan"),)):
         with pytest.raises(InputError, match="strengths"):
-            robustness(subject(), SEEDS, tmp_path, silent, ("blur",), strengths)
+            curves.robustness(seeing_spec(), SEEDS, tmp_path, silent, ("blur",), strengths)
 
 
 def test_the_verb_measures_the_expert_and_continues(tmp_path, capsys):

@@ -1,5 +1,6 @@
-"""Sweeps on the executor: killed, interrupted, failing, continued; whatever happens, each cell once
-and one digest.
+"""Sweeps on the executor: killed, interrupted, failing, continued.
+
+Whatever happens, each run is done once and the digest is the same.
 """
 
 import json
@@ -18,17 +19,22 @@ import pytest
 from surgicai_vision.commands.console import QuietConsole
 from surgicai_vision.commands.sweep import read_grid
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.core.executor import JOBS, RunContext
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.codecs import DEPTH_FAR, DEPTH_NEAR, grey
 from surgicai_vision.dataset.subset import first_episodes, with_frame_stride
-from surgicai_vision.experiments.run import Cell
-from surgicai_vision.experiments.sweep import Grid, estimate, plan, read_choice, run_sweep
-from surgicai_vision.experiments.sweep.grid import chain_parts
+from surgicai_vision.evaluation.storage import read_evaluation
+from surgicai_vision.experiments.sweep.driver import run_sweep
+from surgicai_vision.experiments.sweep.estimate import estimate
+from surgicai_vision.experiments.sweep.grid import Grid, parts_of
 from surgicai_vision.experiments.sweep.lerobot import _arguments
-from surgicai_vision.experiments.sweep.plan import Jobs
+from surgicai_vision.experiments.sweep.plan import Jobs, plan, read_grid_of, run_key
+from surgicai_vision.experiments.sweep.selection import read_choice
+from surgicai_vision.report.experiment_key import condition_of
 from surgicai_vision.training.checkpoint import read_checkpoint
+from surgicai_vision.training.run_config import OWN, RunConfig, Starts
 
 QUIET = QuietConsole().stage
 BLIND = Grid(
@@ -42,26 +48,26 @@ BLIND = Grid(
     episodes=1,
     size=32,
 )
-"""Four cells that see nothing: half a second each."""
+"""Four runs that see nothing: half a second each."""
 
 
 def sweep(grid, out, workers=0, stage=QUIET, only=()):
     context = RunContext(workers, stage=stage)
-    return run_sweep(grid, out, context, choice=read_choice(only, grid.cells))
+    return run_sweep(grid, out, context, choice=read_choice(only, grid.runs))
 
 
 def counts(result):
-    return tuple(result[name] for name in ("cells", "done", "cached", "failed", "not_run", "left"))
+    return tuple(result[name] for name in ("runs", "done", "cached", "failed", "not_run", "left"))
 
 
 @contextmanager
 def eventful(title, unit):
-    """Kill a worker after the first cell, and interrupt the run after the third."""
+    """Kill a worker after the first run, and interrupt the sweep after the third."""
 
     def progress(done, total, unit=""):
-        if title == "cells" and done == 1:
+        if title == "runs" and done == 1:
             os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
-        if title == "cells" and done == 3:
+        if title == "runs" and done == 3:
             raise KeyboardInterrupt
 
     yield progress
@@ -79,7 +85,7 @@ def test_a_killed_and_interrupted_sweep_ends_as_a_quiet_one(quiet, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         sweep(BLIND, out, workers=2, stage=eventful)
     assert not multiprocessing.active_children()
-    assert 1 <= len(list(out.glob("cells/*/cell.json"))) < 4
+    assert 1 <= len(list(out.glob("runs/*/result.json"))) < 4
     result = sweep(BLIND, out, workers=2)
     assert (
         result["failed"] == 0 and result["done"] + result["cached"] == 4 and result["cached"] >= 2
@@ -88,7 +94,7 @@ def test_a_killed_and_interrupted_sweep_ends_as_a_quiet_one(quiet, tmp_path):
         "whatever the workers, and whatever happened to them"
     )
     rows = pq.read_table(out / "episodes.parquet").to_pylist()
-    assert len(rows) == len({(row["cell"], row["seed"]) for row in rows}) == 4
+    assert len(rows) == len({(row["run"], row["seed"]) for row in rows}) == 4
     assert not (out / "work").exists()
 
 
@@ -101,13 +107,13 @@ def test_a_finished_sweep_does_nothing(quiet):
     assert {path.name for path in after if after[path] != before.get(path)} == {"episodes.parquet"}
 
 
-def test_chosen_cells_are_done_and_the_others_left_for_later(quiet, tmp_path):
+def test_chosen_runs_are_done_and_the_others_left_for_later(quiet, tmp_path):
     out = tmp_path / "out"
     grid = replace(BLIND, task=("grasp", "place"))
     chosen = sweep(grid, out, only=("task=grasp", "seed=1", "demonstrations=1", "2"))
     assert counts(chosen) == (8, 2, 0, 0, 0, 6)
     assert [path.name for path in (out / "data").iterdir()] == ["grasp"], (
-        "nothing is made for cells that are left"
+        "nothing is made for runs that are left"
     )
     assert [path.name for path in (out / "references").iterdir()] == ["expert-grasp"]
     again = sweep(grid, out, only=("task=grasp",))
@@ -125,13 +131,13 @@ def test_chosen_cells_are_done_and_the_others_left_for_later(quiet, tmp_path):
 )
 def test_a_wrong_choice_names_the_right_ones(only, told):
     with pytest.raises(InputError, match=told):
-        read_choice(only, BLIND.cells)
+        read_choice(only, BLIND.runs)
 
 
-def test_a_cell_made_by_something_else_is_done_again_in_its_place(quiet, tmp_path):
+def test_a_run_made_by_something_else_is_done_again_in_its_place(quiet, tmp_path):
     out, first = quiet
     state = plan(BLIND, out)[0]
-    path = out / "cells" / state.key / "cell.json"
+    path = out / "runs" / state.key / "result.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "job": "other"}))
     assert [(s.state, s.reason) for s in plan(BLIND, out)][:2] == [
         ("to do", "made by other code or other data"),
@@ -152,8 +158,11 @@ def test_smaller_sets_of_demonstrations_lie_within_larger(quiet):
     for wrong in (0, 3):
         with pytest.raises(InputError, match="holds 2"):
             first_episodes(dataset, wrong)
-    trained = {state.cell.demonstrations: read_checkpoint(out / "cells" / state.key / "policy") for state in
-               plan(BLIND, out) if state.cell.seed == 0}  # fmt: skip
+    trained = {
+        state.run.demonstrations: read_checkpoint(out / "runs" / state.key / "policy")
+        for state in plan(BLIND, out)
+        if state.run.seed == 0
+    }
     assert {asked: card.frames for asked, card in trained.items()}[1] == part.length
 
 
@@ -179,7 +188,7 @@ def test_frames_of_a_stride_are_those_of_the_whole(quiet):
         with_frame_stride(dataset, 0)
 
 
-def test_a_failing_cell_is_recorded_the_rest_goes_on_and_it_is_tried_again(tmp_path):
+def test_a_failing_run_is_recorded_the_rest_goes_on_and_it_is_tried_again(tmp_path):
     recipe = tmp_path / "wild.yaml"
     recipe.write_text("learning_rate: 1.0e+38\nepochs: 3\n")
     grid = replace(
@@ -188,7 +197,7 @@ def test_a_failing_cell_is_recorded_the_rest_goes_on_and_it_is_tried_again(tmp_p
     grid = replace(grid, expert=False)
     result = sweep(grid, tmp_path / "out", workers=1)
     assert counts(result) == (2, 1, 0, 1, 0, 0)
-    (failure,) = (tmp_path / "out").glob("cells/*/failed.json")
+    (failure,) = (tmp_path / "out").glob("runs/*/failed.json")
     error = json.loads(failure.read_text())["error"]
     assert "without overflow" in error and "Traceback" in error
     assert "failed: grasp, proprioception-wild" in result["problems"][0]
@@ -198,23 +207,27 @@ def test_a_failing_cell_is_recorded_the_rest_goes_on_and_it_is_tried_again(tmp_p
     assert not failure.exists()
 
 
-def test_chains_share_their_policies():
-    grid = Grid(("suture",), ("random",), (("front",),), chain=("privileged", "learned"), swap=True)
-    chains = [cell for cell in grid.cells if cell.chain]
-    assert len(grid.cells) == 13 and len(chains) == 12, (
-        "one policy for the whole, and two chains with five swaps each"
+def test_hierarchical_runs_share_their_policies():
+    grid = Grid(
+        ("suture",),
+        ("random",),
+        (("front",),),
+        hierarchical=("privileged", "learned"),
+        expert_swap=True,
     )
-    assert set(chain_parts(chains[0])) == {"hlp", *names.SUBTASKS}
-    assert set(chain_parts(next(cell for cell in chains if cell.swap == "place"))) == {
-        "hlp",
-        *names.SUBTASKS,
-    } - {"place"}
-    assert len({part for cell in chains for part in chain_parts(cell).values()}) == 6
+    runs = [run for run in grid.runs if run.is_hierarchical]
+    assert len(grid.runs) == 13 and len(runs) == 12, (
+        "one policy for the whole, and two hierarchical ones with five swaps each"
+    )
+    assert set(parts_of(runs[0])) == {"hlp", *names.SUBTASKS}
+    swapped = next(run for run in runs if run.expert_swap == "place")
+    assert set(parts_of(swapped)) == {"hlp", *names.SUBTASKS} - {"place"}
+    assert len({part for run in runs for part in parts_of(run).values()}) == 6
     with pytest.raises(InputError, match="no depth views"):
-        Cell("suture", "random", ("front_depth",), chain="learned")
+        RunConfig(TaskConfig("suture"), "random", ("front_depth",), termination="learned")
 
 
-def test_features_are_made_once_for_all_cells(tmp_path):
+def test_features_are_made_once_for_all_runs(tmp_path):
     grid = Grid(
         ("grasp",),
         ("random",),
@@ -223,8 +236,8 @@ def test_features_are_made_once_for_all_cells(tmp_path):
         recipe=("paper", "best"),
     )
     jobs = Jobs(grid, tmp_path)
-    seen = {job.key() for cell in grid.cells for job in jobs.features(cell)}
-    assert len(grid.cells) == 8
+    seen = {job.key() for run in grid.runs for job in jobs.features(run)}
+    assert len(grid.runs) == 8
     assert len(seen) == 4, "two views, all frames and every fifth"
 
 
@@ -237,14 +250,14 @@ def test_depth_is_seen_as_grey():
     assert (grid.cameras, grid.has_depth) == (("front", "back"), True)
 
 
-def test_lerobot_trains_on_what_the_cell_says(quiet):
+def test_lerobot_trains_on_what_the_run_says(quiet):
     dataset = open_dataset(quiet[0] / "data/grasp/dataset")
-    cell = Cell("grasp", "own", ("front",), 7, policy="act", demonstrations=2)
-    given = _arguments(cell, dataset, dataset.path, quiet[0] / "policy")
+    run = RunConfig(TaskConfig("grasp"), OWN, ("front",), seed=7, policy="act", demonstrations=1)
+    given = _arguments(run, dataset, dataset.path, quiet[0] / "policy")
     assert {
         "--policy.type=act",
         "--seed=7",
-        "--dataset.episodes=[0, 1]",
+        "--dataset.episodes=[0]",
         '--env.cameras=["front"]',
     } <= set(given)
     inputs = next(text for text in given if text.startswith("--policy.input_features="))
@@ -257,12 +270,12 @@ def test_a_grid_is_read_with_single_values(tmp_path):
         "task: grasp\nencoder: random\nview: ['front,back']\nseed: 3\ndemonstrations: [5, 10]\n"
     )
     grid = read_grid(path)
-    assert [(cell.seed, cell.demonstrations, cell.view) for cell in grid.cells] == [
+    assert [(run.seed, run.demonstrations, run.views) for run in grid.runs] == [
         (3, 5, ("front", "back")),
         (3, 10, ("front", "back")),
     ]
     assert grid.recorded == 10
-    for line, error in (("policy: act2", UnknownName), ("chain: [sometimes]", UnknownName), ("steps: 0", InputError),
+    for line, error in (("policy: act2", UnknownName), ("hierarchical: [sometimes]", UnknownName), ("steps: 0", InputError),
                         ("source: dmp", UnknownName), ("noise: 2", InputError),
                         ("post_success_steps: -1", InputError)):  # fmt: skip
         path.write_text(f"task: grasp\nencoder: random\nview: [front]\n{line}\n")
@@ -285,34 +298,54 @@ def test_a_grid_says_who_demonstrates_and_how_much_disturbed(tmp_path):
         0.5,
         3,
     )
-    assert {grid.key(cell) for cell in grid.cells}.isdisjoint(
-        BLIND.key(cell) for cell in grid.cells
-    )
+    assert {run_key(run) for run in grid.runs}.isdisjoint(run_key(run) for run in BLIND.runs)
 
 
-def test_the_estimate_follows_the_cells_that_are_done(quiet, tmp_path):
+def test_the_estimate_is_by_what_finished_runs_took(quiet, tmp_path):
     out, _ = quiet
-    assert estimate(BLIND, out, plan(BLIND, out), 1)["seconds"] == 0
-    fresh = estimate(BLIND, tmp_path, plan(BLIND, tmp_path), 1)
-    assert fresh["seconds"] > 0 and "another machine" in fresh["source"]
-    assert (
-        estimate(BLIND, tmp_path, plan(BLIND, tmp_path), 2)["seconds"] <= fresh["seconds"] / 2 + 1
-    )
+    assert estimate(plan(BLIND, out), out, 1) == 0
+    assert estimate(plan(BLIND, tmp_path), tmp_path, 1) is None
+    done, *left = plan(BLIND, out)
+    to_do = [done, *(replace(state, state="to do", key=done.key) for state in left)]
+    taken = json.loads((out / "runs" / done.key / "result.json").read_text())["seconds"]
+    assert estimate(to_do, out, 2) == pytest.approx(3 * sum(taken.values()) / 2)
 
 
-def test_keys_count_every_module_that_can_change_a_cell():
-    """What a worker imports for a cell is counted in the cell's key, or named here as something
-    that cannot matter.
-    """
+def test_a_misspelt_recipe_is_refused_before_any_work(tmp_path):
+    grid = replace(BLIND, recipe=("pepar",))
+    with pytest.raises(UnknownName, match="Did you mean 'paper'"):
+        sweep(grid, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_is_stored_whole_wherever_its_results_are(quiet):
+    out, _ = quiet
+    for state in plan(BLIND, out):
+        folder = out / "runs" / state.key
+        trained = read_checkpoint(folder / "policy").run
+        evaluated = read_evaluation(folder / "evaluation").run
+        assert evaluated == state.run and evaluated.starts == Starts(names.TEST_SEED, 1)
+        assert condition_of(trained) == condition_of(evaluated), "one policy forms one condition"
+        assert trained.seed == evaluated.seed
+    assert read_grid_of(out) == BLIND
+
+
+def test_a_sweep_of_another_version_is_refused(tmp_path):
+    (tmp_path / "sweep.json").write_text(json.dumps({"task": ["grasp"], "chain": []}))
+    with pytest.raises(BadFile, match="of another version"):
+        sweep(BLIND, tmp_path)
+
+
+def test_keys_count_every_module_that_can_change_a_run():
+    """What a worker imports for a run is counted in its key, or named here as harmless."""
     code = (
-        "import sys, surgicai_vision.experiments.sweep.jobs, surgicai_vision.evaluation.lerobot_agent, surgicai_vision.training.train, "
-        "surgicai_vision.evaluation.hierarchical, surgicai_vision.evaluation.rollout, surgicai_vision.demos.record, surgicai_vision.dataset; "
+        "import sys, surgicai_vision.experiments.sweep.jobs, surgicai_vision.demos.record; "
         "print(*{name.split('.')[1] for name in sys.modules if name.startswith('surgicai_vision.')})"
     )
     said = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout
     loaded = set(said.split())
-    counted = set(JOBS["sweep-cell"].stages)
+    counted = set(JOBS["sweep-run"].stages)
     harmless = {"core", "report"}
     assert loaded - counted - harmless == set()

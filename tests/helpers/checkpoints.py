@@ -7,24 +7,20 @@ from policies.bc import BC
 from policies.hlp import HLP
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
+from surgicai_vision.training.run_config import RunConfig
 
 
 def checkpoint(folder: Path, task: str, policy: str = "bc") -> str:
     """Write an untrained policy that sees no image."""
     plugin = {"bc": BC, "hlp": HLP}[policy]
     written = Checkpoint(
-        task=TaskConfig(task),
-        policy=policy,
+        run=RunConfig(TaskConfig(task), policy=policy, demonstrations=1),
         recipe=to_mapping(Recipe()),
-        recipe_name="paper",
-        views=(),
         image_size=32,
         encoder=None,
         proprioception=True,
-        seed=0,
         epoch=1,
         dataset="",
-        demonstrations=1,
         frames=1,
         validation_episodes=(),
         train_losses=(),

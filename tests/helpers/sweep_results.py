@@ -4,6 +4,7 @@ Every kind of thing a report has to show.
 """
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +13,8 @@ import pyarrow.parquet as pq
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.evaluation.rollout import Episode, EpisodeMetrics, Film
-from surgicai_vision.evaluation.storage import write_evaluation
+from surgicai_vision.evaluation.storage import FORMAT, write_evaluation
+from surgicai_vision.training.run_config import RunConfig, Shift, Starts
 
 TASKS = ("grasp", "insert", "handoff")
 ENCODERS = {"imagenet": 0.45, "imagenet-lite": 0.3, "random": 0.05}
@@ -58,63 +60,38 @@ def episode(task, policy, seed, success, generator, stages=0):
     return Episode(row, Film(kept, np.stack([kept, np.full(10, seed)], axis=1).astype(np.float64)))
 
 
-def evaluation(folder, task, policy, rate, generator, about, episodes=20):
+def evaluation(folder, run, rate, generator, about=None, episodes=20):
     """Store one evaluation; a start's difficulty is the same for every policy."""
     made = []
     for index in range(episodes):
         hard = np.random.default_rng(index).uniform()
         won = generator.uniform() < np.clip(rate + 0.5 * (0.5 - hard), 0.0, 1.0)
-        made.append(episode(task, policy, names.TEST_SEED + index, bool(won), generator))
-    common = {
-        "task_config": to_mapping(TaskConfig(task)),
-        "command": COMMAND,
-        "provenance": MACHINE,
-    }
-    return write_evaluation(folder, made, {**common, **about})
+        made.append(episode(run.task, run.name, names.TEST_SEED + index, bool(won), generator))
+    stored = replace(run, starts=Starts(names.TEST_SEED, episodes))
+    common = {"command": COMMAND, "provenance": MACHINE}
+    return write_evaluation(folder, made, stored, {**common, **(about or {})})
 
 
-def checkpoint(seed, recipe="paper", demonstrations=45):
-    return {
-        "weights_sha256": "0123456789abcdef" * 4,
-        "policy_sha256": "aa" * 32,
-        "dataset": "fedcba9876543210" * 4,
-        "seed": seed,
-        "policy": "bc",
-        "recipe": recipe,
-        "demonstrations": demonstrations,
-    }
+CHECKPOINT = {
+    "weights_sha256": "0123456789abcdef" * 4,
+    "policy_sha256": "aa" * 32,
+    "dataset": "fedcba9876543210" * 4,
+}
 
 
-def cell(task, encoder, view, seed, **more):
-    return {
-        "task": task,
-        "encoder": encoder,
-        "view": list(view),
-        "seed": seed,
-        "policy": "bc",
-        "recipe": "paper",
-        "pool": "global",
-        "privileged": False,
-        "epochs": None,
-        **more,
-    }
-
-
-def store_cell(out, key, described, rate, generator, **about):
-    """Store a cell that was done."""
-    encoder, view = described["encoder"], described["view"]
-    name = f"{encoder}-{'+'.join(view)}" if encoder else "proprioception"
-    folder = out / "cells" / key
-    more = {
-        "views": view,
-        "encoder": encoder or name,
-        "checkpoint": checkpoint(described["seed"]),
-        "folder": f"outputs/sweeps/table/cells/{key}/policy",
-    }
-    summary = evaluation(
-        folder / "evaluation", described["task"], name, rate, generator, {**more, **about}
+def run_of(task, encoder, views, seed, **more):
+    """A run of 50 demonstrations."""
+    return RunConfig(
+        TaskConfig(task), encoder, tuple(views), seed=seed, **{"demonstrations": 50, **more}
     )
-    files.write_json(folder / "cell.json", {"cell": described, "summary": summary})
+
+
+def store_run(out, key, run, rate, generator):
+    """Store a run that was done."""
+    folder = out / "runs" / key
+    about = {"checkpoint": CHECKPOINT, "folder": f"outputs/sweeps/table/runs/{key}/policy"}
+    summary = evaluation(folder / "evaluation", run, rate, generator, about)
+    files.write_json(folder / "result.json", {"run": to_mapping(run), "summary": summary})
 
 
 def write_sweep(out, tasks=TASKS, seeds=(0, 1), encoders=ENCODERS, views=VIEWS):
@@ -124,38 +101,37 @@ def write_sweep(out, tasks=TASKS, seeds=(0, 1), encoders=ENCODERS, views=VIEWS):
     """
     generator = np.random.default_rng(7)
     out.mkdir(parents=True, exist_ok=True)
-    not_run = []
+    skipped = []
     for index, (task, view, seed) in enumerate(itertools.product(tasks, views, seeds)):
         for encoder, rate in encoders.items():
             key = f"{encoder}{index:03d}"
-            described = cell(task, encoder, view, seed)
+            run = run_of(task, encoder, view, seed)
             if (task, encoder, view, seed) == ("handoff", "imagenet", ("back",), 1):
-                (out / "cells" / key).mkdir(parents=True)
+                (out / "runs" / key).mkdir(parents=True)
                 error = "Traceback\n  in train\nRuntimeError: the disk is full"
-                files.write_json(
-                    out / "cells" / key / "failed.json", {"cell": described, "error": error}
-                )
+                failed = {"format": FORMAT, "run": to_mapping(run), "error": error}
+                files.write_json(out / "runs" / key / "failed.json", failed)
                 continue
             better = 0.25 if task == "handoff" else 0.0
-            store_cell(out, key, described, rate + better + 0.1 * (view == ("back",)), generator)
-        not_run.append(
-            f"not run: {task}, r3m-{'+'.join(view)}, seed {seed}: R3M's weights are not here; see"
-            " its card."
-        )
+            store_run(out, key, run, rate + better + 0.1 * (view == ("back",)), generator)
+        lacking = run_of(task, "r3m", view, seed)
+        reason = "R3M's weights are not here; see its card."
+        skipped.append({"key": f"r3m{index:03d}", "run": to_mapping(lacking), "reason": reason})
     for task in tasks:
-        store_cell(out, f"blind{task}", cell(task, None, (), 0), 0.05, generator)
-        evaluation(out / "references" / f"expert-{task}", task, "expert", 1.5, generator, {})
-    files.write_json(
-        out / "sweep.json", {"task": list(tasks), "demonstrations": 50, "seed": list(seeds)}
-    )
-    run = {
+        store_run(out, f"blind{task}", run_of(task, None, (), 0), 0.05, generator)
+        expert = RunConfig(TaskConfig(task), policy="expert")
+        evaluation(out / "references" / f"expert-{task}", expert, 1.5, generator)
+    files.write_json(out / "sweep.json", {"format": FORMAT, "grid": {"task": list(tasks)}})
+    state = {
+        "format": FORMAT,
         "title": "table",
         "command": COMMAND,
-        "not_run": [*not_run, "failed: replay-grasp: the mean demonstration is empty"],
+        "problems": ["failed: replay-grasp: the mean demonstration is empty"],
+        "skipped": skipped,
         "provenance": MACHINE,
         "data": "50 demonstrations",
     }
-    files.write_json(out / "run.json", run)
+    files.write_json(out / "run.json", state)
     probes = [
         {
             "encoder": encoder,
@@ -179,34 +155,29 @@ def add_curves(out):
     """Add what other sweeps hold: numbers of demonstrations, shifts, and the whole procedure."""
     generator = np.random.default_rng(3)
     for count, encoder in itertools.product((10, 20, 50, 100), ("imagenet", "random")):
-        described = cell("place", encoder, ("back",), 0, demonstrations=count)
-        store_cell(out, f"data{encoder}{count}", described, 0.1 + count / 200, generator)
+        run = run_of("place", encoder, ("back",), 0, demonstrations=count)
+        store_run(out, f"data{encoder}{count}", run, 0.1 + count / 200, generator)
     for axis, strength in itertools.product(("light", "blur"), (0.25, 0.5, 1.0)):
         for encoder in ("imagenet", "imagenet-lite"):
-            about = {
-                "views": ["back"],
-                "encoder": encoder,
-                "checkpoint": checkpoint(0, demonstrations=50),
-                "shift": {"axis": axis, "strength": strength},
-            }
+            run = run_of("place", encoder, ("back",), 0, shift=Shift(axis, strength))
             place = out / "robustness" / f"{encoder}-{axis}-{strength}"
-            evaluation(place, "place", f"{encoder}-back", 0.6 - 0.5 * strength, generator, about)
+            evaluation(place, run, 0.6 - 0.5 * strength, generator, {"checkpoint": CHECKPOINT})
     for swap in (None, "grasp", "insert"):
         stages = generator.integers(0, 6, size=20)
+        run = run_of(
+            "suture",
+            "imagenet",
+            ("front", "back"),
+            0,
+            termination="privileged",
+            expert_swap=swap,
+        )
         made = [
             episode(
-                "suture", "chain", names.TEST_SEED + at, bool(stage == 5), generator, int(stage)
+                "suture", run.name, names.TEST_SEED + at, bool(stage == 5), generator, int(stage)
             )
             for at, stage in enumerate(stages)
         ]
-        about = {
-            "task_config": to_mapping(TaskConfig("suture")),
-            "chain": {"hlp": "order"},
-            "encoder": "imagenet",
-            "views": ["front", "back"],
-            "swap": swap,
-            "command": COMMAND,
-            "provenance": MACHINE,
-        }
-        write_evaluation(out / "chains" / str(swap), made, about)
+        about = {"hierarchical": {"hlp": "order"}, "command": COMMAND, "provenance": MACHINE}
+        write_evaluation(out / "hierarchical" / str(swap), made, run, about)
     return out

@@ -9,16 +9,18 @@ import pytest
 
 from surgicai_vision import report
 from surgicai_vision.core import files, names
-from surgicai_vision.core.config import TaskConfig, to_mapping
+from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, SurgicaiError
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.rollout import Episode, EpisodeMetrics, Film
 from surgicai_vision.evaluation.storage import (
+    FORMAT,
     find_evaluations,
     read_film,
     read_rows,
     write_evaluation,
 )
+from surgicai_vision.training.run_config import RunConfig
 
 LIMIT = 3_000_000
 MACHINE = {
@@ -54,25 +56,17 @@ def episode(policy, seed, success):
 def store(folder, name, successes, views=None):
     """Store an evaluation of 20 episodes."""
     episodes = [episode(name, names.TEST_SEED + i, i < successes) for i in range(20)]
-    about = {
-        "task_config": to_mapping(TaskConfig("grasp")),
-        "command": "surgicai-vision evaluate",
-        "provenance": {},
-    }
-    if name not in report.REFERENCES:
-        encoder = name.rsplit("-", 1)[0] if views else "proprioception"
+    about = {"command": "surgicai-vision evaluate", "provenance": {}}
+    encoder = name.rsplit("-", 1)[0] if views else None
+    policy = name if name in report.REFERENCES else "bc"
+    run = RunConfig(TaskConfig("grasp"), encoder, tuple(views or ()), policy=policy)
+    if run.is_trained:
         checkpoint = {
             "weights_sha256": "0123456789abcdef" * 4,
-            "seed": 0,
             "dataset": "fedcba9876543210" * 4,
         }
-        about |= {
-            "views": views or [],
-            "encoder": encoder,
-            "checkpoint": checkpoint,
-            "folder": "policies/x",
-        }
-    return write_evaluation(folder / "evaluations" / name, episodes, about)
+        about |= {"checkpoint": checkpoint, "folder": "policies/x"}
+    return write_evaluation(folder / "evaluations" / name, episodes, run, about)
 
 
 @pytest.fixture
@@ -84,6 +78,7 @@ def results(tmp_path):
     store(tmp_path, "proprioception", 2)
     store(tmp_path, "expert", 20)
     run = {
+        "format": FORMAT,
         "title": "quickstart, grasp",
         "command": "surgicai-vision quickstart",
         "seconds": {"demos": 20.4, "dataset": 61.0},
@@ -215,14 +210,9 @@ def test_without_gl_the_numbers_remain(results, monkeypatch):
 def test_names_from_outside_are_escaped(tmp_path, painted):
     evil = "</script><script>alert(1)</script>"
     episodes = [episode(evil, names.TEST_SEED, True)]
-    about = {
-        "task_config": to_mapping(TaskConfig("grasp")),
-        "encoder": evil,
-        "views": ["front"],
-        "command": evil,
-    }
-    write_evaluation(tmp_path / "evil", episodes, {**about, "provenance": {}})
-    files.write_json(tmp_path / report.RUN_FILE, {"title": evil})
+    run = RunConfig(TaskConfig("grasp"), evil, ("front",))
+    write_evaluation(tmp_path / "evil", episodes, run, {"command": evil, "provenance": {}})
+    files.write_json(tmp_path / report.RUN_FILE, {"format": FORMAT, "title": evil})
     text = report.write_report(tmp_path).read_text()
     assert "<script>alert" not in text
     assert text.count("</script>") == 3

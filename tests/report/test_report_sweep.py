@@ -15,23 +15,29 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from matplotlib.figure import Figure
-from sweep_results import COMMAND, TASKS, add_curves, cell, evaluation, store_cell, write_sweep
+from sweep_results import COMMAND, TASKS, add_curves, evaluation, run_of, store_run, write_sweep
 from test_report import assert_stands_alone, painted_stage
 
 from surgicai_vision import report
 from surgicai_vision.commands.main import main
 from surgicai_vision.commands.report import Options
 from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation import statistics
+from surgicai_vision.evaluation.storage import FORMAT
+from surgicai_vision.experiments.sweep.grid import Grid
+from surgicai_vision.experiments.sweep.plan import RunState
 from surgicai_vision.report import charts, filmstrips, formats, paper, paper_comparison, tables
 from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import best_trained, group, of_task
 from surgicai_vision.report.pairs import compare, factor
 from surgicai_vision.report.reader import collect
+from surgicai_vision.training.run_config import RunConfig, Shift
 
 LIMIT = 8_000_000
+EXPERT = RunConfig(TaskConfig("grasp"), policy="expert")
 
 
 @pytest.fixture(scope="module")
@@ -169,31 +175,22 @@ def test_what_failed_or_was_not_run_is_told_with_its_reason(text, written, group
 def test_a_plans_cells_that_nobody_came_to_are_pending(tmp_path):
     write_sweep(tmp_path / "s", tasks=("grasp",), seeds=(0,), views=(("back",),))
     plan = [
-        {
-            **cell("grasp", "imagenet", ("back",), 0),
-            "state": "to do",
-            "key": "a",
-            "reason": "made by other code",
-        },
-        {**cell("grasp", "imagenet", ("front",), 0), "state": "to do", "key": "b", "reason": ""},
-        {
-            **cell("grasp", "clip", ("front",), 3),
-            "state": "not run",
-            "key": "c",
-            "reason": "no weights",
-        },
+        RunState(run_of("grasp", "imagenet", ("back",), 0), "a", "to do", "made by other code"),
+        RunState(run_of("grasp", "imagenet", ("front",), 0), "b", "to do"),
+        RunState(run_of("grasp", "clip", ("front",), 3), "c", "not run", "no weights"),
     ]
     missing = collect(tmp_path / "s", plan).missing
     assert [(item.condition.encoder, item.seed, item.state) for item in missing] == [
         ("clip", 3, "not run"),
         ("imagenet", 0, "pending"),
+        ("r3m", 0, "not run"),
     ]
     assert missing[0].reason == "no weights"
 
 
 def test_what_could_not_be_run_where_the_sweep_ran_stays_not_run_here(tmp_path):
     write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
-    plan = [{**cell("grasp", "r3m", ("back",), 0), "state": "to do", "key": "a", "reason": ""}]
+    plan = [RunState(run_of("grasp", "r3m", ("back",), 0), "a", "to do")]
     (missing,) = collect(tmp_path, plan).missing
     assert (missing.state, missing.reason) == (
         "not run",
@@ -204,12 +201,12 @@ def test_what_could_not_be_run_where_the_sweep_ran_stays_not_run_here(tmp_path):
 def test_a_cell_that_the_run_skipped_is_told_whatever_its_name(tmp_path):
     write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
     run = json.loads((tmp_path / "run.json").read_text())
-    skipped = cell("grasp", "clip", ("front",), 0, epochs=2)
-    run["skipped"] = [{"key": "a", "cell": skipped, "reason": "its licence"}]
+    skipped = run_of("grasp", "clip", ("front",), 0, changes=("epochs=2",))
+    run["skipped"] = [{"key": "a", "run": to_mapping(skipped), "reason": "its licence"}]
     (tmp_path / "run.json").write_text(json.dumps(run))
-    missing = collect(tmp_path, [{**skipped, "state": "to do", "key": "a", "reason": ""}]).missing
+    missing = collect(tmp_path, [RunState(skipped, "a", "to do")]).missing
     assert [(item.condition.label, item.state, item.reason) for item in missing] == [
-        ("clip · 2 epochs on front", "not run", "its licence")
+        ("clip · epochs=2 on front", "not run", "its licence")
     ]
 
 
@@ -218,9 +215,8 @@ def test_cells_keep_their_columns_where_the_first_has_no_result(tmp_path):
         tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),), encoders={"random": 0.5}
     )
     missing = json.loads((tmp_path / "run.json").read_text())
-    missing["skipped"] = [
-        {"key": "a", "cell": cell("grasp", "clip", ("back",), 0), "reason": "its licence"}
-    ]
+    lacking = to_mapping(run_of("grasp", "clip", ("back",), 0))
+    missing["skipped"] = [{"key": "a", "run": lacking, "reason": "its licence"}]
     (tmp_path / "run.json").write_text(json.dumps(missing))
     found = group(collect(tmp_path))
     assert not found[0].episodes
@@ -228,23 +224,27 @@ def test_cells_keep_their_columns_where_the_first_has_no_result(tmp_path):
     assert {"low", "high", "command", "missed"} <= set(table.column_names)
 
 
-def test_the_command_reports_a_sweep_whose_grid_it_cannot_read(tmp_path, monkeypatch, capsys):
+def test_the_command_reports_a_sweep_that_it_cannot_plan(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(contact_sheet, "stage", painted_stage)
     write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
+    grid = Grid(("grasp",), ("random",), (("back",),), recipe=("gone.yaml",))
+    stored = {"format": FORMAT, "grid": to_mapping(grid)}
+    (tmp_path / "sweep.json").write_text(json.dumps(stored))
     assert main(["report", str(tmp_path), "--strips", "2", "--json"]) == 0
     said = capsys.readouterr()
     told = json.loads(said.out.splitlines()[-1])
     assert (told["evaluations"], told["missing"]) == (5, 1)
-    assert "grid cannot be read" in said.err
+    assert "cannot be planned" in said.err
     assert Options(tmp_path).strips == filmstrips.MOST_STRIPS
 
 
 def test_a_folder_where_every_cell_failed_has_a_report(tmp_path, monkeypatch):
     monkeypatch.setattr(contact_sheet, "stage", painted_stage)
-    folder = tmp_path / "cells" / "a"
+    folder = tmp_path / "runs" / "a"
     folder.mkdir(parents=True)
+    failed = to_mapping(run_of("grasp", "random", ("front",), 0))
     (folder / "failed.json").write_text(
-        json.dumps({"cell": cell("grasp", "random", ("front",), 0), "error": "no disk"})
+        json.dumps({"format": FORMAT, "run": failed, "error": "no disk"})
     )
     text = report.write_report(tmp_path).read_text()
     assert "No cell has a result yet" in text
@@ -254,13 +254,13 @@ def test_a_folder_where_every_cell_failed_has_a_report(tmp_path, monkeypatch):
 
 def test_a_cell_and_its_record_have_the_same_condition(tmp_path):
     """A failed seed and a done one must fall into one group, whatever the cell's variant."""
-    described = cell(
-        "grasp", "random", ("front",), 1, policy="act", change=["clock=true"], demonstrations=30
+    described = run_of(
+        "grasp", "random", ("front",), 1, policy="act", changes=("clock=true",), demonstrations=30
     )
-    store_cell(tmp_path, "done", {**described, "seed": 0}, 0.5, np.random.default_rng(0))
-    (tmp_path / "cells/broken").mkdir()
-    (tmp_path / "cells/broken/failed.json").write_text(
-        json.dumps({"cell": described, "error": "no disk"})
+    store_run(tmp_path, "done", replace(described, seed=0), 0.5, np.random.default_rng(0))
+    (tmp_path / "runs/broken").mkdir()
+    (tmp_path / "runs/broken/failed.json").write_text(
+        json.dumps({"format": FORMAT, "run": to_mapping(described), "error": "no disk"})
     )
     (item,) = group(collect(tmp_path))
     assert (len(item.results), len(item.missing)) == (1, 1)
@@ -271,9 +271,7 @@ def test_a_cell_and_its_record_have_the_same_condition(tmp_path):
 def test_a_reference_that_several_sweeps_evaluated_stands_once(tmp_path):
     for name, seed, episodes in (("right", 0, 20), ("left", 0, 12), ("other", 1, 20)):
         rate = 0.6  # the same generator draws the same first episodes
-        evaluation(
-            tmp_path / name, "grasp", "expert", rate, np.random.default_rng(seed), {}, episodes
-        )
+        evaluation(tmp_path / name, EXPERT, rate, np.random.default_rng(seed), {}, episodes)
     told = {(r.folder.name, r.condition.place) for r in collect(tmp_path).results}
     assert told == {
         ("right", "right"),
@@ -283,6 +281,28 @@ def test_a_reference_that_several_sweeps_evaluated_stands_once(tmp_path):
     assert [(r.folder.name, r.condition.place) for r in collect(tmp_path).results] == [
         ("right", "")
     ]
+
+
+def test_what_the_encoder_gave_is_told_and_stands_not_beside_the_papers_number(tmp_path):
+    run = run_of("grasp", "imagenet", ("back",), 0, pool="spatial")
+    evaluation(tmp_path / "spatial", run, 0.5, np.random.default_rng(0))
+    (result,) = collect(tmp_path).results
+    assert result.condition.pool == "spatial" and "spatial" in result.condition.label
+    assert paper_comparison.paper_rate(result.condition) is None
+
+
+def test_results_of_another_version_are_refused_in_one_line(tmp_path, root, capsys):
+    for folder in (root / "docs/results", root / "docs/results/chain"):
+        assert main(["report", str(folder), "--out", str(tmp_path / "report.html")]) == 2
+        (error,) = capsys.readouterr().err.strip().splitlines()
+        assert "of another version" in error
+
+
+def test_an_evaluation_without_films_has_a_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    evaluation(tmp_path, EXPERT, 1.5, np.random.default_rng(0))
+    (tmp_path / "films.safetensors").unlink()
+    assert "20/20" in report.write_report(tmp_path).read_text()
 
 
 def test_pairs_differ_in_one_thing_and_are_corrected_within_their_task(groups):
@@ -335,7 +355,7 @@ def test_curves_chain_and_probes_are_drawn_with_their_numbers(text, groups):
     item = find(groups, task="place", encoder="imagenet", axis="light", strength=0.5)
     assert f"{item.successes}/{item.episodes}" in curves
     chain = text.split('id="chain"')[1].split('id="probes"')[0]
-    swapped = find(groups, task="suture", swap="insert")
+    swapped = find(groups, task="suture", expert_swap="insert")
     finished = sum(row["stages"] > 2 for row in swapped.rows)
     assert f"{finished}/20" in chain
     assert "expert in insert" in chain
@@ -356,19 +376,8 @@ def test_shifted_evaluations_alone_make_a_page(tmp_path, monkeypatch):
     monkeypatch.setattr(contact_sheet, "stage", painted_stage)
     generator = np.random.default_rng(0)
     for strength in (0.0, 0.5, 1.0):
-        about = {
-            "views": ["front"],
-            "encoder": "random",
-            "shift": {"axis": "blur", "strength": strength},
-        }
-        evaluation(
-            tmp_path / "blur" / f"{strength:g}",
-            "grasp",
-            "random-front",
-            1.5 - strength,
-            generator,
-            about,
-        )
+        run = run_of("grasp", "random", ("front",), 0, shift=Shift("blur", strength))
+        evaluation(tmp_path / "blur" / f"{strength:g}", run, 1.5 - strength, generator)
     text = report.write_report(tmp_path).read_text()
     assert "random on front, blur 0 solves 20 of 20 held-out starts of grasp" in text
     assert len(rows_of(text, "success")) == 3
@@ -378,7 +387,7 @@ def test_shifted_evaluations_alone_make_a_page(tmp_path, monkeypatch):
 def test_two_evaluations_of_the_same_thing_are_not_counted_as_one(tmp_path):
     generator = np.random.default_rng(0)
     for name in ("friction", "attach"):
-        evaluation(tmp_path / name, "grasp", "expert", 1.5, generator, {})
+        evaluation(tmp_path / name, EXPERT, 1.5, generator)
     assert [(item.label, item.episodes) for item in group(collect(tmp_path))] == [
         ("expert · attach", 20),
         ("expert · friction", 20),
@@ -388,9 +397,7 @@ def test_two_evaluations_of_the_same_thing_are_not_counted_as_one(tmp_path):
 def test_what_a_running_sweep_has_not_filed_is_no_result_yet(tmp_path):
     write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
     before = len(collect(tmp_path).results)
-    evaluation(
-        tmp_path / "work/job/evaluation", "grasp", "expert", 1.5, np.random.default_rng(0), {}
-    )
+    evaluation(tmp_path / "work/job/evaluation", EXPERT, 1.5, np.random.default_rng(0))
     assert len(collect(tmp_path).results) == before
 
 

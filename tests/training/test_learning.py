@@ -145,9 +145,9 @@ def test_cache_lists_measures_and_prunes(capsys: pytest.CaptureFixture[str]) -> 
 def test_epochs_recipe_and_fine_tuning(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ("train", "--task", "suture", "--encoder", "tiny", "--view", "back")
     first = run(capsys, *arguments, "--epochs", "3", "--save-every", "2")
-    assert first["checkpoint"] == "outputs/train/suture-tiny-back-paper+3epochs-seed0"
+    assert first["checkpoint"] == "outputs/train/suture-tiny-back-paper+epochs=3-seed0"
     checkpoint = read_checkpoint(Path(first["checkpoint"]))
-    assert (checkpoint.epoch, checkpoint.recipe_name) == (3, "paper+3epochs")
+    assert (checkpoint.epoch, checkpoint.run.recipe_label) == (3, "paper+epochs=3")
     early = Path(first["checkpoint"]) / "epochs" / "epoch_0002"
     assert read_checkpoint(early).epoch == 2
     tuned = run(capsys, *arguments, "--epochs", "1", "--start", str(early), "--out", "tuned")
@@ -160,7 +160,7 @@ def test_epochs_recipe_and_fine_tuning(capsys: pytest.CaptureFixture[str]) -> No
     assert "to start from" in fails(capsys, *other)
     Path("own.yaml").write_text("epochs: 2\nhidden: [16]\n")
     own = read_checkpoint(Path(run(capsys, *arguments, "--recipe", "own.yaml")["checkpoint"]))
-    assert (own.epoch, own.recipe["hidden"], own.recipe_name) == (2, [16], "own")
+    assert (own.epoch, own.recipe["hidden"], own.run.recipe_label) == (2, [16], "own")
 
 
 def test_controls_are_named_by_what_they_see(capsys: pytest.CaptureFixture[str]) -> None:

@@ -44,7 +44,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     name = options.repo.partition("/")[2] or options.repo
     out = options.out or folders.OUTPUTS / "train" / name
     checkpoint = pull_policy(options.repo, out, revision=options.revision)
-    console.say(f"{checkpoint.name} for {checkpoint.task.task}: {out}")
+    console.say(f"{checkpoint.run.name} for {checkpoint.task.task}: {out}")
     console.say(f"next: surgicai-vision evaluate {out}")
     return {
         "repo": options.repo,

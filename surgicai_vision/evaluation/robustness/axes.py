@@ -12,12 +12,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING
 
-from surgicai_vision.core.config import RANDOMISATION_LIMITS, TaskConfig
+from surgicai_vision.core.config import (
+    RANDOMISATION_LIMITS,
+    RandomisationConfig,
+    TaskConfig,
+    from_mapping,
+)
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.evaluation.agent import Agent, MakeAgent
-from surgicai_vision.evaluation.policy_spec import Subject
+from surgicai_vision.training.run_config import Shift
+
+if TYPE_CHECKING:
+    from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.robustness.corruption import CORRUPTIONS, CorruptedAgent
 
 
@@ -68,19 +76,19 @@ AXES: Mapping[str, Axis] = MappingProxyType(
 challenge; the others are ours: the plain image is just about recognisable at strength 1."""
 
 
-def axes_of(subject: Subject) -> tuple[str, ...]:
-    """Return the axes that can change what a subject does: without images only those of the arm."""
-    images = bool(subject.about.get("views"))
+def axes_of(spec: "PolicySpec") -> tuple[str, ...]:
+    """Return the axes that can change what a policy does: without images only those of the arm."""
+    images = bool(spec.run.views)
     return tuple(name for name, axis in AXES.items() if images or not axis.seen)
 
 
-def shifted(subject: Subject, axis: str, strength: float) -> Subject:
-    """Return the subject in a world, or behind images, that shifted by `strength` along `axis`.
+def shifted(spec: "PolicySpec", axis: str, strength: float) -> "PolicySpec":
+    """Return the policy in a world, or behind images, that shifted by `strength` along `axis`.
 
     Args:
-        subject: who acts in which task.
+        spec: what is evaluated in which task.
         axis: a key of `AXES`.
-        strength: 0 (the same subject) to 1.
+        strength: 0 (nothing shifts) to 1.
 
     Raises:
         UnknownName, InputError: no such axis, or a strength out of its range.
@@ -89,28 +97,25 @@ def shifted(subject: Subject, axis: str, strength: float) -> Subject:
     if not 0 <= strength <= 1:
         raise InputError(f"strength is {strength}; allowed: 0 to 1.")
     chosen = AXES[axis]
-    make = subject.make_agent
+    make = spec.make
     if chosen.images:
         make = functools.partial(_corrupted, make, chosen.images, strength)
-    about = {**subject.about, "shift": {"axis": axis, "strength": float(strength)}}
-    return dataclasses.replace(
-        subject,
-        config=_shifted_config(subject.config, chosen, strength),
-        make_agent=make,
-        about=about,
+    run = dataclasses.replace(
+        spec.run,
+        env=_shifted_config(spec.config, chosen, strength),
+        shift=Shift(axis, float(strength)),
     )
+    return dataclasses.replace(spec, run=run, make=make)
 
 
 def _shifted_config(config: TaskConfig, axis: Axis, strength: float) -> TaskConfig:
     """Add `strength` of the axis to the task's randomisation, up to what is possible."""
-    changed: dict[str, Any] = {}
+    table = dataclasses.asdict(config.randomisation)
     for name, size in axis.world.items():
-        own = getattr(config.randomisation, name)
+        own = table[name]
         value = min(own + strength * size, RANDOMISATION_LIMITS[name])
-        changed[name] = math.floor(value + 0.5) if isinstance(own, int) else value
-    return dataclasses.replace(
-        config, randomisation=dataclasses.replace(config.randomisation, **changed)
-    )
+        table[name] = math.floor(value + 0.5) if isinstance(own, int) else value
+    return dataclasses.replace(config, randomisation=from_mapping(RandomisationConfig, table))
 
 
 def _corrupted(make: MakeAgent, kind: str, strength: float) -> Agent:

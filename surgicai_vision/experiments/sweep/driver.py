@@ -1,34 +1,35 @@
-"""Running: what cells share is made first, each thing once; then the cells, side by side; then the
-table.
+"""Driver: what runs share is made first, each thing once; then the runs, side by side.
 
-A finished job is filed by one rename from `work/` to its place. A run that was killed in between
+A finished job is filed by one rename from `work/` to its place. A sweep that was killed in between
 finds it in `work/`.
 """
 
-import functools
 import os
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 from surgicai_vision.core import files
 from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
-from surgicai_vision.core.executor import Job, RunContext, claim, run
+from surgicai_vision.core.executor import Job, RunContext, claim
+from surgicai_vision.core.executor import run as run_jobs
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.storage import (
-    CELL_FILE,
     FAILED_FILE,
+    FORMAT,
     GRID_FILE,
+    RESULT_FILE,
     RUN_FILE,
+    Row,
     parquet_bytes,
     read_rows,
+    read_versioned,
 )
 from surgicai_vision.experiments.prepare import prepare_dataset
-from surgicai_vision.experiments.run import Cell
-from surgicai_vision.experiments.sweep.grid import Grid, chain_parts
+from surgicai_vision.experiments.sweep.grid import Grid, parts_of
 from surgicai_vision.experiments.sweep.plan import (
     CACHED,
     LEFT,
@@ -36,16 +37,19 @@ from surgicai_vision.experiments.sweep.plan import (
     PROBE_FILE,
     REFERENCE_FILE,
     TO_DO,
-    CellState,
     Jobs,
+    RunState,
     plan,
+    run_folder,
+    run_key,
 )
 from surgicai_vision.experiments.sweep.selection import EVERYTHING, Choice
+from surgicai_vision.training.run_config import RunConfig
 
 EPISODES, PROBES = "episodes.parquet", "probes.parquet"
 WORK = "work"
 ATTEMPTS = 3
-"""How often a cell is started whose worker dies."""
+"""How often a run is started whose worker dies."""
 
 
 def run_sweep(
@@ -54,43 +58,42 @@ def run_sweep(
     context: RunContext,
     attempts: int = ATTEMPTS,
     choice: Choice = EVERYTHING,
-) -> dict[str, Any]:
-    """Run every cell that is not done and can be run.
+) -> Row:
+    """Do every run that is not done and can be done.
 
     Args:
-        grid: the cells.
+        grid: the runs.
         out: folder to make or to continue.
-        context: workers, engine and display; the result does not depend on them.
-        attempts: how often a cell is started whose worker dies.
-        choice: the cells to work on; others that are not there yet are left for another call.
+        context: processes, engine and progress; the result does not depend on them.
+        attempts: how often a run is started whose worker dies.
+        choice: the runs to work on; others that are not there yet are left for another call.
 
     Returns:
-        {"cells", "done" (by this call), "cached", "failed", "not_run", "left", "digest" (of all
-        rows there are), "problems": one line for each cell that failed or was not run}.
+        {"runs", "done" (by this call), "cached", "failed", "not_run", "left", "digest" (of all
+        rows there are), "problems": one line for each run that failed or was not done}.
 
     Raises:
         InputError: `out` cannot be written, or another sweep is at work in it.
         OutputExists: `out` holds something else.
+        UnknownName: a recipe that does not exist; before any work.
     """
+    plan(grid, out, choice)  # refuses what cannot be done before anything is written
     _open(grid, out)
     with claim(out / WORK):
         states = plan(grid, out, choice)
-        tasks = [
-            task
-            for task in grid.task
-            if any(s.cell.task == task and s.state != LEFT for s in states)
-        ]
-        do = functools.partial(run, context=context, attempts=attempts)
-        sweep = _Sweep(grid, out, context, do, tuple(tasks))
+        asked = [state for state in states if state.state != LEFT]
+        tasks = [task for task in grid.task if any(s.run.task == task for s in asked)]
+        sweep = _Sweep(grid, out, context, attempts, tuple(tasks))
         to_do = [state for state in states if state.state == TO_DO]
         sweep.prepare(to_do)
         sweep.do(to_do)
-        here = [
-            state
-            for state in states
-            if state.state in (CACHED, TO_DO) and state.key not in sweep.errors
-        ]
-        sweep.probe([state.cell for state in here])
+        sweep.probe(
+            [
+                state.run
+                for state in states
+                if state.state in (CACHED, TO_DO) and state.key not in sweep.errors
+            ]
+        )
         shutil.rmtree(out / WORK)
     skipped = [state for state in states if state.state == NOT_RUN]
     problems = [f"not run: {state.where}: {state.reason}" for state in skipped]
@@ -99,26 +102,26 @@ def run_sweep(
         for state in to_do
         if state.key in sweep.errors
     ]
-    problems += sweep.problems
     table = _collect(grid, out)
     _collect_probes(out)
-    _store_run(grid, out, problems, skipped)
+    _store_run(grid, out, sweep.problems, skipped)
     counts = {
-        "cells": len(states),
+        "runs": len(states),
         "done": len(to_do) - len(sweep.errors),
         "cached": sum(state.state == CACHED for state in states),
         "failed": len(sweep.errors),
         "not_run": len(skipped),
         "left": sum(state.state == LEFT for state in states),
     }
-    return {**counts, "digest": digest(table), "problems": problems, "out": str(out)}
+    lines = [*problems, *sweep.problems]
+    return {**counts, "digest": digest(table), "problems": lines, "out": str(out)}
 
 
 def _open(grid: Grid, out: Path) -> None:
     """Make the folder, or accept the one of the same grid."""
     files.check_output(out, may_resume=GRID_FILE)
     if (out / GRID_FILE).exists():
-        if files.read_json(out / GRID_FILE) != to_mapping(grid):
+        if read_versioned(out / GRID_FILE)["grid"] != to_mapping(grid):
             raise OutputExists(
                 f"--out {out} holds another sweep (see {out / GRID_FILE}); give another folder."
             )
@@ -129,26 +132,46 @@ def _open(grid: Grid, out: Path) -> None:
         raise InputError(
             f"--out {out} cannot be written: {error.strerror}; choose another folder."
         ) from None
-    files.write_json(out / GRID_FILE, to_mapping(grid))
+    files.write_json(out / GRID_FILE, {"format": FORMAT, "grid": to_mapping(grid)})
+
+
+@final
+@dataclass(frozen=True)
+class _Place:
+    """Where a job's result is filed.
+
+    Attributes:
+        folder: its place.
+        record: the file in it that names the job.
+        state: the run it is the result of; None for what belongs to no run.
+    """
+
+    folder: Path
+    record: str
+    state: RunState | None = None
+
+    def holds(self, key: str) -> bool:
+        """Return True if the result of the job `key` is there."""
+        path = self.folder / self.record
+        return path.exists() and files.read_json(path).get("job") == key
 
 
 @final
 @dataclass
 class _Sweep:
-    """One run of a sweep.
+    """One call of a sweep.
 
     Attributes:
-        grid, out, context: as `run_sweep`'s.
-        run: `executor.run` with the context.
+        grid, out, context, attempts: as `run_sweep`'s.
         tasks: those whose references are wanted.
-        errors: cell's key → what went wrong, in one line.
-        problems: what went wrong beside the cells.
+        errors: run's key → what went wrong, in one line.
+        problems: what went wrong beside the runs.
     """
 
     grid: Grid
     out: Path
     context: RunContext
-    run: Any
+    attempts: int
     tasks: tuple[str, ...]
     errors: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
@@ -164,45 +187,66 @@ class _Sweep:
         }
         self.jobs = Jobs(self.grid, self.out, command_line(), ours)
 
-    def prepare(self, to_do: Sequence[CellState]) -> None:
-        """Make the datasets, features and policies that cells share; a task whose dataset fails
-        fails its cells.
+    def prepare(self, to_do: Sequence[RunState]) -> None:
+        """Make the datasets, features and policies that runs share.
+
+        A task whose dataset fails fails its runs.
         """
-        needed = {state.cell.task: None for state in to_do}
         replayed = [
             task
             for task in self.tasks
-            if self.grid.replay and not self._filed_reference("replay", task)
+            if self.grid.replay and not self._is_filed_reference("replay", task)
         ]
-        for task in [*needed, *(task for task in replayed if task not in needed)]:
+        for task in dict.fromkeys([*(state.run.task for state in to_do), *replayed]):
             try:
-                prepare_dataset(
-                    self.grid.config(task),
-                    self.jobs.data_folder(task),
-                    self.context,
-                    demonstrations=self.grid.recorded,
-                    views=self.grid.cameras or ("front",),
-                    size=self.grid.size,
-                    depth=self.grid.has_depth,
-                    demonstrator=self.grid.demonstrator,
-                    disturbance=self.grid.disturbance,
-                    frame_stride=self.grid.frame_stride,
-                    post_success_steps=self.grid.post_success_steps,
-                )
+                self._prepare_dataset(task)
             except SurgicaiError as error:
                 for state in to_do:
-                    if task == state.cell.task:
+                    if task == state.run.task:
                         self._fail(state, error)
         self._renew()
-        live = [state.cell for state in to_do if state.key not in self.errors]
-        self._share("features", [job for cell in live for job in self.jobs.features(cell)])
-        self._train_chains(
-            [state for state in to_do if state.cell.chain and state.key not in self.errors]
+        live = [state for state in to_do if state.key not in self.errors]
+        self._share("features", [job for state in live for job in self.jobs.features(state.run)])
+        self._train_parts([state for state in live if state.run.is_hierarchical])
+
+    def _prepare_dataset(self, task: str) -> None:
+        """Record and render a task's demonstrations."""
+        prepare_dataset(
+            self.grid.config(task),
+            self.jobs.data_folder(task),
+            self.context,
+            demonstrations=self.grid.recorded,
+            views=self.grid.cameras or ("front",),
+            size=self.grid.size,
+            depth=self.grid.has_depth,
+            frame_stride=self.grid.frame_stride,
+            demonstrator=self.grid.demonstrator,
+            disturbance=self.grid.disturbance,
+            post_success_steps=self.grid.post_success_steps,
         )
 
+    def _run(
+        self,
+        title: str,
+        jobs: Sequence[Job],
+        ended: Callable[[Job, Path, SurgicaiError | None], None],
+    ) -> None:
+        """Run jobs and show how many are done."""
+        with self.context.stage(title, title) as progress:
+            run_jobs(
+                jobs,
+                self.out / WORK,
+                context=self.context,
+                attempts=self.attempts,
+                unit=title,
+                progress=progress,
+                ended=ended,
+            )
+
     def _share(self, title: str, jobs: Iterable[Job]) -> dict[str, SurgicaiError]:
-        """Do jobs, each once; return the errors by key. What failed here fails again in the cell
-        and is told there.
+        """Do jobs, each once; return the errors by key.
+
+        What failed here fails again in the run and is told there.
         """
         once = {job.key(): job for job in jobs}
         errors: dict[str, SurgicaiError] = {}
@@ -212,147 +256,121 @@ class _Sweep:
                 errors[job.key()] = error
 
         if once:
-            with self.context.stage(title, title) as progress:
-                self.run(
-                    list(once.values()), self.out / WORK, unit=title, progress=progress, ended=ended
-                )
+            self._run(title, list(once.values()), ended)
         return errors
 
-    def _train_chains(self, states: Sequence[CellState]) -> None:
-        """Train the policies of chains and file them; a chain that lacks one fails."""
+    def _train_parts(self, states: Sequence[RunState]) -> None:
+        """Train the policies of hierarchical runs and file them; a run that lacks one fails."""
         parts = {
             self.jobs.policy(part).key(): part
             for state in states
-            for part in chain_parts(state.cell).values()
+            for part in parts_of(state.run).values()
         }
-        missing = [
-            part
-            for key, part in parts.items()
-            if not self._is_filed(self.jobs.policy_folder(part), key)
-        ]
+        places = {
+            key: _Place(self.jobs.policy_folder(part), JOB_FILE) for key, part in parts.items()
+        }
+        missing = [part for key, part in parts.items() if not places[key].holds(key)]
         errors = self._share("policies", map(self.jobs.policy, missing))
-        for key, part in parts.items():
-            if (self.out / WORK / key).is_dir():
-                _file(self.out / WORK / key, self.jobs.policy_folder(part), JOB_FILE, key)
+        self._file_finished(places)
         for state in states:
-            for part in chain_parts(state.cell).values():
+            for part in parts_of(state.run).values():
                 error = errors.get(self.jobs.policy(part).key())
                 if error and state.key not in self.errors:
                     self._fail(state, error)
 
-    def _is_filed(self, folder: Path, key: str) -> bool:
-        path = folder / JOB_FILE
-        return path.exists() and files.read_json(path)["job"] == key
-
-    def do(self, to_do: Sequence[CellState]) -> None:
-        """Do the cells and the references, and file each as it ends."""
-        places: dict[str, tuple[Path, str, CellState | None]] = {}
+    def do(self, to_do: Sequence[RunState]) -> None:
+        """Do the runs and the references, and file each as it ends."""
+        places: dict[str, _Place] = {}
         jobs = []
         for state in to_do:
             if state.key not in self.errors:
-                jobs.append(self.jobs.cell(state.cell))
-                places[jobs[-1].key()] = (self.jobs.cell_folder(state.key), CELL_FILE, state)
+                job = self.jobs.run(state.run)
+                jobs.append(job)
+                places[job.key()] = _Place(run_folder(self.out, state.key), RESULT_FILE, state)
         for name, task in self._references():
             job = self.jobs.reference(name, task)
             jobs.append(job)
-            places[job.key()] = (self._reference_folder(name, task), REFERENCE_FILE, None)
-        for key, (
-            place,
-            record,
-            _,
-        ) in places.items():  # done by a run that was killed before it could file them
-            if (self.out / WORK / key).is_dir():
-                _file(self.out / WORK / key, place, record, key)
-        left = [job for job in jobs if not self._at(places[job.key()], job.key())]
+            places[job.key()] = _Place(self._reference_folder(name, task), REFERENCE_FILE)
+        self._file_finished(places)
+        left = [job for job in jobs if not places[job.key()].holds(job.key())]
 
         def ended(job: Job, folder: Path, error: SurgicaiError | None) -> None:
-            place, record, state = places[folder.name]
+            place = places[folder.name]
             if error is None:
-                _file(folder, place, record, folder.name)
-            elif state:
-                self._fail(state, error)
+                _file(folder, place, folder.name)
+            elif place.state:
+                self._fail(place.state, error)
             else:
-                self.problems.append(f"failed: {place.name}: {' '.join(str(error).split())}")
+                self.problems.append(f"failed: {place.folder.name}: {' '.join(str(error).split())}")
 
         if left:
-            with self.context.stage("cells", "cells") as progress:
-                self.run(left, self.out / WORK, unit="cells", progress=progress, ended=ended)
+            self._run("runs", left, ended)
 
-    def probe(self, cells: Sequence[Cell]) -> None:
-        """Probe what the cells see, where the grid asks for it."""
-        wanted = self.jobs.probes(cells) if self.grid.probe else {}
+    def probe(self, runs: Sequence[RunConfig]) -> None:
+        """Probe what the runs see, where the grid asks for it."""
+        wanted = self.jobs.probes(runs) if self.grid.probe else {}
         places = {
-            job.key(): (self.out / "probes" / name, PROBE_FILE, None)
+            job.key(): _Place(self.out / "probes" / name, PROBE_FILE)
             for name, job in wanted.items()
         }
-        errors = self._share(
-            "probes", [job for job in wanted.values() if not self._at(places[job.key()], job.key())]
-        )
-        for key, (place, record, _) in places.items():
-            if (self.out / WORK / key).is_dir():
-                _file(self.out / WORK / key, place, record, key)
-            if key in errors:
-                self.problems.append(
-                    f"failed: probe {place.name}: {' '.join(str(errors[key]).split())}"
-                )
+        missing = [job for job in wanted.values() if not places[job.key()].holds(job.key())]
+        errors = self._share("probes", missing)
+        self._file_finished(places)
+        for key, error in errors.items():
+            name = places[key].folder.name
+            self.problems.append(f"failed: probe {name}: {' '.join(str(error).split())}")
 
-    def _at(self, place: tuple[Path, str, CellState | None], key: str) -> bool:
-        path = place[0] / place[1]
-        return path.exists() and files.read_json(path).get("job") == key
+    def _file_finished(self, places: dict[str, _Place]) -> None:
+        """File what is finished and not filed yet, by this call or by one that was killed."""
+        for key, place in places.items():
+            if (self.out / WORK / key).is_dir():
+                _file(self.out / WORK / key, place, key)
 
     def _references(self) -> list[tuple[str, str]]:
         """Return (name, task) of the references that are not there."""
-        wanted = [
-            (name, on)
-            for name, on in (("expert", self.grid.expert), ("replay", self.grid.replay))
-            if on
-        ]
-        pairs = [(name, task) for task in self.tasks for name, _ in wanted]
-        return [(name, task) for name, task in pairs if not self._filed_reference(name, task)]
+        wanted = (("expert", self.grid.expert), ("replay", self.grid.replay))
+        pairs = [(name, task) for task in self.tasks for name, is_on in wanted if is_on]
+        return [(name, task) for name, task in pairs if not self._is_filed_reference(name, task)]
 
-    def _filed_reference(self, name: str, task: str) -> bool:
-        path = self._reference_folder(name, task) / REFERENCE_FILE
-        return (
-            path.exists()
-            and files.read_json(path).get("job") == self.jobs.reference(name, task).key()
-        )
+    def _is_filed_reference(self, name: str, task: str) -> bool:
+        place = _Place(self._reference_folder(name, task), REFERENCE_FILE)
+        return place.holds(self.jobs.reference(name, task).key())
 
     def _reference_folder(self, name: str, task: str) -> Path:
         return self.out / "references" / f"{name}-{task}"
 
-    def _fail(self, state: CellState, error: SurgicaiError) -> None:
-        """Keep a cell's error, and its traceback where it was none of ours."""
-        folder = self.jobs.cell_folder(state.key)
+    def _fail(self, state: RunState, error: SurgicaiError) -> None:
+        """Keep a run's error, and its traceback where it was none of ours."""
+        folder = run_folder(self.out, state.key)
         folder.mkdir(parents=True, exist_ok=True)
         details = "\n".join([str(error), *getattr(error, "__notes__", [])])
-        files.write_json(folder / FAILED_FILE, {"cell": to_mapping(state.cell), "error": details})
+        failed = {"format": FORMAT, "run": to_mapping(state.run), "error": details}
+        files.write_json(folder / FAILED_FILE, failed)
         self.errors[state.key] = " ".join(str(error).split())
 
 
 JOB_FILE = "job.json"
-"""Names the job that made a policy which chains share."""
+"""Names the job that made a policy which hierarchical policies share."""
 
 
-def _file(folder: Path, place: Path, record: str, key: str) -> None:
-    """Move a job's result to its place, its key in `record`; what was there is replaced."""
-    path = folder / record
+def _file(folder: Path, place: _Place, key: str) -> None:
+    """Move a job's result to its place, its key in the record; what was there is replaced."""
+    path = folder / place.record
     files.write_json(path, {**(files.read_json(path) if path.exists() else {}), "job": key})
-    place.parent.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(place, ignore_errors=True)
-    os.rename(folder, place)
-    files.sync_folder(place.parent)
+    place.folder.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(place.folder, ignore_errors=True)
+    os.rename(folder, place.folder)
+    files.sync_folder(place.folder.parent)
 
 
-def _collect(grid: Grid, out: Path) -> list[dict[str, Any]]:
-    """Write `episodes.parquet` of all cells that are done and return its rows."""
-    table = []
-    for cell in grid.cells:
-        key = grid.key(cell)
-        if (out / "cells" / key / CELL_FILE).exists():
-            table += [
-                {**_about(grid, key, cell), **row}
-                for row in read_rows(out / "cells" / key / "evaluation")
-            ]
+def _collect(grid: Grid, out: Path) -> list[Row]:
+    """Write `episodes.parquet` of all runs that are done and return its rows."""
+    table: list[Row] = []
+    for run in grid.runs:
+        folder = run_folder(out, run_key(run))
+        if (folder / RESULT_FILE).exists():
+            about = _about(run)
+            table += [{**about, **row} for row in read_rows(folder / "evaluation")]
     files.write_bytes(out / EPISODES, parquet_bytes(table))
     return table
 
@@ -364,23 +382,23 @@ def _collect_probes(out: Path) -> None:
         files.write_bytes(out / PROBES, parquet_bytes(rows))
 
 
-def _about(grid: Grid, key: str, cell: Cell) -> dict[str, Any]:
-    """Return what a row says of its cell."""
+def _about(run: RunConfig) -> Row:
+    """Return what a row says of its run."""
     return {
-        "cell": key,
-        "encoder": cell.encoder,
-        "view": "+".join(cell.view),
-        "training_seed": cell.seed,
-        "trained_by": cell.policy,
-        "recipe": cell.recipe,
-        "demonstrations": cell.demonstrations or grid.recorded,
-        "chain": cell.chain,
-        "swap": cell.swap,
+        "run": run_key(run),
+        "encoder": run.encoder,
+        "view": "+".join(run.views),
+        "training_seed": run.seed,
+        "trained_by": run.policy,
+        "recipe": run.recipe,
+        "demonstrations": run.demonstrations,
+        "hierarchical": run.termination,
+        "expert_swap": run.expert_swap,
     }
 
 
-def _store_run(grid: Grid, out: Path, problems: list[str], skipped: Sequence[CellState]) -> None:
-    """Write what the report says of the run; only when something changed."""
+def _store_run(grid: Grid, out: Path, problems: list[str], skipped: Sequence[RunState]) -> None:
+    """Write what the report says of the sweep; only when something changed."""
     old = files.read_json(out / RUN_FILE) if (out / RUN_FILE).exists() else {}
     counts = ", ".join(map(str, grid.demonstrations))
     parts = [f"{counts} demonstrations of each task by the scripted {grid.demonstrator}"]
@@ -390,9 +408,8 @@ def _store_run(grid: Grid, out: Path, problems: list[str], skipped: Sequence[Cel
         if grid.post_success_steps
         else []
     )
-    parts += [
-        f"{axis} up to {getattr(grid.randomisation, axis):g}" for axis in grid.randomisation.on
-    ]
+    randomised = {axis: size for axis, size in vars(grid.randomisation).items() if size}
+    parts += [f"{axis} up to {size:g}" for axis, size in randomised.items()]
     parts += [f"a frame every {grid.frame_stride} steps"] if grid.frame_stride > 1 else []
     seen = f"{', '.join(grid.views)} at {grid.size} × {grid.size}" if grid.views else "no images"
     taught = f"{', '.join(grid.policy)}, recipe {', '.join(grid.recipe)}"
@@ -401,19 +418,20 @@ def _store_run(grid: Grid, out: Path, problems: list[str], skipped: Sequence[Cel
             ", ".join(parts),
             seen,
             taught,
-            f"{grid.episodes} {grid.starts} starts from {grid.first_seed}",
+            f"{grid.episodes} {grid.starts} starts from {grid.bank.first_seed}",
         ]
     )
-    run = {
+    made = {
+        "format": FORMAT,
         "title": "sweep",
         "command": old.get("command") or command_line(),
         "data": data,
-        "not_run": problems,
+        "problems": problems,
+        "skipped": [
+            {"key": state.key, "run": to_mapping(state.run), "reason": state.reason}
+            for state in skipped
+        ],
+        "provenance": old.get("provenance") or provenance(),
     }
-    lacking = [
-        {"key": state.key, "cell": to_mapping(state.cell), "reason": state.reason}
-        for state in skipped
-    ]
-    made = {**run, "skipped": lacking, "provenance": old.get("provenance") or provenance()}
     if made != old:
         files.write_json(out / RUN_FILE, made)

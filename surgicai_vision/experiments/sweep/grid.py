@@ -1,10 +1,10 @@
-"""Grid: what a sweep's YAML file says, and the cells it stands for."""
+"""Grid: what a sweep's YAML file says, and the runs it stands for."""
 
+import functools
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names, view_names
@@ -12,45 +12,51 @@ from surgicai_vision.core.config import (
     RandomisationConfig,
     TaskConfig,
     check_frame_stride,
-    digest,
-    to_mapping,
 )
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.demos.demonstrator import SCRIPTED_DEMONSTRATORS
 from surgicai_vision.demos.rollout import Disturbance
-from surgicai_vision.evaluation.hierarchical import TERMINATIONS
-from surgicai_vision.experiments.run import OWN, Cell
-from surgicai_vision.experiments.sweep.lerobot import LEROBOT_POLICIES
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
-
-AXES = (
-    "task",
-    "encoder",
-    "view",
-    "recipe",
-    "policy",
-    "demonstrations",
-    "seed",
-    "chain",
+from surgicai_vision.training.run_config import (
+    LEROBOT_POLICIES,
+    OWN,
+    TERMINATIONS,
+    RunConfig,
+    Starts,
+    of_training,
+    with_epochs,
 )
-"""Keys of a grid that hold lists; one value alone may be written without brackets."""
 
+AXES: Mapping[str, Callable[[RunConfig], object]] = MappingProxyType(
+    {
+        "task": lambda run: run.task,
+        "encoder": lambda run: run.encoder,
+        "view": lambda run: run.views,
+        "recipe": lambda run: run.recipe,
+        "policy": lambda run: run.policy,
+        "demonstrations": lambda run: run.demonstrations,
+        "seed": lambda run: run.seed,
+        "hierarchical": lambda run: run.termination,
+    }
+)
+"""Keys of a grid that hold lists, and a run's value on each; one value alone may be written without
+brackets.
+"""
 
 BANKS: Mapping[str, int] = MappingProxyType(
     {"test": names.TEST_SEED, "validation": names.VALIDATION_SEED}
 )
-"""Bank of start states → its first seed: what is chosen is chosen on validation, and told of
-test.
-"""
+"""Bank of start states → its first seed; choices are made on validation, and reported on test."""
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """What is replaced in each cell that sees, alone and all else kept; what is None stays.
+    """What is replaced in each run that sees, alone and all else kept; what is None stays.
 
     Attributes:
-        encoder, view, pool, recipe, change: a cell's.
+        encoder, view, pool, recipe: a run's.
+        change: what is changed in the recipe besides.
         demonstrations: train on the first so many.
     """
 
@@ -64,20 +70,30 @@ class Ablation:
     def __post_init__(self) -> None:
         if self.encoder is not None:
             encoders.check_encoder_name(self.encoder)
-        if not self.replaced:
+        if self == Ablation():
             raise InputError(
-                "A ablation replaces nothing; give one of encoder, view, pool, recipe, change."
+                "An ablation replaces nothing; give one of encoder, view, pool, recipe, change, "
+                "demonstrations."
             )
 
-    @property
-    def replaced(self) -> dict[str, Any]:
-        """Fields of a cell and their new values."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+    def of(self, run: RunConfig) -> RunConfig:
+        """Return the run with this one thing replaced."""
+        views = run.views if self.view is None else self.view
+        if self.demonstrations is not None:
+            run = replace(run, demonstrations=self.demonstrations)
+        return replace(
+            run,
+            encoder=self.encoder or run.encoder,
+            views=views,
+            pool=self.pool or run.pool,
+            recipe=self.recipe or run.recipe,
+            changes=(*run.changes, *(self.change or ())),
+        )
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A sweep's configuration: every combination of its axes, and what all cells share.
+    """A sweep's configuration: every combination of its axes, and what all runs share.
 
     Attributes:
         task: tasks.
@@ -88,7 +104,7 @@ class Grid:
         policy: policies: those of `train`, and LeRobot's `act` and `diffusion`.
         recipe: recipes of the former.
         pool: what is taken from the encoders.
-        ablation: what is replaced one at a time in each cell that sees: ablations beside the whole.
+        ablation: what is replaced one at a time in each run that sees, beside the whole.
         demonstrations: numbers of the expert's demonstrations of each task; the smaller set lies
             within the larger.
         demonstrator: who demonstrates: `expert`, or `search`, which does not know the goal of a
@@ -98,16 +114,15 @@ class Grid:
         randomisation: what differs from episode to episode besides the start, in demonstrations and
             evaluations.
         frame_stride: frames are rendered every so many steps; recipes must then take them so.
-        chain: add, for the whole procedure, a high-level policy over a policy for each subtask, by
-            how subtasks end: `privileged` or `learned`.
-        swap: add each such chain with the expert in the place of each subtask's policy.
+        hierarchical: add, for the whole procedure, a high-level policy over a policy for each
+            subtask, by how subtasks end: `privileged` or `learned`.
+        expert_swap: add each such policy with the expert in the place of each subtask's policy.
         accept_licence: accept weights under a non-commercial licence.
-        proprioception: add a cell without images for each task and seed.
-        state: add a cell that sees the state with the goal, the ceiling, for each task and seed.
-        expert: evaluate the expert on each task beside the cells.
-        replay: evaluate blind replay of the mean demonstration too.
-        probe: probe the encoders' features for the needle's pose, where the command `probe` is
-            there.
+        proprioception: add a run without images for each task and seed.
+        state: add a run that sees the state with the goal, an upper bound, for each task and seed.
+        expert: evaluate the expert on each task beside the runs.
+        replay: evaluate a replay of the mean demonstration, which observes nothing, too.
+        probe: probe the encoders' features for the needle's pose.
         epochs: passes over the frames; none takes the recipe's.
         steps: updates of LeRobot's policies.
         batch: their batch size.
@@ -131,8 +146,8 @@ class Grid:
     post_success_steps: int = 0
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
     frame_stride: int = 1
-    chain: tuple[str, ...] = ()
-    swap: bool = False
+    hierarchical: tuple[str, ...] = ()
+    expert_swap: bool = False
     accept_licence: bool = False
     proprioception: bool = False
     state: bool = False
@@ -157,91 +172,105 @@ class Grid:
         check_name("bank of starts", self.starts, BANKS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
         check_frame_stride(self.frame_stride)
+        for name in self.hierarchical:
+            check_name("termination", name, TERMINATIONS)
+        self._check_numbers()
+        if not self.runs or len(set(self.runs)) != len(self.runs):
+            raise InputError(
+                f"The grid has {len(self.runs)} runs, {len(set(self.runs))} of them different."
+            )
+
+    def _check_numbers(self) -> None:
+        """Refuse numbers out of range."""
         if self.post_success_steps < 0:
             raise InputError(
                 f"post_success_steps is {self.post_success_steps}; it must be at least 0."
             )
-        for name in self.chain:
-            check_name("termination", name, TERMINATIONS)
-        numbers = [(name, getattr(self, name)) for name in ("episodes", "size", "steps", "batch")]
-        for name, number in [
-            *numbers,
-            *(("demonstrations", number) for number in self.demonstrations),
-        ]:
-            if number < 1:
-                raise InputError(f"{name} is {number}; it must be at least 1.")
         if not self.demonstrations:
             raise InputError("demonstrations is empty; give at least one number.")
-        for ablation in self.ablation:
-            if (
-                ablation.demonstrations is not None
-                and not 1 <= ablation.demonstrations <= self.recorded
-            ):
-                raise InputError(
-                    f"ablation: demonstrations is {ablation.demonstrations}; allowed: 1 to {self.recorded}."
-                )
-        if not self.cells or len(set(self.cells)) != len(self.cells):
-            raise InputError(
-                f"The grid has {len(self.cells)} cells, {len(set(self.cells))} of them different."
-            )
-
-    @property
-    def cells(self) -> list[Cell]:
-        """The cells, in the order of the grid."""
-        cells: list[Cell] = []
-        for task, seed, count in itertools.product(self.task, self.seed, self.demonstrations):
-            common: dict[str, Any] = {"seed": seed, "epochs": self.epochs}
-            if len(self.demonstrations) > 1:
-                common["demonstrations"] = count
-            for policy in self.policy:
-                cells += self._of_policy(policy, task, common)
-            if task == names.SUTURE:
-                cells += self._chains(common)
-        seeing = [cell for cell in cells if cell.encoder not in (None, OWN)]
-        return cells + [
-            replace(cell, **ablation.replaced) for cell in seeing for ablation in self.ablation
+        numbers = [
+            ("episodes", self.episodes),
+            ("size", self.size),
+            ("steps", self.steps),
+            ("batch", self.batch),
+            *(("demonstrations", number) for number in self.demonstrations),
         ]
+        for name, number in numbers:
+            if number < 1:
+                raise InputError(f"{name} is {number}; it must be at least 1.")
+        for ablation in self.ablation:
+            count = ablation.demonstrations
+            if count is not None and not 1 <= count <= self.recorded:
+                raise InputError(
+                    f"ablation: demonstrations is {count}; allowed: 1 to {self.recorded}."
+                )
 
-    def _of_policy(self, policy: str, task: str, common: dict[str, Any]) -> Iterator[Cell]:
-        """Yield the cells of a policy on a task."""
-        ours = policy not in LEROBOT_POLICIES
-        recipes = self.recipe if ours else ("paper",)
-        for encoder, view, recipe in itertools.product(self.encoder, self.view, recipes):
-            if ours and encoder == OWN:
-                continue  # `own` is for policies that see images themselves
-            pool = self.pool if ours else "global"
-            yield Cell(
-                task,
-                encoder,
-                view,
-                policy=policy,
-                recipe=recipe,
-                pool=pool,
-                **common,
-            )
-        for recipe in recipes if ours else ():
+    @functools.cached_property
+    def runs(self) -> tuple[RunConfig, ...]:
+        """The runs, in the order of the grid."""
+        runs: list[RunConfig] = []
+        for task, seed, count in itertools.product(self.task, self.seed, self.demonstrations):
+            common = self._common(task, seed, count)
+            for policy in self.policy:
+                runs += self._of_policy(policy, common)
+            if task == names.SUTURE:
+                runs += self._hierarchical(common)
+        seeing = [run for run in runs if run.encoder not in (None, OWN)]
+        return (*runs, *(ablation.of(run) for run in seeing for ablation in self.ablation))
+
+    def _common(self, task: str, seed: int, demonstrations: int) -> RunConfig:
+        """Return a run with what all policies of a task share."""
+        return RunConfig(
+            self.config(task),
+            changes=with_epochs((), self.epochs),
+            demonstrations=demonstrations,
+            demonstrator=self.demonstrator,
+            noise=self.noise,
+            post_success_steps=self.post_success_steps,
+            frame_stride=self.frame_stride,
+            seed=seed,
+            starts=self.bank,
+        )
+
+    def _of_policy(self, policy: str, common: RunConfig) -> Iterator[RunConfig]:
+        """Yield the runs of a policy on a task."""
+        if policy in LEROBOT_POLICIES:
+            common = replace(common, changes=(), updates=self.steps, batch_size=self.batch)
+            for encoder, views in itertools.product(self.encoder, self.view):
+                yield replace(common, policy=policy, encoder=encoder, views=views)
+            return
+        ours = replace(common, policy=policy)
+        for encoder, views, recipe in itertools.product(self.encoder, self.view, self.recipe):
+            if encoder != OWN:  # for policies that see images themselves
+                yield replace(ours, encoder=encoder, views=views, recipe=recipe, pool=self.pool)
+        for recipe in self.recipe:
             if self.proprioception:
-                yield Cell(task, None, (), policy=policy, recipe=recipe, **common)
+                yield replace(ours, recipe=recipe)
             if self.state:
-                yield Cell(task, None, (), policy=policy, recipe=recipe, privileged=True, **common)
+                yield replace(ours, recipe=recipe, privileged=True)
 
-    def _chains(self, common: dict[str, Any]) -> Iterator[Cell]:
-        """Yield the chains over the whole procedure."""
-        encoders = [encoder for encoder in self.encoder if encoder != OWN]
-        for end, encoder, view, recipe in itertools.product(
-            self.chain, encoders, self.view, self.recipe
+    def _hierarchical(self, common: RunConfig) -> Iterator[RunConfig]:
+        """Yield the hierarchical policies of the whole procedure."""
+        frozen = [encoder for encoder in self.encoder if encoder != OWN]
+        for termination, encoder, views, recipe in itertools.product(
+            self.hierarchical, frozen, self.view, self.recipe
         ):
-            whole = Cell(
-                names.SUTURE, encoder, view, recipe=recipe, pool=self.pool, chain=end, **common
+            whole = replace(
+                common,
+                encoder=encoder,
+                views=views,
+                recipe=recipe,
+                pool=self.pool,
+                termination=termination,
             )
             yield whole
-            if self.swap:
-                yield from (replace(whole, swap=subtask) for subtask in names.SUBTASKS)
+            if self.expert_swap:
+                yield from (replace(whole, expert_swap=subtask) for subtask in names.SUBTASKS)
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Every view some cell needs."""
-        seen = {view for cell in self.cells for view in cell.view}
+        """Every view some run needs."""
+        seen = {view for run in self.runs for view in run.views}
         return tuple(view for view in view_names() if view in seen)
 
     @property
@@ -261,9 +290,9 @@ class Grid:
         return Disturbance(self.noise)
 
     @property
-    def first_seed(self) -> int:
-        """Seed of the first start of an evaluation."""
-        return BANKS[self.starts]
+    def bank(self) -> Starts:
+        """Start states of every evaluation."""
+        return Starts(BANKS[self.starts], self.episodes)
 
     def config(self, task: str) -> TaskConfig:
         """Return the task as it is demonstrated and evaluated."""
@@ -271,37 +300,24 @@ class Grid:
 
     @property
     def recorded(self) -> int:
-        """Demonstrations recorded of each task: the largest number; cells with fewer train on the
-        first of them.
+        """Demonstrations recorded of each task: the largest number.
+
+        Runs with fewer train on the first of them.
         """
         return max(self.demonstrations)
 
-    def key(self, cell: Cell) -> str:
-        """Return the digest of everything that decides what a cell is."""
-        lerobot = (
-            {"steps": self.steps, "batch": self.batch} if cell.policy in LEROBOT_POLICIES else {}
-        )
-        shared = {name: getattr(self, name) for name in ("episodes", "size", "depth")}
-        shared |= {"views": list(self.views), "demonstrations": self.recorded, **lerobot}
-        shared |= {
-            "demonstrator": self.demonstrator,
-            "noise": self.noise,
-            **({"frame_stride": self.frame_stride} if self.frame_stride > 1 else {}),
-        }
-        shared |= {
-            "post_success_steps": self.post_success_steps,
-            "starts": self.starts,
-            "randomisation": to_mapping(self.randomisation),
-        }
-        return digest({"cell": to_mapping(cell), **shared})[:16]
 
-
-def chain_parts(cell: Cell) -> dict[str, Cell]:
-    """Return the policies a chain is made of: "hlp" and those of its subtasks but for the one
-    swapped.
-    """
-    alone = replace(cell, chain=None, swap=None)
+def parts_of(run: RunConfig) -> dict[str, RunConfig]:
+    """Return the policies of a hierarchical run: "hlp", and each subtask's but the one swapped."""
+    alone = replace(of_training(run), termination=None)
     low = {
-        subtask: replace(alone, task=subtask) for subtask in names.SUBTASKS if subtask != cell.swap
+        subtask: replace(alone, env=with_task(run.env, subtask))
+        for subtask in names.SUBTASKS
+        if subtask != run.expert_swap
     }
     return {"hlp": replace(alone, policy="hlp"), **low}
+
+
+def with_task(config: TaskConfig, task: str) -> TaskConfig:
+    """Return another task in the same scene, with that task's limit of steps."""
+    return replace(config, task=task, max_steps=0)

@@ -1,5 +1,6 @@
-"""LeRobot's policies as cells: `lerobot-train` in a process of its own, on images or on exported
-features.
+"""LeRobot's policies as runs: `lerobot-train` in a process of its own.
+
+It sees images or exported features.
 
 Its checkpoint is evaluated as `surgicai-vision evaluate` does. LeRobot is not imported here.
 """
@@ -7,18 +8,18 @@ Its checkpoint is evaluated as `surgicai-vision evaluate` does. LeRobot is not i
 import json
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.processes import OFFLINE, run_module
-from surgicai_vision.experiments.run import OWN, Cell
-from surgicai_vision.features.encoders import WeightsSource, load_encoder
+from surgicai_vision.dataset import Dataset, RenderedDataset
+from surgicai_vision.dataset.feature_export import export_features
+from surgicai_vision.features.cache import encode
+from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
+from surgicai_vision.training.run_config import OWN, RunConfig
 
-if TYPE_CHECKING:
-    from surgicai_vision.dataset import Dataset, RenderedDataset
-
-LEROBOT_POLICIES = ("act", "diffusion")
 OPTIONS = {
     "diffusion": (
         "--policy.use_group_norm=true",
@@ -34,53 +35,47 @@ VARIABLES = {**OFFLINE, "HF_DATASETS_DISABLE_PROGRESS_BARS": "1", "WANDB_MODE": 
 
 
 def train_lerobot(
-    cell: Cell,
-    dataset: "RenderedDataset",
-    out: Path,
-    *,
-    steps: int,
-    batch: int,
-    weights: WeightsSource,
+    run: RunConfig, dataset: RenderedDataset, out: Path, weights: WeightsSource = ANYWHERE
 ) -> None:
     """Train a policy of LeRobot into `out`, as `lerobot-train` writes it.
 
     Args:
-        cell: its policy, encoder (`OWN` or frozen features), views, seed and number of
+        run: its policy, encoder (`OWN` or frozen features), views, seed, updates and number of
             demonstrations.
-        dataset: an opened dataset of the cell's task.
+        dataset: an opened dataset of the run's task.
         out: folder to make.
-        steps: updates.
-        batch: batch size.
         weights: where pretrained weights come from.
 
     Raises:
+        InputError: a dataset without every step's frame.
         SurgicaiError: LeRobot failed; the message ends with the last of what it said.
     """
     if dataset.fps != names.FPS:
         raise InputError(
-            f"{dataset.path} holds {dataset.fps} frames a second; {cell.policy} needs {names.FPS}."
+            f"{dataset.path} holds {dataset.fps} frames a second; {run.policy} needs {names.FPS}."
         )
     root = dataset.path
-    if cell.encoder != OWN:
+    if run.encoder != OWN:
         root = out.with_name(SCRATCH)
-        _export(cell, dataset, root, weights)
-    arguments = _arguments(cell, dataset, root, out)
-    arguments += [f"--steps={steps}", f"--batch_size={batch}", f"--save_freq={steps}"]
+        _export(run, dataset, root, weights)
+    arguments = _arguments(run, dataset, root, out)
+    arguments += [
+        f"--steps={run.updates}",
+        f"--save_freq={run.updates}",
+        f"--batch_size={run.batch_size}",
+    ]
     done = run_module("lerobot.scripts.lerobot_train", *arguments, variables=VARIABLES)
     if done.returncode:
-        raise SurgicaiError(f"lerobot-train failed for {cell.name}:\n{done.stderr[-2000:]}")
+        raise SurgicaiError(f"lerobot-train failed for {run.name}:\n{done.stderr[-2000:]}")
 
 
-def _export(cell: Cell, dataset: "RenderedDataset", root: Path, weights: WeightsSource) -> None:
-    """Write a dataset with the cell's features in place of images."""
-    from surgicai_vision.dataset.feature_export import export_features
-    from surgicai_vision.features.cache import encode
-
-    encoder = load_encoder(str(cell.encoder), cell.pool, weights)
-    rows = [encode(dataset, view, encoder).rows for view in cell.view]
+def _export(run: RunConfig, dataset: RenderedDataset, root: Path, weights: WeightsSource) -> None:
+    """Write a dataset with the run's features in place of images."""
+    encoder = load_encoder(str(run.encoder), run.pool, weights)
+    rows = [encode(dataset, view, encoder).rows for view in run.views]
     about = {
-        "encoder": cell.encoder,
-        "views": list(cell.view),
+        "encoder": run.encoder,
+        "views": list(run.views),
         "weights_sha256": encoder.weights_sha256,
         "encoder_fingerprint": encoder.fingerprint,
     }
@@ -88,32 +83,32 @@ def _export(cell: Cell, dataset: "RenderedDataset", root: Path, weights: Weights
     export_features(dataset, rows, about, root)
 
 
-def _arguments(cell: Cell, dataset: "Dataset", root: Path, out: Path) -> list[str]:
+def _arguments(run: RunConfig, dataset: Dataset, root: Path, out: Path) -> list[str]:
     """Return the options of `lerobot-train` that say what is trained on what."""
     arguments = [
-        f"--dataset.repo_id=local/{cell.task}",
+        f"--dataset.repo_id=local/{run.task}",
         f"--dataset.root={root}",
         "--env.type=surgicai",
         f"--env.dataset={root}",
-        f"--policy.type={cell.policy}",
+        f"--policy.type={run.policy}",
         "--policy.pretrained_backbone_weights=null",
         "--policy.push_to_hub=false",
         "--policy.device=cpu",
         "--env_eval_freq=0",
         "--num_workers=0",
-        f"--seed={cell.seed}",
+        f"--seed={run.seed}",
         f"--output_dir={out}",
-        *OPTIONS.get(cell.policy, ()),
+        *OPTIONS.get(run.policy, ()),
     ]
-    if cell.demonstrations is not None:
-        arguments.append(f"--dataset.episodes={list(range(cell.demonstrations))}")
-    if cell.encoder == OWN:
+    if run.demonstrations not in (None, len(np.unique(dataset.episode_index))):
+        arguments.append(f"--dataset.episodes={list(range(run.demonstrations or 0))}")
+    if run.encoder == OWN:
         side = dataset.image_size
         seen = {
             names.image_key(view): {"type": "VISUAL", "shape": [3, side, side]}
-            for view in cell.view
+            for view in run.views
         }
         inputs = {**seen, names.STATE: {"type": "STATE", "shape": [len(names.STATE_NAMES)]}}
         arguments.append(f"--policy.input_features={json.dumps(inputs)}")
-        arguments.append(f"--env.cameras={json.dumps(list(cell.view))}")
+        arguments.append(f"--env.cameras={json.dumps(list(run.views))}")
     return arguments

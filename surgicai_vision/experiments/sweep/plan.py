@@ -1,32 +1,31 @@
-"""Planning: which cells there are, what stands in the folder already, and the job that makes
-each.
-"""
+"""Plan: which runs there are, what stands in the folder already, and the job that makes each."""
 
 import functools
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Final
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON, digest, to_mapping
+from surgicai_vision.core.config import JSON, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, MissingWeights
 from surgicai_vision.core.executor import Job, register_job
 from surgicai_vision.core.files import read_json
-from surgicai_vision.evaluation.storage import CELL_FILE
-from surgicai_vision.experiments.run import OWN, Cell
-from surgicai_vision.experiments.sweep.grid import Grid, chain_parts
-from surgicai_vision.experiments.sweep.lerobot import LEROBOT_POLICIES
+from surgicai_vision.evaluation.storage import GRID_FILE, RESULT_FILE, read_versioned
+from surgicai_vision.experiments.sweep.grid import Grid, parts_of, with_task
 from surgicai_vision.experiments.sweep.selection import EVERYTHING, Choice, is_chosen
 from surgicai_vision.features import encoders
+from surgicai_vision.features.encoders import WeightsSource
 from surgicai_vision.training import policies
+from surgicai_vision.training.run_config import LEROBOT_POLICIES, OWN, RunConfig
 
 REFERENCE_FILE = "reference.json"
 PROBE_FILE = "probe.json"
-CACHED, TO_DO, NOT_RUN, LEFT = "cached", "to do", "not run", "left"
+TO_DO: Final = "to do"
+CACHED: Final = "cached"
+NOT_RUN: Final = "not run"
+LEFT: Final = "left"
 STATES = (TO_DO, CACHED, NOT_RUN, LEFT)
-
 
 LEARN = (
     "scene",
@@ -46,8 +45,8 @@ for name, function, stages in (
     ("sweep-features", "encode_features", LEARN),
     ("sweep-policy", "train_policy", LEARN),
     ("sweep-probe", "run_probe", LEARN),
-    ("sweep-cell", "run_cell", EVALUATE),
-    ("sweep-reference", "run_reference", EVALUATE),
+    ("sweep-run", "train_and_evaluate", EVALUATE),
+    ("sweep-reference", "evaluate_reference", EVALUATE),
 ):
     register_job(
         name, f"surgicai_vision.experiments.sweep.jobs:{function}", stages=stages, packages=PACKAGES
@@ -55,54 +54,84 @@ for name, function, stages in (
 
 
 @dataclass(frozen=True)
-class CellState:
-    """A cell and what is known of it.
+class RunState:
+    """A run and what is known of it.
 
     Attributes:
-        cell: the cell.
+        run: the run.
         key: its folder's name.
-        state: one of `STATES`; "left" is a cell that this call was not asked for.
+        state: one of `STATES`; "left" is a run that this call was not asked for.
         reason: why it is not run, or why it is done again.
     """
 
-    cell: Cell
+    run: RunConfig
     key: str
     state: str
     reason: str = ""
 
     @property
     def where(self) -> str:
-        """The cell in words."""
-        return f"{self.cell.task}, {self.cell.name}, seed {self.cell.seed}"
+        """The run in words."""
+        run = self.run
+        return f"{run.task}, {run.name}, {run.demonstrations} demonstrations, seed {run.seed}"
 
 
-def plan(grid: Grid, out: Path, choice: Choice = EVERYTHING) -> list[CellState]:
-    """Return every cell of `grid` with its state in the folder `out`; does no work."""
+def read_grid_of(folder: Path) -> Grid:
+    """Return the grid of the sweep in `folder`.
+
+    Raises:
+        BadFile: there is none, or another version wrote it.
+    """
+    return from_mapping(Grid, read_versioned(folder / GRID_FILE)["grid"], str(folder / GRID_FILE))
+
+
+def run_key(run: RunConfig) -> str:
+    """Return the digest of everything that decides what a run is."""
+    return digest(run)[:16]
+
+
+def run_folder(out: Path, key: str) -> Path:
+    """Return where a run's result is filed."""
+    return out / "runs" / key
+
+
+def plan(grid: Grid, out: Path, choice: Choice = EVERYTHING) -> list[RunState]:
+    """Return every run of `grid` with its state in the folder `out`; does no work.
+
+    Raises:
+        UnknownName: a recipe, or a change of one, that does not exist.
+    """
+    for run in grid.runs:
+        if run.policy not in LEROBOT_POLICIES:
+            _recipe_digest(run.policy, run.recipe, run.changes, run.privileged)
     jobs = Jobs(grid, out)
-    missing = functools.lru_cache(functools.partial(_missing, accept_licence=grid.accept_licence))
-    return [_state(grid.key(cell), cell, jobs, missing, choice) for cell in grid.cells]
+    weights = WeightsSource(accept_licence=grid.accept_licence)
+    missing = functools.lru_cache(functools.partial(_missing, weights=weights))
+    return [_state(run, jobs, missing, choice) for run in grid.runs]
 
 
-def _missing(encoder: str, accept_licence: bool) -> str:
+def _missing(encoder: str, weights: WeightsSource) -> str:
     """Return why an encoder's weights cannot be had, or "" where they are at hand."""
     try:
-        encoders.find_weights(encoder, encoders.WeightsSource(accept_licence=accept_licence))
+        encoders.find_weights(encoder, weights)
     except MissingWeights as error:
         return str(error)
     return ""
 
 
-def _state(key: str, cell: Cell, jobs: "Jobs", missing: Any, choice: Choice) -> CellState:
-    path = jobs.cell_folder(key) / CELL_FILE
-    made = path.exists()
-    if made and read_json(path).get("job") == jobs.cell_key(cell):
-        return CellState(cell, key, CACHED)
-    lack = missing(cell.encoder) if cell.encoder and cell.encoder != OWN else ""
+def _state(run: RunConfig, jobs: "Jobs", missing: Callable[[str], str], choice: Choice) -> RunState:
+    """Return a run with its state."""
+    key = run_key(run)
+    path = run_folder(jobs.out, key) / RESULT_FILE
+    is_made = path.exists()
+    if is_made and read_json(path).get("job") == jobs.key_of_run(run):
+        return RunState(run, key, CACHED)
+    lack = missing(run.encoder) if run.encoder and run.encoder != OWN else ""
     if lack:
-        return CellState(cell, key, NOT_RUN, lack)
-    if not is_chosen(cell, choice):
-        return CellState(cell, key, LEFT)
-    return CellState(cell, key, TO_DO, "made by other code or other data" if made else "")
+        return RunState(run, key, NOT_RUN, lack)
+    if not is_chosen(run, choice):
+        return RunState(run, key, LEFT)
+    return RunState(run, key, TO_DO, "made by other code or other data" if is_made else "")
 
 
 class Jobs:
@@ -118,139 +147,122 @@ class Jobs:
     def __init__(
         self, grid: Grid, out: Path, command: str = "", environment: Mapping[str, str] | None = None
     ):
-        self.grid, self.out = grid, out
+        self.grid = grid
+        self.out = out
         self._where: dict[str, JSON] = {"command": command, "environment": dict(environment or {})}
         self._digests: dict[str, str | None] = {}
-
-    def cell_folder(self, key: str) -> Path:
-        """Return where a cell's result is filed."""
-        return self.out / "cells" / key
 
     def data_folder(self, task: str) -> Path:
         """Return where a task's demonstrations and dataset are."""
         return self.out / "data" / task
 
-    def policy_folder(self, part: Cell) -> Path:
-        """Return where a policy that chains share is filed."""
-        return self.out / "policies" / self.grid.key(part)
+    def policy_folder(self, part: RunConfig) -> Path:
+        """Return where a policy that hierarchical policies share is filed."""
+        return self.out / "policies" / run_key(part)
 
     def dataset_digest(self, task: str) -> str | None:
         """Return the digest of a task's dataset; None where it is not made yet."""
         if task not in self._digests:
             try:
-                self._digests[task] = str(
-                    read_json(self.data_folder(task) / "dataset" / names.META_FILE)["digest"]
-                )
+                meta = read_json(self.data_folder(task) / "dataset" / names.META_FILE)
+                self._digests[task] = str(meta["digest"])
             except BadFile:
                 self._digests[task] = None
         return self._digests[task]
 
-    def cell_key(self, cell: Cell) -> str | None:
-        """Return the key of a cell's job; None where it cannot be known yet."""
-        return self.cell(cell).key() if self.dataset_digest(cell.task) else None
+    def key_of_run(self, run: RunConfig) -> str | None:
+        """Return the key of a run's job; None where it cannot be known yet."""
+        return self.run(run).key() if self.dataset_digest(run.task) else None
 
-    def cell(self, cell: Cell) -> Job:
-        """Return the job that trains and evaluates a cell, or evaluates the chain of policies made
-        before.
+    def run(self, run: RunConfig) -> Job:
+        """Return the job of a run.
+
+        It trains and evaluates, or evaluates the hierarchical policy of policies made before.
         """
-        parts = chain_parts(cell) if cell.chain else {}
-        final = self.cell_folder(self.grid.key(cell))
-        inputs = (
-            [self.policy(part).key() for part in parts.values()] if parts else self._inputs(cell)
-        )
+        parts = parts_of(run) if run.is_hierarchical else {}
+        inputs = [self.policy(part).key() for part in parts.values()] or self._inputs(run)
         arguments = {
-            "cell": to_mapping(cell),
-            "seeds": self._seeds,
-            "final": str(final.absolute()),
+            "run": to_mapping(run),
+            "final": str(run_folder(self.out, run_key(run)).absolute()),
             "policies": {
                 name: str(self.policy_folder(part).absolute()) for name, part in parts.items()
             },
-            **self._common(cell),
+            **self._common(run),
         }
-        return Job("sweep-cell", arguments, tuple(inputs), label=(*LABELS, "final", "policies"))
+        return Job("sweep-run", arguments, tuple(inputs), label=(*LABELS, "final", "policies"))
 
-    def policy(self, part: Cell) -> Job:
-        """Return the job that trains one policy of a chain, on its subtask's frames of whole
-        procedures.
+    def policy(self, part: RunConfig) -> Job:
+        """Return the job that trains one policy of a hierarchical policy.
+
+        It is trained on its subtask's frames of whole procedures.
         """
-        whole = replace(part, task=names.SUTURE)
-        subtask = {} if part.task == names.SUTURE else {"subtask": part.task}
-        arguments = {"cell": to_mapping(whole), **self._common(whole), "options": subtask}
+        whole = replace(part, env=with_task(part.env, names.SUTURE))
+        subtask = None if part.task == names.SUTURE else part.task
+        arguments = {"run": to_mapping(whole), "subtask": subtask, **self._common(whole)}
         return Job("sweep-policy", arguments, tuple(self._inputs(whole)), label=LABELS)
 
-    def features(self, cell: Cell) -> list[Job]:
-        """Return the jobs that encode what a cell, or a chain's policies, see."""
-        if not cell.encoder or cell.encoder == OWN:
+    def features(self, run: RunConfig) -> list[Job]:
+        """Return the jobs that encode what a run sees, view by view, so that runs share them."""
+        if not run.encoder or run.encoder == OWN:
             return []
+        changes: tuple[str, ...] = ()
+        if run.policy not in LEROBOT_POLICIES:
+            stride = policies.recipe_of(run).frame_stride
+            changes = (f"frame_stride={stride}",) if stride > 1 else ()
         jobs = []
-        for seen in _seen(cell):
-            arguments = {"cell": to_mapping(seen), **self._common(seen)}
+        for view in run.views:
+            seen = RunConfig(run.env, run.encoder, (view,), pool=run.pool, changes=changes)
+            arguments = {"run": to_mapping(seen), **self._common(seen)}
             jobs.append(Job("sweep-features", arguments, tuple(self._inputs(seen)), label=LABELS))
         return jobs
 
-    def probes(self, cells: Iterable[Cell]) -> dict[str, Job]:
-        """Return the probes of what cells see, by their folders' names; a chain and an `own`
-        network have none.
+    def probes(self, runs: Iterable[RunConfig]) -> dict[str, Job]:
+        """Return the probes of what runs see, by their folders' names.
+
+        A hierarchical policy and a policy with a network of its own have none.
         """
         jobs = {}
-        for cell in cells:
-            if cell.encoder and cell.encoder != OWN and not cell.chain:
-                seen = Cell(cell.task, cell.encoder, cell.view, pool=cell.pool)
-                arguments = {"cell": to_mapping(seen), **self._common(seen)}
-                name = digest(to_mapping(seen))[:16]
-                jobs[name] = Job("sweep-probe", arguments, tuple(self._inputs(seen)), label=LABELS)
+        for run in runs:
+            if run.encoder and run.encoder != OWN and not run.is_hierarchical:
+                seen = RunConfig(run.env, run.encoder, run.views, pool=run.pool)
+                arguments = {"run": to_mapping(seen), **self._common(seen)}
+                inputs = tuple(self._inputs(seen))
+                jobs[run_key(seen)] = Job("sweep-probe", arguments, inputs, label=LABELS)
         return jobs
 
     def reference(self, name: str, task: str) -> Job:
-        """Return the job that evaluates the expert, or blind replay, on a task."""
-        dataset = str((self.data_folder(task) / "dataset").absolute())
-        config = to_mapping(self.grid.config(task))
+        """Return the job that evaluates the expert, or the replay, on a task."""
+        run = RunConfig(self.grid.config(task), policy=name, starts=self.grid.bank)
         arguments: dict[str, JSON] = {
-            "name": name, "config": config, "seeds": self._seeds, "dataset": dataset, **self._where
-        }  # fmt: skip
+            "run": to_mapping(run),
+            "dataset": self._dataset(task),
+            **self._where,
+        }
         inputs = (self.dataset_digest(task) or "",) if name == "replay" else ()
         return Job("sweep-reference", arguments, inputs, label=LABELS)
 
-    @property
-    def _seeds(self) -> list[int]:
-        """First seed of an evaluation's starts, and the one after its last."""
-        return [self.grid.first_seed, self.grid.first_seed + self.grid.episodes]
+    def _dataset(self, task: str) -> str:
+        return str((self.data_folder(task) / "dataset").absolute())
 
-    def _common(self, cell: Cell) -> dict[str, Any]:
-        lerobot = (
-            {"steps": self.grid.steps, "batch": self.grid.batch}
-            if cell.policy in LEROBOT_POLICIES
-            else {}
-        )
+    def _common(self, run: RunConfig) -> dict[str, JSON]:
         return {
-            "dataset": str((self.data_folder(cell.task) / "dataset").absolute()),
+            "dataset": self._dataset(run.task),
             "accept_licence": self.grid.accept_licence,
-            "options": lerobot,
             **self._where,
         }
 
-    def _inputs(self, cell: Cell) -> list[str]:
-        """Return hashes of what a cell reads: its dataset, its encoder, its recipe."""
-        inputs = [self.dataset_digest(cell.task) or ""]
-        if cell.encoder and cell.encoder != OWN:
-            inputs.append(_card_digest(cell.encoder))
-        if cell.policy not in LEROBOT_POLICIES:
-            inputs.append(_recipe_digest(cell.policy, cell.recipe, json.dumps(cell.changes)))
+    def _inputs(self, run: RunConfig) -> list[str]:
+        """Return hashes of what a run reads: its dataset, its encoder, its recipe."""
+        inputs = [self.dataset_digest(run.task) or ""]
+        if run.encoder and run.encoder != OWN:
+            inputs.append(_card_digest(run.encoder))
+        if run.policy not in LEROBOT_POLICIES:
+            inputs.append(_recipe_digest(run.policy, run.recipe, run.changes, run.privileged))
         return inputs
 
 
 LABELS = ("dataset", "accept_licence", "command", "environment")
 """Arguments that change where and how a job is done, and not its result."""
-
-
-def _seen(cell: Cell) -> list[Cell]:
-    """Return what a cell sees, view by view where that is possible, so that cells share it."""
-    common: dict[str, Any] = {"pool": cell.pool}
-    if cell.policy not in LEROBOT_POLICIES:
-        recipe = policies.load_recipe(cell.policy, cell.recipe, cell.changes)
-        if recipe.frame_stride > 1:
-            common["change"] = (f"frame_stride={recipe.frame_stride}",)
-    return [Cell(cell.task, cell.encoder, (view,), **common) for view in cell.view]
 
 
 @functools.cache
@@ -260,5 +272,7 @@ def _card_digest(encoder: str) -> str:
 
 
 @functools.cache
-def _recipe_digest(policy: str, recipe: str, changes: str) -> str:
-    return digest(to_mapping(policies.load_recipe(policy, recipe, json.loads(changes))))
+def _recipe_digest(policy: str, recipe: str, changes: tuple[str, ...], privileged: bool) -> str:
+    """Hash a recipe with its changes; read once for all runs that share it."""
+    run = RunConfig(policy=policy, recipe=recipe, changes=changes, privileged=privileged)
+    return digest(to_mapping(policies.recipe_of(run)))

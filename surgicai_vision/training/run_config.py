@@ -1,0 +1,191 @@
+"""A run: one policy from its demonstrations to its counted successes, as data.
+
+A `RunConfig` is stored whole wherever results of the run are: in its checkpoint, its evaluation, the
+record of its failure and a sweep's folders. Names are printed from it and never parsed.
+
+Light to import, for the command line.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from surgicai_vision.core import names
+from surgicai_vision.core.cameras import check_view
+from surgicai_vision.core.config import JSON, TaskConfig, read_changes
+from surgicai_vision.core.errors import InputError, check_name
+
+OWN = "own"
+"""Stands for an encoder: a network of the policy's own, trained with it on the images."""
+REFERENCES = ("expert", "random", "zero", "replay")
+"""Policies that are not trained: what the trained ones stand beside."""
+LEROBOT_POLICIES = ("act", "diffusion")
+"""Policies that a sweep trains by `lerobot-train`."""
+TERMINATIONS = ("privileged", "learned")
+"""How a subtask ends under a hierarchical policy."""
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Start states of an evaluation: consecutive seeds.
+
+    Attributes:
+        first_seed: seed of the first start.
+        episodes: number of starts.
+    """
+
+    first_seed: int = names.TEST_SEED
+    episodes: int = 20
+
+    @property
+    def seeds(self) -> range:
+        """The seed of each start."""
+        return range(self.first_seed, self.first_seed + self.episodes)
+
+
+@dataclass(frozen=True)
+class Shift:
+    """What differs from the training conditions in an evaluation of robustness.
+
+    Attributes:
+        axis: a key of `robustness.AXES`.
+        strength: 0 to 1.
+    """
+
+    axis: str
+    strength: float
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides what a run is.
+
+    Attributes:
+        env: the task, its scene and what differs from episode to episode.
+        encoder: encoder's name; `OWN` for a policy with a network of its own on the images; None
+            for a policy without images.
+        views: its views, in the order of the features; empty without images.
+        policy: policy's name; one of `REFERENCES` for what is not trained.
+        pool: what is taken from the encoder.
+        privileged: see the state with the goal in place of all else, an upper bound.
+        recipe: the policy's recipe: a name, or the path of a YAML file.
+        changes: what is changed in the recipe, "key=value" each.
+        demonstrations: demonstrations trained on, those of the validation split included; None
+            for all there are, where they are not counted yet.
+        demonstrator: who demonstrated; None where it is not known.
+        noise: how much what the demonstrator executed was disturbed.
+        post_success_steps: control steps that demonstrations go on after their success.
+        frame_stride: control steps from frame to frame of the dataset.
+        updates: updates of the weights and `batch_size`, for LeRobot's policies.
+        batch_size: frames of an update, for LeRobot's policies.
+        seed: training seed.
+        termination: how subtasks end, where this is a hierarchical policy (`TERMINATIONS`).
+        parts: digest of the file that names the policies of a hierarchical policy; empty where
+            they are trained by this run.
+        expert_swap: the subtask of a hierarchical policy that the expert does.
+        starts: start states of the evaluation; None before it.
+        shift: what is shifted in an evaluation of robustness.
+    """
+
+    env: TaskConfig = field(default_factory=TaskConfig)
+    encoder: str | None = None
+    views: tuple[str, ...] = ()
+    policy: str = "bc"
+    pool: str = "global"
+    privileged: bool = False
+    recipe: str = "paper"
+    changes: tuple[str, ...] = ()
+    demonstrations: int | None = None
+    demonstrator: str | None = None
+    noise: float = 0.0
+    post_success_steps: int = 0
+    frame_stride: int = 1
+    updates: int | None = None
+    batch_size: int | None = None
+    seed: int = 0
+    termination: str | None = None
+    parts: str = ""
+    expert_swap: str | None = None
+    starts: Starts | None = None
+    shift: Shift | None = None
+
+    def __post_init__(self) -> None:
+        for view in self.views:
+            check_view(view)
+        if self.encoder is not None and not self.views:
+            raise InputError(
+                f"Encoder '{self.encoder}' is given without views; give both or neither."
+            )
+        if self.encoder is None and self.views and not self.parts:
+            raise InputError(
+                f"Views {', '.join(self.views)} are given without an encoder; give both or neither."
+            )
+        if self.expert_swap is not None:
+            check_name("subtask", self.expert_swap, names.SUBTASKS)
+        if self.termination is None:
+            return
+        check_name("termination", self.termination, TERMINATIONS)
+        if any(map(names.is_depth_view, self.views)):
+            raise InputError(
+                f"A hierarchical policy sees no depth views ({', '.join(self.views)}); "
+                "give views in colour."
+            )
+
+    @property
+    def task(self) -> str:
+        """The task's name."""
+        return self.env.task
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether a policy is trained."""
+        return self.policy not in REFERENCES
+
+    @property
+    def is_hierarchical(self) -> bool:
+        """Whether this is a high-level policy over low-level ones."""
+        return self.termination is not None
+
+    @property
+    def inputs(self) -> str:
+        """What the policy is fed, in words."""
+        if self.encoder:
+            return f"{self.encoder}-{'+'.join(self.views)}"
+        return "state" if self.privileged else "proprioception"
+
+    @property
+    def recipe_label(self) -> str:
+        """The recipe's name and what is changed in it."""
+        return "+".join((Path(self.recipe).stem, *self.changes))
+
+    @property
+    def name(self) -> str:
+        """How tables and folders call the policy: its inputs and whatever is not as usual."""
+        if not self.is_trained:
+            return self.policy
+        parts = [f"hierarchical-{self.termination}"] if self.is_hierarchical else []
+        if self.parts:
+            parts.append(self.parts[:8])
+        else:
+            parts += [self.policy] if self.policy != "bc" else []
+            parts.append(self.inputs)
+            parts += [self.pool] if self.pool != "global" else []
+            parts += [self.recipe_label] if self.recipe_label != "paper" else []
+        if self.expert_swap:
+            parts.append(f"expert-{self.expert_swap}")
+        return "-".join(parts).replace(":", "-")
+
+    @property
+    def recipe_changes(self) -> dict[str, JSON]:
+        """Keys of the recipe that are replaced, with their values: the only way to change one."""
+        return read_changes(self.changes) | ({"privileged": True} if self.privileged else {})
+
+
+def with_epochs(changes: tuple[str, ...], epochs: int | None) -> tuple[str, ...]:
+    """Return the changes of a recipe with the number of epochs among them, where one is given."""
+    return changes if epochs is None else (*changes, f"epochs={epochs}")
+
+
+def of_training(run: RunConfig) -> RunConfig:
+    """Return a run without what belongs to one evaluation of it."""
+    return dataclasses.replace(run, starts=None, shift=None, expert_swap=None)

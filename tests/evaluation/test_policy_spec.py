@@ -1,0 +1,97 @@
+"""`open_policy`: every way to name what is evaluated, and what is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from checkpoints import checkpoint
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import BadFile, InputError, UnknownName
+from surgicai_vision.evaluation.agent import Agent
+from surgicai_vision.evaluation.policy_spec import open_policy
+from surgicai_vision.evaluation.run import evaluate_into
+from surgicai_vision.evaluation.storage import MARKER, read_evaluation
+from surgicai_vision.training.run_config import Starts
+
+
+class Still(Agent):
+    """Holds still and looks through one camera."""
+
+    name = "still"
+    cameras = ("back",)
+
+    def reset(self, slot, env, seed):
+        pass
+
+    def act(self, slots, envs, observations):
+        return np.zeros((len(slots), 7), np.float32)
+
+
+def not_an_agent():
+    """Return something else."""
+    return 3
+
+
+def test_a_baseline_acts_in_the_task_and_env_asked_for() -> None:
+    spec = open_policy("zero", task="place", env={"max_steps": 7})
+    assert (spec.name, spec.config) == ("zero", TaskConfig("place", max_steps=7))
+    assert not spec.run.is_trained and spec.make_agent().name == "zero"
+
+
+def test_a_checkpoint_acts_in_the_env_it_was_trained_in(tmp_path: Path) -> None:
+    spec = open_policy(checkpoint(tmp_path / "grasp", "grasp"))
+    assert (spec.name, spec.config) == ("proprioception", TaskConfig("grasp"))
+    assert spec.run.demonstrations == 1
+    assert open_policy(tmp_path / "grasp", env={"max_steps": 7}).config.max_steps == 7
+
+
+def test_a_factory_elsewhere_makes_the_agent(tmp_path: Path) -> None:
+    spec = open_policy(f"{__name__}:Still", env={"max_steps": 2})
+    assert spec.run.views == ("back",) and spec.run.is_trained
+    summary = evaluate_into(tmp_path / "out", spec, [names.TEST_SEED], workers=1)
+    assert summary["policy"] == spec.name == f"{__name__}-Still-own-back"
+    stored = read_evaluation(tmp_path / "out").run
+    assert stored.starts == Starts(names.TEST_SEED, 1) and stored.policy == f"{__name__}:Still"
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (f"{__name__}:not_an_agent", "gives int"),
+        (f"{__name__}:nothing", "cannot be imported"),
+        ("no_such_module:make", "cannot be imported"),
+        ("replay", "give a dataset"),
+        ("missing.yaml", "Cannot read"),
+        ("expret", "Did you mean 'expert'"),
+        ("some/where", "not a checkpoint"),
+    ],
+)
+def test_what_is_no_policy_is_refused(given: str, told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        open_policy(given)
+
+
+def test_options_that_do_not_go_with_a_policy_are_refused(tmp_path: Path) -> None:
+    grasp = checkpoint(tmp_path / "grasp", "grasp")
+    with pytest.raises(InputError, match="not for 'place'"):
+        open_policy(grasp, task="place")
+    with pytest.raises(InputError, match="--expert-swap place"):
+        open_policy(grasp, expert_swap="place")
+    with pytest.raises(InputError, match="the task is an option of its own"):
+        open_policy(grasp, env={"task": "place"})
+    with pytest.raises(UnknownName, match="max_steps"):
+        open_policy(grasp, env={"max_step": 3})
+
+
+def test_an_evaluation_of_another_version_is_refused(tmp_path: Path) -> None:
+    spec = open_policy("zero", env={"max_steps": 2})
+    evaluate_into(tmp_path, spec, [names.TEST_SEED], workers=1)
+    stored = json.loads((tmp_path / MARKER).read_text())
+    del stored["format"]
+    (tmp_path / MARKER).write_text(json.dumps(stored))
+    with pytest.raises(BadFile, match="of another version") as refused:
+        read_evaluation(tmp_path)
+    assert "\n" not in str(refused.value)
