@@ -70,7 +70,7 @@ class Ablation:
     def __post_init__(self) -> None:
         if self.encoder is not None:
             encoders.check_encoder_name(self.encoder)
-        if self == Ablation():
+        if all(value is None for value in vars(self).values()):
             raise InputError(
                 "An ablation replaces nothing; give one of encoder, view, pool, recipe, change, "
                 "demonstrations."
