@@ -75,7 +75,7 @@ class Sweep:
     def filed(self) -> int:
         """Return how many cells are in their place."""
         try:
-            return len(os.listdir(self.out / "cells"))
+            return len(os.listdir(self.out / "runs"))
         except OSError:
             return 0
 
@@ -106,10 +106,10 @@ class Sweep:
         """Return what is in the folder beside what should be."""
         import pyarrow.parquet as pq
 
-        rows = pq.read_table(self.out / "episodes.parquet", columns=["cell", "seed"]).to_pylist()
-        different = {(row["cell"], row["seed"]) for row in rows}
+        rows = pq.read_table(self.out / "episodes.parquet", columns=["run", "seed"]).to_pylist()
+        different = {(row["run"], row["seed"]) for row in rows}
         return {
-            "results": len({row["cell"] for row in rows}),
+            "results": len({row["run"] for row in rows}),
             "duplicates": len(rows) - len(different),
             "identical": result["digest"] == digest,
             "left": sorted(path.name for path in self.out.iterdir() if path.name == "work"),

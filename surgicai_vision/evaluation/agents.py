@@ -157,8 +157,7 @@ BASELINES: Mapping[str, Callable[[], Agent]] = MappingProxyType(
 
 @final
 class PolicyAgent(Agent):
-    """A trained policy; sees the images of its views and the measured pose of its tip, nothing
-    else.
+    """A trained policy; it sees the images of its views and the measured pose of its tip.
 
     Args:
         name: how tables call it.

@@ -110,8 +110,9 @@ def read(folder: Path, task: str | None = None) -> LeRobotCheckpoint:
 def _circumstances(
     training: Mapping[str, Any], folder: Path, task: str | None, policy: Mapping[str, Any]
 ) -> tuple[TaskConfig, Inputs]:
-    """Return the task the policy was trained for and what it sees, from its env, its dataset or
-    `task`.
+    """Return the task the policy was trained for and what it sees.
+
+    They are told by its env, its dataset or `task`.
     """
     env, root = training.get("env") or {}, (training.get("dataset") or {}).get("root")
     features: Mapping[str, Any] = {}
@@ -251,7 +252,7 @@ class LeRobotAgent(Agent):
         import torch
         from lerobot.envs.utils import preprocess_observation
 
-        # Asked of the env: in a chain another arm may have become active since it was observed.
+        # Asked of the env: another arm may have become active since it was observed.
         raw: dict[str, Any] = {"agent_pos": np.stack([env.agent_pos() for env in envs])}
         if self._encoder is None:
             raw["pixels"] = {
@@ -289,8 +290,9 @@ def _set_random(device: str, state: Any) -> None:
 
 
 def _load(folder: Path, weights: WeightsSource) -> tuple[Any, Any, Any]:
-    """Return policy, pre- and post-processor; plug-ins are found as LeRobot's own commands find
-    them.
+    """Return policy, pre- and post-processor.
+
+    Plug-ins are found as LeRobot's own commands find them.
     """
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors

@@ -1,5 +1,6 @@
-"""Metrics: what is kept of one episode, and the summary of many. `docs/evaluation.md` explains every
-column.
+"""Metrics: what is kept of one episode, and the summary of many.
+
+`docs/evaluation.md` explains every column.
 
 All lengths, angles and forces are read from the measured physical state, never from a command.
 """
@@ -121,8 +122,9 @@ def summary(rows: Sequence[EpisodeMetrics]) -> dict[str, Any]:
 
 
 def subtask_successes(rows: Sequence[EpisodeMetrics]) -> list[dict[str, Any]]:
-    """Return for each subtask how many episodes finished it and all before it: k of n, with the
-    exact interval.
+    """Return for each subtask how many episodes finished it and all before it.
+
+    k of n, with the exact interval.
     """
     stages = []
     for subtask, k in _reached(rows).items():

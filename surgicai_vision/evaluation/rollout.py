@@ -112,8 +112,9 @@ def run_share(
     batch: int,
     report: Callable[[int], None],
 ) -> list[Episode]:
-    """Run the episodes of one process; `report` is told the steps done, a finished episode as all
-    of its own.
+    """Run the episodes of one process.
+
+    `report` is told the steps done; a finished episode counts as all of its own.
     """
     agent = make_agent()
     slots = [_Slot(index, agent, task_config) for index in range(min(batch, len(seeds)))]
@@ -261,5 +262,6 @@ def _in_processes(
         )
     except processes.Died:
         raise SurgicaiError(
-            "A process of the evaluation was killed (out of memory?); run it again with --workers 1."
+            "A process of the evaluation was killed (out of memory?); "
+            "run it again with --workers 1."
         ) from None

@@ -1,5 +1,4 @@
-"""Statistics: intervals of success rates, tests of pairs of policies, the area under a curve of
-successes.
+"""Statistics: intervals of success rates, tests of pairs of policies, areas under curves.
 
 Interface:
     clopper_pearson(k, n)                exact interval of one success rate
@@ -44,7 +43,8 @@ def clopper_pearson(successes: int, trials: int, level: float = 0.95) -> tuple[f
     """
     if trials < 1 or not 0 <= successes <= trials:
         raise InputError(
-            f"{successes} successes of {trials} trials; allowed: 0 ≤ successes ≤ trials, trials ≥ 1."
+            f"{successes} successes of {trials} trials; "
+            "allowed: 0 ≤ successes ≤ trials, trials ≥ 1."
         )
     return _beta_bounds(successes, trials, level)
 
@@ -166,7 +166,8 @@ def mcnemar(one: ArrayLike, other: ArrayLike) -> float:
     a, b = np.asarray(one, bool), np.asarray(other, bool)
     if a.shape != b.shape or a.ndim != 1 or not a.size:
         raise InputError(
-            f"Successes of shapes {a.shape} and {b.shape}; give the same starts of both, at least one."
+            f"Successes of shapes {a.shape} and {b.shape}; "
+            "give the same starts of both, at least one."
         )
     first, second = int((a & ~b).sum()), int((b & ~a).sum())
     return min(1.0, 2.0 * float(binom.cdf(min(first, second), first + second, 0.5)))
@@ -194,8 +195,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def area_under_curve(strength: ArrayLike, success: ArrayLike) -> float:
-    """Return the mean success over the range of strengths: the trapezoids' area over the range's
-    width.
+    """Return the mean success over the range of strengths: the trapezoids' area over its width.
 
     Args:
         strength: increasing, (k,), at least two.
@@ -207,7 +207,8 @@ def area_under_curve(strength: ArrayLike, success: ArrayLike) -> float:
     x, y = np.asarray(strength, np.float64), np.asarray(success, np.float64)
     if x.shape != y.shape or x.ndim != 1 or x.size < 2 or not (np.diff(x) > 0).all():
         raise InputError(
-            f"Strengths {x.tolist()} with {y.size} successes; give at least two, increasing, one success for each."
+            f"Strengths {x.tolist()} with {y.size} successes; "
+            "give at least two, increasing, one success for each."
         )
     return float(np.sum(np.diff(x) * (y[1:] + y[:-1])) / 2 / (x[-1] - x[0]))
 
@@ -230,9 +231,7 @@ def area_interval(areas: Sequence[float], level: float = 0.95) -> tuple[float, f
 
 
 def mean_and_std(values: Sequence[float]) -> dict[str, float | None]:
-    """Return {"mean", "std"} of `values` (sample deviation, n - 1); None where it is not
-    defined.
-    """
+    """Return {"mean", "std"} of `values` (sample deviation); None where it is not defined."""
     count = len(values)
     if count == 0:
         return {"mean": None, "std": None}

@@ -178,8 +178,9 @@ def read_results(folder: Path, empty: bool = False) -> list[Result]:
 
 
 def _once(results: Sequence[Result]) -> list[Result]:
-    """Leave out a reference whose episodes are among those of another: several sweeps evaluate the
-    same expert.
+    """Leave out a reference whose episodes are among those of another.
+
+    Several sweeps evaluate the same expert.
     """
     kept: list[Result] = []
     references = [result for result in results if not result.trained]
@@ -199,8 +200,9 @@ def _outcomes(result: Result) -> set[tuple[Any, ...]]:
 
 
 def _told_apart(results: Sequence[Result], folder: Path) -> list[Result]:
-    """Name evaluations of the same condition and training seed by their folders: counted together
-    they count twice.
+    """Name evaluations of the same condition and training seed by their folders.
+
+    Counted together they would count twice.
     """
     count = Counter((result.condition, result.seed) for result in results)
     return [

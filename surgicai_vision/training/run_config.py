@@ -1,7 +1,7 @@
 """A run: one policy from its demonstrations to its counted successes, as data.
 
-A `RunConfig` is stored whole wherever results of the run are: in its checkpoint, its evaluation, the
-record of its failure and a sweep's folders. Names are printed from it and never parsed.
+A `RunConfig` is stored whole wherever results of the run are: in its checkpoint, its evaluation,
+the record of its failure and a sweep's folders. Names are printed from it and never parsed.
 
 Light to import, for the command line.
 """

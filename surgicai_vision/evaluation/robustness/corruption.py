@@ -1,5 +1,6 @@
-"""Corruption: blur, noise and smoke on the images an agent is given; the env, its rewards and its
-films stay clean.
+"""Corruption: blur, noise and smoke on the images an agent is given.
+
+The env, its rewards and its films stay clean.
 
 A corruption is `change(image, strength, moment) -> image` of (height, width, 3) uint8. It is a
 function of the image, the strength, the start seed, the step and the view alone, so an episode
@@ -66,9 +67,7 @@ def noise(image: Image, strength: float, moment: Moment) -> Image:
 
 
 def smoke(image: Image, strength: float, moment: Moment) -> Image:
-    """Return the image behind smoke that drifts across; each start and view has clouds of its
-    own.
-    """
+    """Return the image behind smoke that drifts; each start and view has clouds of its own."""
     height, width = image.shape[:2]
     field = _clouds(moment.seed, moment.view, height, width)
     field = np.roll(field, round(moment.step * SMOKE_DRIFT * width), axis=1)
@@ -77,8 +76,9 @@ def smoke(image: Image, strength: float, moment: Moment) -> Image:
 
 
 def _clouds(seed: int, view: int, height: int, width: int) -> NDArray[np.float32]:
-    """Return smooth noise from 0 to 1, (height, width), that tiles across: bilinear between random
-    knots.
+    """Return smooth noise from 0 to 1, (height, width), that tiles across.
+
+    It is bilinear between random knots.
     """
     knots = np.random.default_rng((seed, view)).random(
         (SMOKE_KNOTS + 1, SMOKE_KNOTS), dtype=np.float32

@@ -1,5 +1,6 @@
-"""Sweep: a grid of runs; each is encode (cached) → train → evaluate, and is done once, by jobs of
-the executor.
+"""Sweep: a grid of runs, done once each by jobs of the executor.
+
+A run is encode (cached) → train → evaluate.
 
 `out` holds `sweep.json` (the grid), `data/<task>/` (demonstrations and dataset), `runs/<key>/`
 with `policy/`, `evaluation/` and `result.json`, `policies/<key>/` (what hierarchical policies
