@@ -17,12 +17,17 @@ from surgicai_vision.core.errors import BadFile, check_name
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.core.plugins import POLICIES_GROUP, Registry
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
+from surgicai_vision.training.checkpoint import (
+    Checkpoint,
+    check_encoder,
+    read_checkpoint,
+    read_tensors,
+)
 from surgicai_vision.training.run_config import RunConfig
 
 if TYPE_CHECKING:
     from encoders.base import Encoder
     from policies.base import Plugin, Policy, Recipe
-    from surgicai_vision.training.checkpoint import Checkpoint
 
 POLICIES: Final = Registry["Plugin"](
     "policy", POLICIES_GROUP, {"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP"}
@@ -103,15 +108,11 @@ def load_policy(folder: Path | str) -> "Policy":
     Raises:
         BadFile: a folder that is no whole checkpoint, or one that was changed.
     """
-    from surgicai_vision.training.checkpoint import read_checkpoint
-
     return restore(read_checkpoint(Path(folder)))
 
 
-def restore(checkpoint: "Checkpoint") -> "Policy":
+def restore(checkpoint: Checkpoint) -> "Policy":
     """Build the trained policy of a checkpoint; see `load_policy`."""
-    from surgicai_vision.training.checkpoint import read_tensors
-
     plugin = policy_plugin(checkpoint.policy)
     try:
         policy = plugin.make(from_mapping(plugin.recipe, checkpoint.recipe), checkpoint.visual)
@@ -125,16 +126,12 @@ def restore(checkpoint: "Checkpoint") -> "Policy":
     return policy
 
 
-def load_encoder_of(
-    checkpoint: "Checkpoint", weights: WeightsSource = ANYWHERE
-) -> "Encoder | None":
+def load_encoder_of(checkpoint: Checkpoint, weights: WeightsSource = ANYWHERE) -> "Encoder | None":
     """Load the encoder a policy was trained on, verified; None for a policy without images.
 
     Raises:
-        InputError: the encoder at hand is not the one trained on; else as `load_encoder`.
+        InputError: this is not the encoder it was trained on; else as `load_encoder`.
     """
-    from surgicai_vision.training.checkpoint import check_encoder
-
     record = checkpoint.encoder
     encoder = load_encoder(record.name, record.pool, weights) if record else None
     check_encoder(checkpoint, encoder)

@@ -10,8 +10,9 @@ from fake_hub import FakeHub
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.commands.policy import push
-from surgicai_vision.core.config import SceneConfig
+from surgicai_vision.core.config import SceneConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
+from surgicai_vision.evaluation.storage import FORMAT
 from surgicai_vision.scene import build_scene
 from surgicai_vision.training.checkpoint import CARD, WEIGHTS, read_checkpoint
 from surgicai_vision.training.hub import Successes, model_card, pull_policy, push_policy
@@ -126,14 +127,15 @@ def test_successes_are_those_of_this_policy(
     trained = read_checkpoint(policy)
     summary = {"successes": 1, "episodes": 2, "ci95": [0.01, 0.99]}
     about = {"checkpoint": {"policy_sha256": trained.policy_sha256}}
+    stored = {"format": FORMAT, "run": to_mapping(trained.run), "summary": summary, "about": about}
     marker = tmp_path / "evaluation.json"
-    marker.write_text(json.dumps({"summary": summary, "about": about}))
+    marker.write_text(json.dumps(stored))
     monkeypatch.setattr(
         "surgicai_vision.evaluation.storage.read_rows", lambda _: [{"seed": 7}, {"seed": 8}]
     )
     found = push._successes(tmp_path, trained)
     assert found == Successes(1, 2, (0.01, 0.99), (7, 8))
     about["checkpoint"]["policy_sha256"] = "0" * 64
-    marker.write_text(json.dumps({"summary": summary, "about": about}))
+    marker.write_text(json.dumps(stored))
     with pytest.raises(InputError, match="of another policy"):
         push._successes(tmp_path, trained)

@@ -9,7 +9,6 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import DIRECTORY
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.core.files import read_json
 
 if TYPE_CHECKING:
     from surgicai_vision.training.checkpoint import Checkpoint
@@ -74,18 +73,19 @@ def _successes(folder: Path, checkpoint: "Checkpoint") -> "Successes":
     Raises:
         InputError: it is of another policy.
     """
-    from surgicai_vision.evaluation.storage import MARKER, read_rows
+    from surgicai_vision.evaluation.storage import read_evaluation, read_rows
     from surgicai_vision.training.hub import Successes
 
     seeds = [int(row["seed"]) for row in read_rows(folder)]
-    stored = read_json(folder / MARKER)
-    evaluated = stored["about"].get("checkpoint") or {}
-    if evaluated.get("policy_sha256") != checkpoint.policy_sha256:
+    evaluation = read_evaluation(folder)
+    evaluated = evaluation.about.get("checkpoint")
+    sha256 = evaluated.get("policy_sha256") if isinstance(evaluated, dict) else None
+    if sha256 != checkpoint.policy_sha256:
         raise InputError(
             f"--evaluation {folder} is of another policy than {checkpoint.folder}; "
             "give one of this policy, or leave it out."
         )
-    summary = stored["summary"]
+    summary = evaluation.summary
     low, high = summary["ci95"]
     return Successes(
         count=summary["successes"],
