@@ -99,7 +99,7 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
 
     def _fill(self, config: TaskConfig, cameras: list[str], image_size: int) -> None:
         """Fill what is None from the dataset, or from the arguments where there is none."""
-        features: dict[str, Any] = {}
+        features: dict[str, PolicyFeature] = {}
         if self.dataset:
             dataset = open_dataset(Path(self.dataset))
             config = dataset.config
@@ -131,7 +131,7 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
         return env_id(self.task_config().task)
 
     @property
-    def gym_kwargs(self) -> dict[str, Any]:
+    def gym_kwargs(self) -> dict[str, object]:
         """Return the arguments of `gymnasium.make`.
 
         Its step limit gives LeRobot `_max_episode_steps`.

@@ -8,7 +8,6 @@ whenever the policy is loaded.
 import copy
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -68,7 +67,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
 
     @classmethod
     def from_pretrained(
-        cls, pretrained_name_or_path: str | Path, *, strict: bool = True, **arguments: Any
+        cls, pretrained_name_or_path: str | Path, *, strict: bool = True, **arguments: object
     ) -> "SurgicaiBcPolicy":
         """Load a policy; unlike LeRobot's own, a tensor that is missing or unexpected is an error.
 
@@ -100,7 +99,7 @@ class SurgicaiBcPolicy(PreTrainedPolicy):  # type: ignore[misc]  # mypy skips Le
         super().train(mode)
         return self
 
-    def load_state_dict(self, *arguments: Any, **options: Any) -> Any:
+    def load_state_dict(self, *arguments: object, **options: object) -> object:
         """Load weights."""
         self._acting = None
         return super().load_state_dict(*arguments, **options)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
@@ -22,6 +22,9 @@ from surgicai_vision.commands.options import (
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
+
+if TYPE_CHECKING:
+    from surgicai_vision.demos.record import Learner
 
 app = App(
     name="record-demos",
@@ -123,7 +126,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     }
 
 
-def _learner(folder: Path, config: TaskConfig) -> Any:
+def _learner(folder: Path, config: TaskConfig) -> "Learner":
     """Return the learner that drives."""
     from surgicai_vision.experiments.dagger import learner_of
 

@@ -9,7 +9,7 @@ to (DAgger, Ross et al. 2011; `surgicai_vision.experiments.dagger`).
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,8 @@ from surgicai_vision.demos.demonstrator import BehaviourPolicy, Demonstrator
 from surgicai_vision.demos.store import Demo
 
 if TYPE_CHECKING:
-    from surgicai_vision.envs.base import SuturingEnv
+    from surgicai_vision.envs.base import Observation, SuturingEnv
+    from surgicai_vision.envs.success import Info
 
 DISTURBANCE_STREAM = 0xDA27
 """Sets the disturbance's random numbers apart from the start's, which are of the same seed."""
@@ -102,13 +103,15 @@ class EpisodeRecorder:
 
     def __init__(self, env: "SuturingEnv", seed: int, demonstrator: str):
         self.seed = seed
-        self.info: dict[str, Any] = {}
-        self.observation: Any = None
+        self.info: Info = {}
+        self.observation: Observation | None = None
         self.truncated = False
         self._env = env
         self._demonstrator = demonstrator
         self._states = [env.get_state()]
-        self._rows: list[tuple[Any, ...]] = []
+        self._rows: list[
+            tuple[NDArray[np.float32], NDArray[np.float32], int, float, bool, bool]
+        ] = []
 
     def __len__(self) -> int:
         """Return the control steps so far."""

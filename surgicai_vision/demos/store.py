@@ -179,7 +179,7 @@ def read_demo(path: Path) -> Demo:
         raise error if isinstance(error, BadFile) else BadFile(f"{path}: {error}") from None
 
 
-def write_marker(folder: Path, task: str, demonstrator: str, **details: Any) -> None:
+def write_marker(folder: Path, task: str, demonstrator: str, **details: object) -> None:
     """Write `demos.json`, which says what the folder holds and which code wrote it."""
     write_json(
         folder / MARKER,

@@ -172,7 +172,8 @@ class SuturingEnv(gymnasium.Env):
         """Return the front camera's image, (480, 640, 3) uint8, in render mode "rgb_array"."""
         if self.render_mode is None:
             return None
-        return self._images.image(self.data, RENDER_CAMERA, RENDER_SIZE)
+        image = self._images.image(self.data, RENDER_CAMERA, RENDER_SIZE)
+        return image.astype(np.uint8, copy=False)
 
     def close(self) -> None:
         """Free the renderer."""

@@ -62,18 +62,19 @@ def state_renderer(config: TaskConfig, size: int, quality: str = "high") -> Iter
 def coloured(frame: Frame, modality: str) -> Image:
     """Return a frame as RGB (H, W, 3): depth by a colour map, segmentation by a palette."""
     if modality == names.RGB:
-        return frame
+        return frame.astype(np.uint8, copy=False)
     if modality == names.SEGMENTATION:
         parts: Image = PALETTE[frame[..., 0]]
         return parts
     import cv2
 
-    near, far = depth_range(frame)
-    scaled = np.clip((frame[..., 0] - near) / max(far - near, 1e-6), 0, 1)
+    depth = frame.astype(np.float32, copy=False)
+    near, far = depth_range(depth)
+    scaled = np.clip((depth[..., 0] - near) / max(far - near, 1e-6), 0, 1)
     rgb: Image = cv2.applyColorMap((255 * (1 - scaled)).astype(np.uint8), cv2.COLORMAP_TURBO)[
         ..., ::-1
     ].copy()
-    rgb[frame[..., 0] >= BEYOND] = PALETTE[0]
+    rgb[depth[..., 0] >= BEYOND] = PALETTE[0]
     return rgb
 
 

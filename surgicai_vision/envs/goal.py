@@ -6,6 +6,7 @@ for them with another desired goal. All three take single goals (8,) or batches 
 """
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +55,9 @@ class GoalSuturingEnv(SuturingEnv):
         seen, reward, terminated, truncated, info = super().step(action)
         if self.config.reward == "dense":
             assert isinstance(seen, dict)
-            reward = float(self.compute_reward(seen["achieved_goal"], seen["desired_goal"], info))
+            achieved = cast(Goals, seen["achieved_goal"])
+            desired = cast(Goals, seen["desired_goal"])
+            reward = float(self.compute_reward(achieved, desired, info))
         return seen, reward, terminated, truncated, info
 
     def _reached(self, achieved_goal: Goals, desired_goal: Goals) -> NDArray[np.bool_]:

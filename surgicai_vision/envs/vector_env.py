@@ -11,6 +11,7 @@ number of workers: `benchmarks/speed.py --only workers` measures it.
 
 import itertools
 import traceback
+from collections.abc import Sequence
 from copy import deepcopy
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
@@ -142,7 +143,7 @@ class SuturingVectorEnv(VectorEnv):
         infos = self._merge([answer[3] for answer in answers])
         return deepcopy(self._seen), rewards, terminated, truncated, infos
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+    def call(self, name: str, *args: object, **kwargs: object) -> tuple[object, ...]:
         """Return an attribute of each env, or what its method returns."""
         self._check_open()
         return tuple(
@@ -151,7 +152,7 @@ class SuturingVectorEnv(VectorEnv):
             for value in part
         )
 
-    def get_attr(self, name: str) -> tuple[Any, ...]:
+    def get_attr(self, name: str) -> tuple[object, ...]:
         """Return an attribute of each env."""
         return self.call(name)
 
@@ -179,7 +180,7 @@ class SuturingVectorEnv(VectorEnv):
         if self.closed or not self._workers:
             raise InputError("The vector env is closed; make a new one.")
 
-    def _ask_all(self, what: str, arguments: list[Any]) -> list[Any]:
+    def _ask_all(self, what: str, arguments: Sequence[object]) -> list[Any]:
         """Send each worker its part, then collect the answers; a worker's error ends all."""
         try:
             for worker, part in zip(self._workers, arguments, strict=True):
@@ -241,7 +242,7 @@ def _work(
             vector.close()
 
 
-def _answer(vector: SyncVectorEnv, what: str, part: Any, seen: Tree, share: slice) -> Any:
+def _answer(vector: SyncVectorEnv, what: str, part: Any, seen: Tree, share: slice) -> object:
     """Do what is asked; observations go to shared memory."""
     if what == "step":
         observation, *rest = vector.step(*part)

@@ -183,7 +183,7 @@ def _render(choices: Sequence[Choice]) -> Iterator[Strip]:
                     yield strip
 
 
-def _strip(choice: Choice, image: Any) -> Strip | None:
+def _strip(choice: Choice, image: contact_sheet.Draw) -> Strip | None:
     """Render one episode as the policy's first view saw it; None where no state of it was kept."""
     view = next(iter(choice.group.condition.views), "front")
     film = read_film(choice.result.folder, choice.row["seed"])

@@ -1,6 +1,6 @@
 """Probing: each encoder's linear probe beside the success of the policies that see through it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,24 +19,59 @@ ALL = "all"
 
 
 @dataclass(frozen=True)
+class ProbeRow:
+    """A probe as the page's table shows it.
+
+    Attributes:
+        task: the probe's task, or `ALL`.
+        encoder: the encoder's name.
+        view: its views.
+        tip_mm: error of the needle's tip [mm], as text.
+        tip_rest: that error's interval and the mean pose's error, or "".
+        tip_sort: what the column is sorted by.
+        angle_deg: error of the needle's angle [deg], as text.
+        angle_rest: that error's interval and the mean pose's error, or "".
+        angle_sort: what the column is sorted by.
+        n: frames the probe was fitted on and asked for.
+        success: successes of the policies that see through the encoder, as "k/n".
+        rate: their rate, as text.
+        point: the rate at the tip's error, where there are both.
+    """
+
+    task: str
+    encoder: str
+    view: str
+    tip_mm: str
+    tip_rest: str
+    tip_sort: float | str
+    angle_deg: str
+    angle_rest: str
+    angle_sort: float | str
+    n: int | str
+    success: str
+    rate: str
+    point: Point | None
+
+
+@dataclass(frozen=True)
 class Probes:
     """Probe errors beside success: a table, a chart, and how the two go together."""
 
-    rows: tuple[dict[str, Any], ...]
+    rows: tuple[ProbeRow, ...]
     chart: Chart | None
     correlation: str
 
 
-def probes(found: Sequence[dict[str, Any]], groups: Sequence[Group]) -> Probes | None:
+def probes(found: Sequence[Mapping[str, Any]], groups: Sequence[Group]) -> Probes | None:
     """Set each probe beside the success of the policies with its encoder, view, pool and task."""
     if not found:
         return None
     rows = tuple(_row(probe, [item for item in groups if _matches(probe, item)]) for probe in found)
-    pairs = [row for row in rows if row["point"] is not None]
+    pairs = [(row, row.point) for row in rows if row.point is not None]
     return Probes(rows, _chart(pairs), _correlations(pairs))
 
 
-def _row(probe: dict[str, Any], mine: Sequence[Group]) -> dict[str, Any]:
+def _row(probe: Mapping[str, Any], mine: Sequence[Group]) -> ProbeRow:
     """Return one probe with the pooled success of its policies."""
     k = sum(item.successes for item in mine)
     n = sum(item.episodes for item in mine)
@@ -47,24 +82,24 @@ def _row(probe: dict[str, Any], mine: Sequence[Group]) -> dict[str, Any]:
     if n and tip:
         low, high = statistics.clopper_pearson(k, n)
         point = Point(tip[0], k / n, low, high, f"{view}: {tip[0]:.1f} mm, {k}/{n}")
-    return {
-        "task": probe.get("task") or ALL,
-        "encoder": encoder,
-        "view": view,
-        "tip_mm": _number(tip),
-        "tip_rest": _rest(probe, "tip_mm"),
-        "tip_sort": tip[0] if tip else "",
-        "angle_deg": _number(angle),
-        "angle_rest": _rest(probe, "angle_deg"),
-        "angle_sort": angle[0] if angle else "",
-        "n": probe.get("n", text.ABSENT),
-        "success": f"{k}/{n}" if n else text.ABSENT,
-        "rate": text.percent(k / n) if n else "",
-        "point": point,
-    }
+    return ProbeRow(
+        task=probe.get("task") or ALL,
+        encoder=encoder,
+        view=view,
+        tip_mm=_number(tip),
+        tip_rest=_rest(probe, "tip_mm"),
+        tip_sort=tip[0] if tip else "",
+        angle_deg=_number(angle),
+        angle_rest=_rest(probe, "angle_deg"),
+        angle_sort=angle[0] if angle else "",
+        n=probe.get("n", text.ABSENT),
+        success=f"{k}/{n}" if n else text.ABSENT,
+        rate=text.percent(k / n) if n else "",
+        point=point,
+    )
 
 
-def _matches(probe: dict[str, Any], item: Group) -> bool:
+def _matches(probe: Mapping[str, Any], item: Group) -> bool:
     condition = item.condition
     if not (item.episodes and condition.trained and condition.plain):
         return False
@@ -74,7 +109,7 @@ def _matches(probe: dict[str, Any], item: Group) -> bool:
     return pooled and probe.get("encoder") == condition.encoder and _view(probe) == condition.view
 
 
-def _view(probe: dict[str, Any]) -> str:
+def _view(probe: Mapping[str, Any]) -> str:
     view = probe.get("view") or ()
     views = view.replace("+", ",").split(",") if isinstance(view, str) else view
     return " + ".join(str(name).strip() for name in views)
@@ -84,19 +119,19 @@ def _number(known: Sequence[float]) -> str:
     return f"{known[0]:.2f}" if known else text.ABSENT
 
 
-def _rest(probe: dict[str, Any], name: str) -> str:
+def _rest(probe: Mapping[str, Any], name: str) -> str:
     """Return interval and the mean pose's error, where the probe tells them."""
     known = text.finite([probe.get(f"{name}_{part}") for part in ("low", "high", "chance")])
     return f"({known[0]:.2f}–{known[1]:.2f}; {known[2]:.2f})" if len(known) == 3 else ""
 
 
-def _chart(pairs: Sequence[dict[str, Any]]) -> Chart | None:
+def _chart(pairs: Sequence[tuple[ProbeRow, Point]]) -> Chart | None:
     """Draw success against the probe's tip error, one sign an encoder."""
-    if len(pairs) < 2 or len({row["point"].x for row in pairs}) < 2:
+    if len(pairs) < 2 or len({point.x for _, point in pairs}) < 2:
         return None
-    encoders = list(dict.fromkeys(row["encoder"] for row in pairs))[:MOST]
+    encoders = list(dict.fromkeys(row.encoder for row, _ in pairs))[:MOST]
     lines = [
-        Series(name, tuple(row["point"] for row in pairs if row["encoder"] == name))
+        Series(name, tuple(point for row, point in pairs if row.encoder == name))
         for name in encoders
     ]
     ticks = {point.x: f"{point.x:.1f}" for line in lines for point in line.points}
@@ -107,11 +142,11 @@ def _chart(pairs: Sequence[dict[str, Any]]) -> Chart | None:
     return Chart("Success [%] against the probe", drawing, charts.key(encoders), (), ())
 
 
-def _correlations(pairs: Sequence[dict[str, Any]]) -> str:
+def _correlations(pairs: Sequence[tuple[ProbeRow, Point]]) -> str:
     """Describe Spearman's rank correlation of tip error and success, each task by itself."""
     parts = []
-    for task in dict.fromkeys(row["task"] for row in pairs):
-        mine = [(row["point"].x, row["point"].rate) for row in pairs if row["task"] == task]
+    for task in dict.fromkeys(row.task for row, _ in pairs):
+        mine = [(point.x, point.rate) for row, point in pairs if row.task == task]
         parts.append(f"{'all tasks' if task == ALL else task}: {_correlation(mine)}")
     if not parts:
         return "No policy sees through a probed encoder, so there is nothing to correlate."

@@ -1,7 +1,7 @@
 """Origin: with what, where and by which commands the numbers were made."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from surgicai_vision.report import text
@@ -12,7 +12,7 @@ from surgicai_vision.report.tables import evaluate_command
 FLOW = ("demos", "dataset", "features", "policy", "evaluation", "report")
 
 
-def origin(collected: Collected, groups: Sequence[Group]) -> dict[str, Any]:
+def origin(collected: Collected, groups: Sequence[Group]) -> dict[str, object]:
     """Return versions, seeds, machine, renderer and hashes; where cells differ, every value."""
     run = collected.run
     results = collected.results
@@ -55,7 +55,7 @@ def stages(seconds: dict[str, float]) -> str:
     return f"{sum(seconds.values()):.0f} s: {', '.join(parts)}" if parts else ""
 
 
-def _cell(item: Group, result: Result) -> dict[str, Any]:
+def _cell(item: Group, result: Result) -> dict[str, str | int]:
     """Return one row of the table of hashes."""
     checkpoint = result.checkpoint
     command = evaluate_command(result) or str(result.about.get("command") or "")
@@ -70,7 +70,7 @@ def _cell(item: Group, result: Result) -> dict[str, Any]:
     }
 
 
-def _hash(value: Any) -> str:
+def _hash(value: object) -> str:
     return str(value)[:16] if value else text.ABSENT
 
 
@@ -85,7 +85,7 @@ def _starts(results: Sequence[Result]) -> str:
     )
 
 
-def _distinct(values: Any, joint: str = ", ") -> str:
+def _distinct(values: Iterable[object], joint: str = ", ") -> str:
     """Join different values in the order of their first appearance."""
     return joint.join(dict.fromkeys(str(value) for value in values if value not in (None, "")))
 

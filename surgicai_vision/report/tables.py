@@ -6,7 +6,7 @@ result too; `pairs.csv` one a comparison.
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ def write_changed(path: Path, content: bytes) -> None:
         files.write_bytes(path, content)
 
 
-def condition_record(item: Group) -> dict[str, Any]:
+def condition_record(item: Group) -> dict[str, object]:
     """Return one condition as a flat row with numbers."""
     evaluated = item.episodes > 0
     low, high = item.interval if evaluated else (None, None)
@@ -75,7 +75,7 @@ def condition_record(item: Group) -> dict[str, Any]:
     }
 
 
-def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, Any]]:
+def cell_records(groups: Sequence[Group]) -> Iterator[dict[str, object]]:
     """Yield one flat row a cell.
 
     What it is, its counts and measures, how to make it again, or why there is none.
@@ -132,13 +132,13 @@ def evaluate_command(result: Result) -> str | None:
     return f"surgicai-vision evaluate {name} {ending}" if name in REFERENCES[:3] else None
 
 
-def _filled(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _filled(rows: list[dict[str, object]]) -> list[dict[str, object]]:
     """Give every row every column: a table's columns are those of its first row."""
     columns = dict.fromkeys(name for row in sorted(rows, key=len, reverse=True) for name in row)
     return [{name: row.get(name) for name in columns} for row in rows]
 
 
-def _identity(condition: Condition) -> dict[str, Any]:
+def _identity(condition: Condition) -> dict[str, object]:
     return {
         "task": condition.task,
         "encoder": condition.encoder,
@@ -152,10 +152,10 @@ def _identity(condition: Condition) -> dict[str, Any]:
     }
 
 
-def _measures(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _measures(rows: Sequence[Mapping[str, Any]]) -> dict[str, object]:
     """Return means over successes, medians of what was measured, and failures by kind."""
     wins = [row for row in rows if row["success"]]
-    found: dict[str, Any] = {}
+    found: dict[str, object] = {}
     for column in ("trajectory_length_mm", "steps"):
         spread = statistics.mean_and_std([float(row[column]) for row in wins])
         found |= {f"{column}_mean": spread["mean"], f"{column}_std": spread["std"]}
@@ -166,7 +166,7 @@ def _measures(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {**found, **{kind: failures.count(kind) for kind in KINDS}}
 
 
-def _pair_record(pair: Pair) -> dict[str, Any]:
+def _pair_record(pair: Pair) -> dict[str, object]:
     return {
         "task": pair.first.condition.task,
         "differ_in": pair.factor,
@@ -180,7 +180,7 @@ def _pair_record(pair: Pair) -> dict[str, Any]:
     }
 
 
-def _csv(rows: Sequence[dict[str, Any]]) -> bytes:
+def _csv(rows: Sequence[Mapping[str, object]]) -> bytes:
     out = io.StringIO()
     if rows:
         writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")

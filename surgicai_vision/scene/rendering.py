@@ -15,7 +15,6 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -29,7 +28,7 @@ from surgicai_vision.scene.opengl import renderer_string
 
 __all__ = ["QUALITIES", "Frame", "FrameRenderer", "parts_of_geoms", "renderer_string"]
 
-Frame = NDArray[Any]
+Frame = NDArray[np.uint8 | np.float32]
 """One modality of a view, (height, width, channels): uint8, of depth float32 [m]."""
 
 

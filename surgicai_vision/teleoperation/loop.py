@@ -6,7 +6,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.core import names
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.scene.rendering import FrameRenderer
 from surgicai_vision.teleoperation.inputs import Device
@@ -57,7 +56,7 @@ class EnvViews:
             self._renderer = FrameRenderer(self._env.model, self._size, self._size)
             self._draws = self._env.simulation.draws
         return {
-            camera: self._renderer.render(self._env.data, camera, names.RGB)
+            camera: self._renderer.render(self._env.data, camera).astype(np.uint8, copy=False)
             for camera in self._cameras
         }
 

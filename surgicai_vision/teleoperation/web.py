@@ -24,7 +24,6 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import cv2
@@ -105,7 +104,7 @@ class PageInputs:
         self._lock = threading.Lock()
         self._pages: dict[str, _Page] = {}
 
-    def receive(self, content: Any) -> None:
+    def receive(self, content: object) -> None:
         """Take a page's message.
 
         Args:
@@ -150,7 +149,7 @@ class PageInputs:
         return self._pages[client]
 
 
-def _read_message(content: Any) -> _Message:
+def _read_message(content: object) -> _Message:
     """Return a checked message, or raise `InputError`."""
     if not isinstance(content, dict):
         raise InputError("An input must be a table.")
@@ -186,7 +185,7 @@ class PageScreen:
         self._requested = False
         self._images: Images = {}
         self._encoded: dict[str, bytes] = {}
-        self._status: dict[str, Any] = {}
+        self._status: dict[str, object] = {}
 
     def wants_image(self) -> bool:
         """Return True if a page waits for an image."""
@@ -204,7 +203,7 @@ class PageScreen:
             self._status = dataclasses.asdict(status)
             self._changed.notify_all()
 
-    def status(self, after: int) -> dict[str, Any]:
+    def status(self, after: int) -> dict[str, object]:
         """Return the newest status with its number, waiting a while for one after `after`."""
         with self._changed:
             self.watched = True

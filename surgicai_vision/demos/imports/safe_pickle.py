@@ -18,7 +18,7 @@ import pickle
 import pickletools
 import re
 from types import MappingProxyType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,7 @@ class _Array:
     def __init__(self) -> None:
         self.value: NDArray[np.generic] | None = None
 
-    def __setstate__(self, state: Any) -> None:
+    def __setstate__(self, state: object) -> None:
         if not isinstance(state, tuple) or len(state) != 5:
             _refuse("an array's state is not the five values numpy writes")
         version, shape, dtype, fortran, content = state
@@ -92,11 +92,13 @@ class _Dtype:
         self.code = code
         self.order = "="
 
-    def __setstate__(self, state: Any) -> None:
-        plain = (
-            isinstance(state, tuple) and len(state) in (7, 8) and state[2:5] == (None, None, None)
-        )
-        if not plain or state[1] not in ("<", ">", "=", "|"):
+    def __setstate__(self, state: object) -> None:
+        if (
+            not isinstance(state, tuple)
+            or len(state) not in (7, 8)
+            or state[2:5] != (None, None, None)
+            or state[1] not in ("<", ">", "=", "|")
+        ):
             _refuse("a dtype's state is not that of a plain number")
         self.order = state[1]
 
@@ -110,7 +112,7 @@ class _Reconstruct:
 
     __slots__ = ()
 
-    def __call__(self, *arguments: Any) -> _Array:
+    def __call__(self, *arguments: object) -> _Array:
         if len(arguments) != 3 or not isinstance(arguments[0], _Ndarray) or arguments[1] != (0,):
             _refuse("an array is not made the way numpy makes it")
         return _Array()
@@ -121,7 +123,7 @@ class _MakeDtype:
 
     __slots__ = ()
 
-    def __call__(self, *arguments: Any) -> _Dtype:
+    def __call__(self, *arguments: object) -> _Dtype:
         code = arguments[0] if arguments else None
         if not isinstance(code, str) or not _NUMPY.fullmatch(code):
             _refuse(f"dtype {str(code)[:40]!r} is not that of plain numbers")
@@ -133,7 +135,7 @@ class _Scalar:
 
     __slots__ = ()
 
-    def __call__(self, *arguments: Any) -> np.generic:
+    def __call__(self, *arguments: object) -> np.generic:
         if len(arguments) != 2 or not isinstance(arguments[0], _Dtype):
             _refuse("a number is not made the way numpy makes it")
         content = arguments[1].encode("latin-1") if isinstance(arguments[1], str) else arguments[1]
@@ -160,13 +162,13 @@ ADMITTED = MappingProxyType(
 class _Unpickler(pickle.Unpickler):
     """The only unpickler of the project: its globals are `ADMITTED`."""
 
-    def find_class(self, module: str, name: str) -> Any:
+    def find_class(self, module: str, name: str) -> object:
         if (module, name) not in ADMITTED:
             _refuse_global(module, name)
         return ADMITTED[module, name]
 
 
-def unpickle(content: bytes, where: str) -> Any:
+def unpickle(content: bytes, where: str) -> object:
     """Return the plain data in a pickle.
 
     Args:
@@ -223,7 +225,7 @@ def _inspect(content: bytes) -> None:
             _refuse("its memo has numbers beyond its length")
 
 
-def _plain(value: Any, seen: dict[int, Any], depth: int) -> Any:
+def _plain(value: object, seen: dict[int, object], depth: int) -> object:
     """Return `value` with finished arrays in the place of those in the making."""
     if isinstance(value, _Array):
         if value.value is None:
@@ -237,14 +239,14 @@ def _plain(value: Any, seen: dict[int, Any], depth: int) -> Any:
         _refuse(f"it is nested deeper than {MAX_DEPTH} levels")
     if id(value) not in seen:
         if isinstance(value, dict):
-            made: Any = {_key(key): _plain(item, seen, depth + 1) for key, item in value.items()}
+            made: object = {_key(key): _plain(item, seen, depth + 1) for key, item in value.items()}
         else:
             made = type(value)(_plain(item, seen, depth + 1) for item in value)
         seen[id(value)] = made
     return seen[id(value)]
 
 
-def _key(key: Any) -> str:
+def _key(key: object) -> str:
     """Return a dictionary's key if it is text."""
     if not isinstance(key, str):
         _refuse(f"a dictionary has a key of type {type(key).__name__}")

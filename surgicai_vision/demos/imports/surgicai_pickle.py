@@ -15,7 +15,6 @@ numpy and runs in the process of `sandbox`.
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +104,7 @@ def _transitions(tree: object, path: Path) -> dict[str, list[NDArray[np.float64]
     return rows
 
 
-def _observation(value: Any) -> Any:
+def _observation(value: object) -> object:
     """Return the 21 values of an observation, bare or in SurgicAI's dictionary."""
     return value["observation"] if isinstance(value, Mapping) else value
 

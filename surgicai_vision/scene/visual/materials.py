@@ -6,7 +6,7 @@ lights are chosen so that the needle stands out without shadows, which software 
 afford; the key light casts one in high quality.
 """
 
-from typing import Any
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -27,7 +27,7 @@ DRAPE_WAVE = 0.006
 
 Shape = mujoco.mjtGeom.mjGEOM_MESH
 
-MATERIALS: dict[str, dict[str, Any]] = {
+MATERIALS: dict[str, Mapping[str, float | list[float]]] = {
     "tissue": {"rgba": [1.0, 1.0, 1.0, 1.0], "specular": 0.35, "shininess": 0.35},
     "flesh": {"rgba": [0.78, 0.45, 0.41, 1.0], "specular": 0.1, "shininess": 0.2},
     "inside": {"rgba": [0.30, 0.07, 0.08, 1.0], "specular": 0.1, "shininess": 0.2},

@@ -6,7 +6,6 @@ scene's hash must not.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -131,7 +130,7 @@ def rod(start: Sequence[float], end: Sequence[float], radius: float, sides: int 
     return loft([circle + start, circle + end])
 
 
-def show(body: mujoco.MjsBody, shape: mujoco.mjtGeom, material: str, **place: Any) -> None:
+def show(body: mujoco.MjsBody, shape: mujoco.mjtGeom, material: str, **place: object) -> None:
     """Add a geom to `body` that is seen and nothing else: it neither collides nor weighs."""
     body.add_geom(
         type=shape, material=material, contype=0, conaffinity=0, mass=0.0, group=VISIBLE, **place
