@@ -108,7 +108,7 @@ def painted_stage(config, size, quality="high"):
 @pytest.fixture
 def painted(monkeypatch):
     """These tests are about the page: they paint."""
-    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
 
 
 class Page(HTMLParser):
@@ -201,7 +201,7 @@ def test_without_gl_the_numbers_remain(results, monkeypatch):
     def no_gl(*_):
         raise SurgicaiError("nothing renders")
 
-    monkeypatch.setattr(contact_sheet, "stage", no_gl)
+    monkeypatch.setattr(contact_sheet, "state_renderer", no_gl)
     text = report.write_report(results).read_text()
     assert "No images: nothing renders" in text
     assert "13/20" in text

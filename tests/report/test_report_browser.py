@@ -34,7 +34,7 @@ def written(tmp_path_factory):
     """A sweep's folder with its report."""
     folder = add_curves(write_sweep(tmp_path_factory.mktemp("sweep") / "table"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contact_sheet, "stage", painted_stage)
+        patch.setattr(contact_sheet, "state_renderer", painted_stage)
         report.write_report(folder)
     return folder
 

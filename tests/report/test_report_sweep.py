@@ -45,7 +45,7 @@ def written(tmp_path_factory):
     """A sweep's folder with its report."""
     folder = add_curves(write_sweep(tmp_path_factory.mktemp("sweep") / "table"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contact_sheet, "stage", painted_stage)
+        patch.setattr(contact_sheet, "state_renderer", painted_stage)
         report.write_report(folder)
     return folder
 
@@ -225,7 +225,7 @@ def test_cells_keep_their_columns_where_the_first_has_no_result(tmp_path):
 
 
 def test_the_command_reports_a_sweep_that_it_cannot_plan(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
     write_sweep(tmp_path, tasks=("grasp",), seeds=(0,), views=(("back",),))
     grid = Grid(("grasp",), ("random",), (("back",),), recipe=("gone.yaml",))
     stored = {"format": FORMAT, "grid": to_mapping(grid)}
@@ -239,7 +239,7 @@ def test_the_command_reports_a_sweep_that_it_cannot_plan(tmp_path, monkeypatch, 
 
 
 def test_a_folder_where_every_cell_failed_has_a_report(tmp_path, monkeypatch):
-    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
     folder = tmp_path / "runs" / "a"
     folder.mkdir(parents=True)
     failed = to_mapping(run_of("grasp", "random", ("front",), 0))
@@ -299,7 +299,7 @@ def test_results_of_another_version_are_refused_in_one_line(tmp_path, root, caps
 
 
 def test_an_evaluation_without_films_has_a_report(tmp_path, monkeypatch):
-    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
     evaluation(tmp_path, EXPERT, 1.5, np.random.default_rng(0))
     (tmp_path / "films.safetensors").unlink()
     assert "20/20" in report.write_report(tmp_path).read_text()
@@ -373,7 +373,7 @@ def test_a_shifted_policy_is_no_cell_of_the_tables(text, groups):
 
 
 def test_shifted_evaluations_alone_make_a_page(tmp_path, monkeypatch):
-    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
     generator = np.random.default_rng(0)
     for strength in (0.0, 0.5, 1.0):
         run = run_of("grasp", "random", ("front",), 0, shift=Shift("blur", strength))
@@ -406,7 +406,7 @@ def test_films_show_every_condition_and_stay_within_the_budget(text, groups, wri
     details = json.loads(text.split('id="details">')[1].split("</script>")[0])
     assert len(details) == len(groups)
     assert all(entry["films"] for entry, item in zip(details, groups, strict=True) if item.episodes)
-    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
     monkeypatch.setattr(filmstrips, "BUDGET", 100_000)
     reel = filmstrips.make_reel(groups)
     assert (
@@ -439,7 +439,7 @@ def test_details_tell_every_episode(text, groups):
 def test_failures_are_those_of_the_best_policy_of_each_task_once_a_kind(
     written, groups, monkeypatch
 ):
-    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
     reel, drawn = filmstrips.make_reel(groups), []
     monkeypatch.setattr(
         contact_sheet, "sheet", lambda rows, columns, title: drawn.append(rows) or Figure()
@@ -463,7 +463,7 @@ def test_failures_are_those_of_the_best_policy_of_each_task_once_a_kind(
 
 
 def test_page_and_tables_are_the_same_each_time(written, text, monkeypatch):
-    monkeypatch.setattr(contact_sheet, "stage", painted_stage)
+    monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
     before = {path.name: path.read_bytes() for path in (written / "tables").iterdir()}
     assert report.write_report(written).read_text() == text
     assert {path.name: path.read_bytes() for path in (written / "tables").iterdir()} == before
