@@ -38,7 +38,7 @@ class Env:
         """Steps for which the success has held: it comes after two."""
         return max(0, self.steps - 2)
 
-    def begin(self, phase: int) -> None:
+    def enter(self, phase: int) -> None:
         if phase != self.phase:
             self.begun.append(phase)
             self.phase, self.steps = phase, 0
