@@ -25,7 +25,7 @@ beside any neighbours. So:
   EfficientNet;
 * features are rounded to the values float16 can hold.
 
-BatchNorms are folded into the convolutions before them (`encoders.folding`).
+BatchNorms are folded into the convolutions before them (`encoders.fold_batchnorm`).
 """
 
 import functools
@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from encoders.card import EncoderCard, Plugin
-from encoders.folding import fold_batch_norms
+from encoders.fold_batchnorm import fold_batch_norms
 from encoders.state import load_exactly, read_tensors, read_torch
 from surgicai_vision.core.config import digest
 from surgicai_vision.core.errors import InputError, SurgicaiError, check_name

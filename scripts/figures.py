@@ -19,7 +19,7 @@ PACKAGES = ("surgicai_vision", "encoders", "policies", "lerobot_env_surgicai")
 OURS = {"surgicai_vision", "encoders", "policies"}
 WIDTH = 100
 GERUND = re.compile(r"ing\.py$")
-NOUNS = ("rendering.py", "training.py")
+NOUNS = ("rendering.py", "training.py", "hole_crossing.py")
 
 
 class Figure(NamedTuple):

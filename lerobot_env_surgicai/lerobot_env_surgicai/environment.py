@@ -24,7 +24,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from numpy.typing import NDArray
 
-from lerobot_env_surgicai.encoding import EncodeViews
+from lerobot_env_surgicai.encode_views import EncodeViews
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import check_camera
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig, to_mapping

@@ -89,7 +89,7 @@ class Options:
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Let a person drive and record, and print what was kept."""
     from surgicai_vision import envs
-    from surgicai_vision.teleoperation.input_mapping import InputMapping
+    from surgicai_vision.teleoperation.input_map import InputMapping
     from surgicai_vision.teleoperation.loop import EnvViews, run_session
     from surgicai_vision.teleoperation.pacer import Pacer
     from surgicai_vision.teleoperation.recordings import open_recordings

@@ -6,7 +6,7 @@
 The parts, each usable and tested alone:
 
 * `inputs`: what a person can command at one moment (`Input`: three translations, three rotations,
-  the jaw, fine or not, events) and the protocol `Device`. `input_mapping`: the env's action for it,
+  the jaw, fine or not, events) and the protocol `Device`. `input_map`: the env's action for it,
   in the axes of a camera or of the tool.
 * `keyboard`, `gamepad`: presses and releases, axes and buttons → `Input`. The key table that
   `--help`, the page and the documentation show is in `keyboard`. Keys are named as browsers name

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from surgicai_vision.core import names
 from surgicai_vision.demos.rollout import EpisodeRecorder
 from surgicai_vision.envs.base import SuturingEnv
-from surgicai_vision.teleoperation.input_mapping import InputMapping
+from surgicai_vision.teleoperation.input_map import InputMapping
 from surgicai_vision.teleoperation.inputs import DISCARD, JAW, KEEP, START, STOP, VIEW, Input
 from surgicai_vision.teleoperation.recordings import DEMONSTRATOR, Recordings
 

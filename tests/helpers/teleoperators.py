@@ -6,7 +6,7 @@ from fake_env import FakeEnv
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.teleoperation.gamepad import DEAD_ZONE, Gamepad
-from surgicai_vision.teleoperation.input_mapping import FINE
+from surgicai_vision.teleoperation.input_map import FINE
 from surgicai_vision.teleoperation.inputs import Input
 from surgicai_vision.teleoperation.keyboard import MOTIONS, Keyboard
 

@@ -10,7 +10,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.scene.cameras import extrinsics
 from surgicai_vision.teleoperation import gamepad, inputs
 from surgicai_vision.teleoperation.gamepad import Gamepad
-from surgicai_vision.teleoperation.input_mapping import InputMapping
+from surgicai_vision.teleoperation.input_map import InputMapping
 from surgicai_vision.teleoperation.inputs import JAW, KEEP, Input, merge
 from surgicai_vision.teleoperation.keyboard import CODES, PRESSES, TABLE, Keyboard, key_table
 

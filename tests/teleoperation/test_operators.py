@@ -10,7 +10,7 @@ from surgicai_vision import envs
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.dataset import check_dataset, open_dataset, render_demos
 from surgicai_vision.demos.store import list_demos, read_demo
-from surgicai_vision.teleoperation.input_mapping import InputMapping
+from surgicai_vision.teleoperation.input_map import InputMapping
 from surgicai_vision.teleoperation.inputs import DISCARD, KEEP, START
 from surgicai_vision.teleoperation.recordings import open_recordings
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, Rules, Session

@@ -21,7 +21,7 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.store import list_demos, read_demo
-from surgicai_vision.teleoperation.input_mapping import InputMapping
+from surgicai_vision.teleoperation.input_map import InputMapping
 from surgicai_vision.teleoperation.inputs import JAW, KEEP, START, Input
 from surgicai_vision.teleoperation.loop import run_session
 from surgicai_vision.teleoperation.pacer import Pacer

@@ -7,7 +7,7 @@ import torch
 import torchvision
 from torch import nn
 
-from encoders.folding import fold_batch_norms
+from encoders.fold_batchnorm import fold_batch_norms
 from surgicai_vision.features import encoders
 
 
