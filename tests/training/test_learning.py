@@ -236,7 +236,7 @@ def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(
         "1",
     )
     folder = run(capsys, *arguments)["checkpoint"]
-    assert folder == "outputs/train/insert-of-suture-tiny-back-paper+1epochs-seed0"
+    assert folder == "outputs/train/insert-of-suture-tiny-back-paper+epochs=1-seed0"
     checkpoint = read_checkpoint(Path(folder))
     assert checkpoint.task == TaskConfig("insert") and checkpoint.frames == 6
     assert "Did you mean 'insert'" in fails(capsys, "train", "--subtask", "inset")
