@@ -57,7 +57,8 @@ class SuturingEnv(gymnasium.Env):
         truncates: end episodes at `config.max_steps`; False where gymnasium's `TimeLimit` does.
     """
 
-    metadata: ClassVar[dict[str, object]] = {  # type: ignore[misc]  # gymnasium declares no ClassVar
+    # gymnasium declares no ClassVar
+    metadata: ClassVar[dict[str, object]] = {  # type: ignore[misc]
         "render_modes": ["rgb_array"],
         "render_fps": names.FPS,
     }

@@ -194,15 +194,30 @@ def state_vector_in_world(
     home = STARTS[arm].yaw - pi
     seen = np.empty(21, np.float32)
     _TWENTY_ONE(
-        seen, 0, px * 100.0, py * 100.0, pz * 100.0,
-        _roll(b2 * r1 + b5 * r4 + b8 * r7, b2 * r2 + b5 * r5 + b8 * r8), atan2(-cz, cos_pitch),
-        home + (atan2(cy, cx) - home) % (2 * pi), jaw,
-        (px + ex) * 100.0, (py + ey) * 100.0, (pz + ez) * 100.0,
-        _roll(x * r1 + y * r4 + z * r7, x * r2 + y * r5 + z * r8), atan2(-fz, goal_cos_pitch),
-        home + (atan2(fy, fx) - home) % (2 * pi), 0.0,
-        ex * 100.0, ey * 100.0, ez * 100.0,
-        b0 * vx + b3 * vy + b6 * vz, b1 * vx + b4 * vy + b7 * vz, b2 * vx + b5 * vy + b8 * vz, -jaw,
-    )  # fmt: skip
+        seen,
+        0,
+        px * 100.0,
+        py * 100.0,
+        pz * 100.0,
+        _roll(b2 * r1 + b5 * r4 + b8 * r7, b2 * r2 + b5 * r5 + b8 * r8),
+        atan2(-cz, cos_pitch),
+        home + (atan2(cy, cx) - home) % (2 * pi),
+        jaw,
+        (px + ex) * 100.0,
+        (py + ey) * 100.0,
+        (pz + ez) * 100.0,
+        _roll(x * r1 + y * r4 + z * r7, x * r2 + y * r5 + z * r8),
+        atan2(-fz, goal_cos_pitch),
+        home + (atan2(fy, fx) - home) % (2 * pi),
+        0.0,
+        ex * 100.0,
+        ey * 100.0,
+        ez * 100.0,
+        b0 * vx + b3 * vy + b6 * vz,
+        b1 * vx + b4 * vy + b7 * vz,
+        b2 * vx + b5 * vy + b8 * vz,
+        -jaw,
+    )
     return seen
 
 

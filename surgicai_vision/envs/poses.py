@@ -54,9 +54,19 @@ def shifted_along_z(pose: Pose, distance: float) -> Pose:
     """Return a pose shifted by `distance` [m] along its own z axis."""
     x, y, z, r0, r1, r2, r3, r4, r5, r6, r7, r8 = pose
     return (
-        x + distance * r2, y + distance * r5, z + distance * r8,
-        r0, r1, r2, r3, r4, r5, r6, r7, r8,
-    )  # fmt: skip
+        x + distance * r2,
+        y + distance * r5,
+        z + distance * r8,
+        r0,
+        r1,
+        r2,
+        r3,
+        r4,
+        r5,
+        r6,
+        r7,
+        r8,
+    )
 
 
 def transform(a: Pose, point: Vector) -> Vector:

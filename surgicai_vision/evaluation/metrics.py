@@ -20,8 +20,14 @@ KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
 ON_SUCCESSES = (("trajectory_length_mm", "trajectory_length_mm"), ("time_steps", "steps"))
 """Key of a summary → column it averages over the successes."""
 MEASURED = (
-    "d_trans_mm", "d_angle_deg", "entry_mm", "exit_mm", "slip_mm", "slip_deg", "tissue_force_n",
-)  # fmt: skip
+    "d_trans_mm",
+    "d_angle_deg",
+    "entry_mm",
+    "exit_mm",
+    "slip_mm",
+    "slip_deg",
+    "tissue_force_n",
+)
 """Columns a summary averages over all episodes where they were measured."""
 
 

@@ -214,8 +214,9 @@ def area_under_curve(strength: ArrayLike, success: ArrayLike) -> float:
 
 
 def area_interval(areas: Sequence[float], level: float = 0.95) -> tuple[float, float]:
-    """Return an interval of the mean of values in [0, 1]: each start's own area under its
-    successes.
+    """Return an interval of the mean of values in [0, 1].
+
+    Each start's own area under its successes.
 
     A value in [0, 1] varies at most as much as a success of the same mean, so that Clopper and
     Pearson's bounds of their sum (which need not be whole) out of their number are at least as wide

@@ -67,11 +67,19 @@ def learner_of(folder: Path, config: TaskConfig) -> Learner:
 @job(
     "drive-episode",
     stages=(
-        "scene", "envs", "demos", "dataset", "features", "training", "evaluation", "experiments",
-        "encoders", "policies",
+        "scene",
+        "envs",
+        "demos",
+        "dataset",
+        "features",
+        "training",
+        "evaluation",
+        "experiments",
+        "encoders",
+        "policies",
     ),
     packages=("mujoco", "numpy", "torch", "timm", "lerobot"),
-)  # fmt: skip
+)
 def record_driven(folder: Path, task: Mapping[str, JSON], learner: str, **how: Any) -> None:
     """Job "drive-episode": as "record-episode", with a learner that drives."""
     env, mixture = _driven(from_mapping(TaskConfig, task), learner)

@@ -221,11 +221,19 @@ def forward_flat(q: Joints, instrument: str = DEFAULT) -> Pose:
     depth = q3 + length.tool - length.rcc
     p2y = length.pitch_to_yaw
     return (
-        depth * zx + p2y * ux, depth * zy + p2y * uy, depth * zz + p2y * uz,
-        s5 * zx - c5 * fx, c6 * ex - s6 * ux, c6 * ux + s6 * ex,
-        s5 * zy - c5 * fy, c6 * ey - s6 * uy, c6 * uy + s6 * ey,
-        s5 * zz - c5 * fz, c6 * ez - s6 * uz, c6 * uz + s6 * ez,
-    )  # fmt: skip
+        depth * zx + p2y * ux,
+        depth * zy + p2y * uy,
+        depth * zz + p2y * uz,
+        s5 * zx - c5 * fx,
+        c6 * ex - s6 * ux,
+        c6 * ux + s6 * ex,
+        s5 * zy - c5 * fy,
+        c6 * ey - s6 * uy,
+        c6 * uy + s6 * ey,
+        s5 * zz - c5 * fz,
+        c6 * ez - s6 * uz,
+        c6 * uz + s6 * ez,
+    )
 
 
 def inverse_flat(pose: Pose, instrument: str = DEFAULT, near: Joints | None = None) -> Joints:

@@ -28,10 +28,16 @@ def rpy_to_matrix_flat(roll: float, pitch: float, yaw: float) -> Flat9:
     """Return Rz(yaw) Ry(pitch) Rx(roll) [rad]."""
     cr, sr, cp, sp, cy, sy = cos(roll), sin(roll), cos(pitch), sin(pitch), cos(yaw), sin(yaw)
     return (
-        cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr,
-        sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr,
-        -sp, cp * sr, cp * cr,
-    )  # fmt: skip
+        cy * cp,
+        cy * sp * sr - sy * cr,
+        cy * sp * cr + sy * sr,
+        sy * cp,
+        sy * sp * sr + cy * cr,
+        sy * sp * cr - cy * sr,
+        -sp,
+        cp * sr,
+        cp * cr,
+    )
 
 
 def matrix_to_rpy_flat(m: Sequence[float]) -> Vector:
@@ -112,10 +118,16 @@ def quaternion_to_matrix_flat(w: float, x: float, y: float, z: float) -> Flat9:
     s = 2.0 / (w * w + x * x + y * y + z * z)
     xs, ys, zs = x * s, y * s, z * s
     return (
-        1.0 - y * ys - z * zs, x * ys - w * zs, x * zs + w * ys,
-        x * ys + w * zs, 1.0 - x * xs - z * zs, y * zs - w * xs,
-        x * zs - w * ys, y * zs + w * xs, 1.0 - x * xs - y * ys,
-    )  # fmt: skip
+        1.0 - y * ys - z * zs,
+        x * ys - w * zs,
+        x * zs + w * ys,
+        x * ys + w * zs,
+        1.0 - x * xs - z * zs,
+        y * zs - w * xs,
+        x * zs - w * ys,
+        y * zs + w * xs,
+        1.0 - x * xs - y * ys,
+    )
 
 
 def multiply_flat(a: Sequence[float], b: Sequence[float]) -> Flat9:
@@ -123,10 +135,16 @@ def multiply_flat(a: Sequence[float], b: Sequence[float]) -> Flat9:
     a0, a1, a2, a3, a4, a5, a6, a7, a8 = a
     b0, b1, b2, b3, b4, b5, b6, b7, b8 = b
     return (
-        a0 * b0 + a1 * b3 + a2 * b6, a0 * b1 + a1 * b4 + a2 * b7, a0 * b2 + a1 * b5 + a2 * b8,
-        a3 * b0 + a4 * b3 + a5 * b6, a3 * b1 + a4 * b4 + a5 * b7, a3 * b2 + a4 * b5 + a5 * b8,
-        a6 * b0 + a7 * b3 + a8 * b6, a6 * b1 + a7 * b4 + a8 * b7, a6 * b2 + a7 * b5 + a8 * b8,
-    )  # fmt: skip
+        a0 * b0 + a1 * b3 + a2 * b6,
+        a0 * b1 + a1 * b4 + a2 * b7,
+        a0 * b2 + a1 * b5 + a2 * b8,
+        a3 * b0 + a4 * b3 + a5 * b6,
+        a3 * b1 + a4 * b4 + a5 * b7,
+        a3 * b2 + a4 * b5 + a5 * b8,
+        a6 * b0 + a7 * b3 + a8 * b6,
+        a6 * b1 + a7 * b4 + a8 * b7,
+        a6 * b2 + a7 * b5 + a8 * b8,
+    )
 
 
 def transpose_flat(a: Flat9) -> Flat9:

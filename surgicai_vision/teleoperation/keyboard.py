@@ -47,12 +47,24 @@ TABLE = (
 )
 """What the help, the page and the documentation show."""
 
-MOTIONS = MappingProxyType({
-    "KeyD": (0, 1.0), "KeyA": (0, -1.0), "KeyS": (1, 1.0), "KeyW": (1, -1.0),
-    "KeyE": (2, 1.0), "KeyQ": (2, -1.0), "KeyI": (3, 1.0), "KeyK": (3, -1.0),
-    "KeyL": (4, 1.0), "KeyJ": (4, -1.0), "KeyO": (5, 1.0), "KeyU": (5, -1.0),
-    "KeyX": (6, 1.0), "KeyZ": (6, -1.0),
-})  # fmt: skip
+MOTIONS = MappingProxyType(
+    {
+        "KeyD": (0, 1.0),
+        "KeyA": (0, -1.0),
+        "KeyS": (1, 1.0),
+        "KeyW": (1, -1.0),
+        "KeyE": (2, 1.0),
+        "KeyQ": (2, -1.0),
+        "KeyI": (3, 1.0),
+        "KeyK": (3, -1.0),
+        "KeyL": (4, 1.0),
+        "KeyJ": (4, -1.0),
+        "KeyO": (5, 1.0),
+        "KeyU": (5, -1.0),
+        "KeyX": (6, 1.0),
+        "KeyZ": (6, -1.0),
+    }
+)
 """Key → its place in (move, turn, jaw) and its sign."""
 FINE_KEYS = ("ShiftLeft", "ShiftRight")
 PRESSES = MappingProxyType(

@@ -334,8 +334,10 @@ def test_transforms_and_whole_numbers_are_read_as_well(tmp_path):
     times, labels = found["label"]
     found["label"] = times, [names.SUBTASKS.index(label) for label in labels]
     types = {**TYPES, "pose": "geometry_msgs/msg/TransformStamped", "label": "std_msgs/msg/Int32"}
-    plain, other = (write_bag(tmp_path / name, "mcap", *rest) for name, *rest in (
-        ("plain", streams(motion)), ("other", found, TOPICS, types)))  # fmt: skip
+    plain, other = (
+        write_bag(tmp_path / name, "mcap", *rest)
+        for name, *rest in (("plain", streams(motion)), ("other", found, TOPICS, types))
+    )
     one, two = recorded(plain), recorded(other)
     np.testing.assert_array_equal(one.arms["psm1"].tip, two.arms["psm1"].tip)
     assert segments.segments(one, PAIR, WHOLE, None) == segments.segments(two, PAIR, WHOLE, None)

@@ -22,8 +22,10 @@ from surgicai_vision.features.encoders import (
 
 def table_of(network: torch.nn.Module, prefix: str = "") -> dict[str, torch.Tensor]:
     """The network's state, small on disk."""
-    return {prefix + name: value.half() if value.is_floating_point() else value
-            for name, value in network.state_dict().items()}  # fmt: skip
+    return {
+        prefix + name: value.half() if value.is_floating_point() else value
+        for name, value in network.state_dict().items()
+    }
 
 
 def saved(path: Path, content: object) -> Path:

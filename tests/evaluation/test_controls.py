@@ -46,9 +46,12 @@ def test_replay_of_one_demonstration_repeats_it_where_it_was_recorded(
         _, _, terminated, truncated, _ = env.step(actions[-1])
         ended = terminated or truncated
     dataset = SimpleNamespace(
-        columns=lambda: {names.ACTION: np.stack(actions)}, episode_index=np.zeros(len(actions), np.int64),
-        config=config, fingerprint="one", fps=names.FPS,
-    )  # fmt: skip
+        columns=lambda: {names.ACTION: np.stack(actions)},
+        episode_index=np.zeros(len(actions), np.int64),
+        config=config,
+        fingerprint="one",
+        fps=names.FPS,
+    )
     monkeypatch.chdir(str(tmp_path))
     monkeypatch.setattr(folders, "open_dataset", lambda *_: dataset)
     assert main(["evaluate", "replay", "--episodes", "1", "--json"]) == 0

@@ -1,5 +1,6 @@
-"""Evaluation: rows do not depend on batch or workers; errors are failures; the summary has its
-keys.
+"""Evaluation: rows do not depend on batch or workers.
+
+Errors are failures; the summary has its keys.
 """
 
 import json
@@ -198,7 +199,10 @@ def test_seeds_are_checked(seeds):
 
 def test_summary_has_the_promised_keys(fake_envs):
     result = summary(rows_of(evaluate(ZeroAgent, SHORT, [3, 5, 40], workers=1)))
-    promised = "task policy episodes successes success_rate ci95 trajectory_length_mm time_steps grasp errors"
+    promised = (
+        "task policy episodes successes success_rate ci95 trajectory_length_mm time_steps grasp"
+        " errors"
+    )
     assert set(promised.split()) <= set(result)
     assert result["successes"] == 2
     assert result["time_steps"]["mean"] == 4.0
@@ -238,17 +242,31 @@ def test_each_subtask_counts_with_all_before_it():
     rows = [row_with_stages(seed, stages) for seed, stages in enumerate((0, 2, 2, 5))]
     subtasks = summary(rows)["subtasks"]
     assert [(stage["subtask"], stage["k"]) for stage in subtasks] == [
-        ("grasp", 3), ("place", 3), ("insert", 1), ("handoff", 1), ("pullout", 1),
-    ]  # fmt: skip
+        ("grasp", 3),
+        ("place", 3),
+        ("insert", 1),
+        ("handoff", 1),
+        ("pullout", 1),
+    ]
     assert (subtasks[0]["low"], subtasks[0]["high"]) == clopper_pearson(3, 4)
 
 
 def row_with_stages(seed, stages):
     return EpisodeMetrics(
-        task="suture", policy="x", seed=seed, success=stages == 5, steps=9, trajectory_length_mm=1.0, d_trans_mm=1.0,
-        d_angle_deg=1.0, contact=True, error="", grasp="friction", failure="" if stages == 5 else "time",
+        task="suture",
+        policy="x",
+        seed=seed,
+        success=stages == 5,
+        steps=9,
+        trajectory_length_mm=1.0,
+        d_trans_mm=1.0,
+        d_angle_deg=1.0,
+        contact=True,
+        error="",
+        grasp="friction",
+        failure="" if stages == 5 else "time",
         stages=stages,
-    )  # fmt: skip
+    )
 
 
 def test_real_env_gives_the_same_rows_for_any_batch_and_workers():

@@ -28,7 +28,7 @@ EXPERTS = dict.fromkeys(names.SUBTASKS, "expert")
 
 
 class Env:
-    """Counts what a hierarchical policy asks of it; the present subtask succeeds after `length` steps."""
+    """Counts what a hierarchical policy asks of it; a subtask succeeds after `length` steps."""
 
     def __init__(self, length: int = 3):
         self.length, self.phase, self.steps, self.begun = length, 0, 0, []
@@ -66,9 +66,7 @@ class Constant(Agent):
 
 
 def agent(classes: list[int], **changes: object) -> HierarchicalAgent:
-    """Return a policy whose high-level policy says `classes` one after another, and whose policies
-    say their index.
-    """
+    """Return a policy whose high level says `classes` in turn and whose low level its index."""
     made = HierarchicalAgent(
         HierarchicalConfig("order", **{**EXPERTS, **changes}), [ExpertAgent] * 5
     )

@@ -30,10 +30,15 @@ CHECKPOINT = "checkpoints/last/pretrained_model"
 TINY = {
     "act": ["dim_model=64", "dim_feedforward=128", "n_heads=4", "chunk_size=4", "n_action_steps=2"],
     "diffusion": [
-        "down_dims=[32,64]", "diffusion_step_embed_dim=16", "num_inference_steps=2", "horizon=8",
-        "n_action_steps=2", "drop_n_last_frames=3", "use_group_norm=true",
+        "down_dims=[32,64]",
+        "diffusion_step_embed_dim=16",
+        "num_inference_steps=2",
+        "horizon=8",
+        "n_action_steps=2",
+        "drop_n_last_frames=3",
+        "use_group_norm=true",
     ],
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -72,12 +77,22 @@ def command(monkeypatch: pytest.MonkeyPatch, folder: Path):
 
 def training(dataset: Path, out: Path, policy: str, *more: str) -> list[str]:
     return [
-        "--dataset.repo_id=local/toy", f"--dataset.root={dataset}", f"--policy.type={policy}",
-        "--policy.device=cpu", "--policy.push_to_hub=false", "--batch_size=2", "--steps=2",
-        "--num_workers=0", "--log_freq=1", f"--output_dir={out}", "--env.type=surgicai",
+        "--dataset.repo_id=local/toy",
+        f"--dataset.root={dataset}",
+        f"--policy.type={policy}",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--batch_size=2",
+        "--steps=2",
+        "--num_workers=0",
+        "--log_freq=1",
+        f"--output_dir={out}",
+        "--env.type=surgicai",
         f"--env.dataset={dataset}",
-        f"--env.max_steps={STEPS}", "--env_eval_freq=0", *more,
-    ]  # fmt: skip
+        f"--env.max_steps={STEPS}",
+        "--env_eval_freq=0",
+        *more,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -424,11 +439,19 @@ def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(
     from surgicai_vision.evaluation.rollout import evaluate
 
     command(
-        "lerobot_eval", f"--policy.path={trained / CHECKPOINT}", "--env.type=surgicai",
-        f"--env.dataset={dataset}", f"--env.max_steps={STEPS}", "--env.reward=dense",
-        "--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false",
-        "--policy.device=cpu", f"--output_dir={trained / 'eval'}", "--seed=1000",
-    )  # fmt: skip
+        "lerobot_eval",
+        f"--policy.path={trained / CHECKPOINT}",
+        "--env.type=surgicai",
+        f"--env.dataset={dataset}",
+        f"--env.max_steps={STEPS}",
+        "--env.reward=dense",
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=false",
+        "--policy.device=cpu",
+        f"--output_dir={trained / 'eval'}",
+        "--seed=1000",
+    )
     metrics = json.loads((trained / "eval" / "eval_info.json").read_text())["per_task"][0][
         "metrics"
     ]
@@ -581,9 +604,13 @@ def test_lerobot_edits_our_dataset(dataset: Path, folder: Path, tmp_path: Path, 
     edit = "lerobot_edit_dataset"
     command(edit, *given, "--operation.type=info", "--operation.show_features=true")
     command(
-        edit, *given, "--new_repo_id=local/less", f"--new_root={tmp_path / 'less'}",
-        "--operation.type=delete_episodes", "--operation.episode_indices=[1]",
-    )  # fmt: skip
+        edit,
+        *given,
+        "--new_repo_id=local/less",
+        f"--new_root={tmp_path / 'less'}",
+        "--operation.type=delete_episodes",
+        "--operation.episode_indices=[1]",
+    )
     splits = '{"train": 0.5, "val": 0.5}'
     command(
         edit,
@@ -593,10 +620,13 @@ def test_lerobot_edits_our_dataset(dataset: Path, folder: Path, tmp_path: Path, 
         f"--operation.splits={splits}",
     )
     command(
-        edit, "--new_repo_id=local/whole", f"--new_root={tmp_path / 'whole'}",
-        "--operation.type=merge", "--operation.repo_ids=['local/toy_train','local/toy_val']",
+        edit,
+        "--new_repo_id=local/whole",
+        f"--new_root={tmp_path / 'whole'}",
+        "--operation.type=merge",
+        "--operation.repo_ids=['local/toy_train','local/toy_val']",
         f"--operation.roots=['{tmp_path / 'train'}','{tmp_path / 'val'}']",
-    )  # fmt: skip
+    )
     infos = {
         path.name: json.loads((path / "meta/info.json").read_text()) for path in tmp_path.iterdir()
     }

@@ -1,6 +1,4 @@
-"""Robustness: strength 0 is the plain evaluation, strengths are paired, each axis changes what it
-says and no more.
-"""
+"""Robustness: strength 0 is plain, strengths are paired, an axis changes what it says alone."""
 
 import json
 from contextlib import contextmanager
@@ -253,9 +251,13 @@ def test_curves_count_compare_and_are_stored(tmp_path, pretend):
         seeing_spec(), seeds, tmp_path, silent, ("light", "blur"), (0.0, 0.5, 1.0)
     )
     assert [(row["axis"], row["strength"], row["k"], row["n"]) for row in rows] == [
-        ("light", 0.0, 5, 5), ("light", 0.5, 3, 5), ("light", 1.0, 1, 5),
-        ("blur", 0.0, 5, 5), ("blur", 0.5, 3, 5), ("blur", 1.0, 1, 5),
-    ]  # fmt: skip
+        ("light", 0.0, 5, 5),
+        ("light", 0.5, 3, 5),
+        ("light", 1.0, 1, 5),
+        ("blur", 0.0, 5, 5),
+        ("blur", 0.5, 3, 5),
+        ("blur", 1.0, 1, 5),
+    ]
     assert (rows[1]["low"], rows[1]["high"]) == clopper_pearson(3, 5)
     assert rows[0]["auc"] == pytest.approx(0.6) and rows[0]["auc_low"] < 0.6 < rows[0]["auc_high"]
     p = mcnemar([True] * 5, [False] * 4 + [True])

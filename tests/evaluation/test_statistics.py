@@ -1,5 +1,6 @@
-"""Intervals and tests against SciPy's own and other formulas, on random tables; nominal coverage,
-simulated.
+"""Intervals and tests against SciPy's own and other formulas, on random tables.
+
+Nominal coverage, simulated.
 """
 
 import itertools
@@ -134,8 +135,9 @@ def test_bootstrap_of_one_seed_is_the_exact_interval():
 
 
 def korn_graubard(groups):
-    """The interval of success counts with the bootstrap's error in closed form: infinitely many
-    resamples.
+    """The interval of success counts with the bootstrap's error in closed form.
+
+    Infinitely many resamples.
     """
     p, seeds = np.mean([np.mean(g) for g in groups]), len(groups)
     rates, sizes = np.array([np.mean(g) for g in groups]), np.array([len(g) for g in groups])

@@ -1,6 +1,4 @@
-"""DAgger: a learner drives, the expert labels, and the same seed gives the same episodes whatever
-the workers.
-"""
+"""DAgger: a learner drives, the expert labels, and the seed decides whatever the workers."""
 
 import json
 from pathlib import Path
@@ -60,8 +58,8 @@ def test_the_learner_drives_until_the_expert_takes_over():
     assert 0 < handed < 40 and wrong[:handed].all(), "first the learner, then the expert to the end"
     np.testing.assert_array_equal(driven.executed[handed:], driven.action[handed:])
     assert driven.success[-1] and len(driven.action) > len(plain.action)
-    lengths = {int((rollout(env, FakeExpert(env), seed, behaviour=mixture).demo.executed == -1.0).all(axis=1).sum())
-               for seed in range(8)}  # fmt: skip
+    demos = [rollout(env, FakeExpert(env), seed, behaviour=mixture).demo for seed in range(8)]
+    lengths = {int((demo.executed == -1.0).all(axis=1).sum()) for demo in demos}
     assert len(lengths) > 4, "each episode draws its own step"
 
 

@@ -275,9 +275,14 @@ def test_a_grid_is_read_with_single_values(tmp_path):
         (3, 10, ("front", "back")),
     ]
     assert grid.recorded == 10
-    for line, error in (("policy: act2", UnknownName), ("hierarchical: [sometimes]", UnknownName), ("steps: 0", InputError),
-                        ("source: dmp", UnknownName), ("noise: 2", InputError),
-                        ("post_success_steps: -1", InputError)):  # fmt: skip
+    for line, error in (
+        ("policy: act2", UnknownName),
+        ("hierarchical: [sometimes]", UnknownName),
+        ("steps: 0", InputError),
+        ("source: dmp", UnknownName),
+        ("noise: 2", InputError),
+        ("post_success_steps: -1", InputError),
+    ):
         path.write_text(f"task: grasp\nencoder: random\nview: [front]\n{line}\n")
         with pytest.raises(error):
             read_grid(path)
@@ -339,8 +344,9 @@ def test_a_sweep_of_another_version_is_refused(tmp_path):
 def test_keys_count_every_module_that_can_change_a_run():
     """What a worker imports for a run is counted in its key, or named here as harmless."""
     code = (
-        "import sys, surgicai_vision.experiments.sweep.jobs, surgicai_vision.demos.record; "
-        "print(*{name.split('.')[1] for name in sys.modules if name.startswith('surgicai_vision.')})"
+        "import sys, surgicai_vision.experiments.sweep.jobs, surgicai_vision.demos.record;"
+        " print(*{name.split('.')[1] for name in sys.modules if"
+        " name.startswith('surgicai_vision.')})"
     )
     said = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True

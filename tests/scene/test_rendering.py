@@ -78,8 +78,13 @@ def test_depth_of_a_plane_and_of_nothing(renderer, data):
 
 def test_segmentation_names_every_part(renderer, model, data):
     assert [PARTS[part] for part in parts_of_geoms(model)] == [
-        "background", "phantom", "needle", "thread", "psm1", "psm2",
-    ]  # fmt: skip
+        "background",
+        "phantom",
+        "needle",
+        "thread",
+        "psm1",
+        "psm2",
+    ]
     parts = renderer.render(data, "front", "segmentation")
     assert set(np.unique(parts)) == set(range(len(PARTS)))
 

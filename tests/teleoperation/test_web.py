@@ -339,9 +339,14 @@ def test_the_command_records_stops_and_sums_up(tmp_path):
     summary = json.loads(out.splitlines()[-1])
     demo = read_demo(list_demos(tmp_path / "demos")[0])
     assert summary == {
-        "task": "grasp", "kept": 1, "discarded": 0, "skipped": 0, "steps": len(demo), "episodes": 1,
+        "task": "grasp",
+        "kept": 1,
+        "discarded": 0,
+        "skipped": 0,
+        "steps": len(demo),
+        "episodes": 1,
         "demos": str(tmp_path / "demos"),
-    }  # fmt: skip
+    }
     assert demo.config.max_steps == 3000
     assert "Kept as episode 0" in error
 

@@ -45,10 +45,27 @@ MAX_WRITTEN = 2**30
 """Limit of the child's one file [byte]."""
 
 REFUSED = (
-    "socket.", "subprocess.", "os.system", "os.exec", "os.fork", "os.posix_spawn", "os.spawn",
-    "ctypes.", "pty.", "os.chmod", "os.kill", "os.link", "os.mkdir", "os.remove", "os.rename",
-    "os.rmdir", "os.symlink", "os.truncate", "shutil.", "tempfile.",
-)  # fmt: skip
+    "socket.",
+    "subprocess.",
+    "os.system",
+    "os.exec",
+    "os.fork",
+    "os.posix_spawn",
+    "os.spawn",
+    "ctypes.",
+    "pty.",
+    "os.chmod",
+    "os.kill",
+    "os.link",
+    "os.mkdir",
+    "os.remove",
+    "os.rename",
+    "os.rmdir",
+    "os.symlink",
+    "os.truncate",
+    "shutil.",
+    "tempfile.",
+)
 """Prefixes of the audit events that end the child."""
 
 

@@ -20,11 +20,21 @@ from surgicai_vision.demos.imports.rosbag.config import printable
 
 PRIMITIVES: Mapping[str, str] = MappingProxyType(
     {
-        "bool": "B", "byte": "b", "char": "B", "int8": "b", "uint8": "B", "int16": "h",
-        "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f",
+        "bool": "B",
+        "byte": "b",
+        "char": "B",
+        "int8": "b",
+        "uint8": "B",
+        "int16": "h",
+        "uint16": "H",
+        "int32": "i",
+        "uint32": "I",
+        "int64": "q",
+        "uint64": "Q",
+        "float32": "f",
         "float64": "d",
     }
-)  # fmt: skip
+)
 """ROS type → `struct` code."""
 STRING = "string"
 
