@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
@@ -11,6 +11,9 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import LIST
 from surgicai_vision.core.errors import InputError
+
+if TYPE_CHECKING:
+    from surgicai_vision.features.cache import Manifest
 
 app = App(name="cache", help_epilogue="example:\n  surgicai-vision cache list")
 ACTIONS = ("list", "size", "prune")
@@ -70,7 +73,7 @@ def _mb(size: int) -> str:
     return f"{size / 1e6:.1f} MB"
 
 
-def _text(manifest: Mapping[str, Any] | None) -> str:
+def _text(manifest: "Manifest | None") -> str:
     if manifest is None:
         return "unfinished"
     shape = " × ".join(map(str, (manifest["length"], *manifest["shape"])))
@@ -78,6 +81,7 @@ def _text(manifest: Mapping[str, Any] | None) -> str:
     return ", ".join((manifest["encoder"], manifest["view"], manifest["pool"], shape, dataset))
 
 
-def _row(folder: Path, size: int, manifest: Mapping[str, Any] | None) -> dict[str, object]:
+def _row(folder: Path, size: int, manifest: "Manifest | None") -> dict[str, object]:
     keys = ("dataset", "view", "encoder", "pool", "length", "dim")
-    return {"key": folder.name, "bytes": size, **{key: (manifest or {}).get(key) for key in keys}}
+    known: Mapping[str, object] = manifest or {}
+    return {"key": folder.name, "bytes": size, **{key: known.get(key) for key in keys}}

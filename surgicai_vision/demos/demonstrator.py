@@ -10,7 +10,7 @@ acts in its place for a while; the labels stay the demonstrator's.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from surgicai_vision.core.errors import check_name
 from surgicai_vision.core.plugins import resolve
 
 if TYPE_CHECKING:
-    from surgicai_vision.envs.base import SuturingEnv
+    from surgicai_vision.envs.base import Observation, SuturingEnv
 
 
 class Demonstrator(ABC):
@@ -43,7 +43,7 @@ class BehaviourPolicy(ABC):
         """Start an episode: `env` has been reset."""
 
     @abstractmethod
-    def action(self, env: "SuturingEnv", observation: Any) -> NDArray[np.float32] | None:
+    def action(self, env: "SuturingEnv", observation: "Observation") -> NDArray[np.float32] | None:
         """Return the action that is executed, (7,), or None once the demonstrator acts itself."""
 
 

@@ -211,7 +211,9 @@ def rollout(
     succeeded = False
     while not ended:
         label = np.asarray(demonstrator.action(), dtype=np.float32)
-        executed = behaviour.action(env, observation) if behaviour else None
+        executed = None
+        if behaviour and observation is not None:
+            executed = behaviour.action(env, observation)
         if executed is None:
             executed = disturbance.disturb(label, deviation, rng) if deviation else label
         recorder.step(executed, label)

@@ -2,13 +2,14 @@
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from surgicai_vision.envs import base
+    from surgicai_vision.scene.rendering import Frame
 
 type Env = base.SuturingEnv
 type Observation = base.Observation
@@ -18,11 +19,10 @@ type FeatureTable = dict[tuple[str, tuple[str, ...]], dict[int, NDArray[np.float
 """(encoder's fingerprint, views) → id of an observation → its features."""
 
 
-def frame_of(observation: Observation, key: str) -> NDArray[Any]:
+def frame_of(observation: Observation, key: str) -> "Frame":
     """Return a camera's frame (height, width, channels) by its key, such as "front_depth"."""
     assert isinstance(observation, Mapping), "the env of an agent with cameras shows images"
-    frame: NDArray[Any] = observation[key]
-    return frame
+    return observation[key]
 
 
 class Agent(abc.ABC):

@@ -250,8 +250,9 @@ class PolicyAgent(Agent):
 
 def _image(observation: Observation, view: str) -> NDArray[np.uint8]:
     """Return what a policy sees of a view, (height, width, 3)."""
+    frame = frame_of(observation, view)
     if names.is_depth_view(view):
         from surgicai_vision.dataset.codecs import grey
 
-        return grey(frame_of(observation, view))
-    return frame_of(observation, view)
+        return grey(frame.astype(np.float32, copy=False))
+    return frame.astype(np.uint8, copy=False)

@@ -18,10 +18,10 @@ import copy
 import dataclasses
 import itertools
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, Protocol, final
 
 import numpy as np
 
@@ -35,11 +35,37 @@ from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_enco
 from surgicai_vision.training.run_config import OWN
 from surgicai_vision.training.threads import one_thread
 
+if TYPE_CHECKING:
+    import torch
+
+    from encoders.base import Encoder
+
 CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
 PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")
 """Where a checkpoint lies in a folder the user names."""
 ENV_TYPE = "surgicai"
 VISUAL = "VISUAL"
+
+
+class LeRobotPolicy(Protocol):
+    """The part of LeRobot's `PreTrainedPolicy` that acting uses."""
+
+    def parameters(self) -> "Iterator[torch.Tensor]":
+        """Yield the trained tensors."""
+
+    def buffers(self) -> "Iterator[torch.Tensor]":
+        """Yield the other tensors of its state."""
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+
+    def select_action(self, batch: Mapping[str, object]) -> "torch.Tensor":
+        """Return the actions (n, 7) of a batch of observations."""
+
+
+type Before = Callable[[Mapping[str, object]], Mapping[str, object]]
+type After = "Callable[[torch.Tensor], torch.Tensor]"
+"""LeRobot's processing around a policy: of the observations, and of the actions."""
 
 
 def find(folder: Path) -> Path | None:
@@ -205,7 +231,7 @@ class LeRobotAgent(Agent):
         self._encoder = _encoder(inputs, weights) if inputs.encoder else None
         device = str(next(self._policy.parameters()).device)
         self._devices = ("cpu",) if device == "cpu" else ("cpu", device)
-        self._slots: dict[int, tuple[Any, dict[str, Any]]] = {}
+        self._slots: dict[int, tuple[LeRobotPolicy, dict[str, torch.Tensor]]] = {}
 
     def reset(self, slot: int, env: Env, seed: int) -> None:
         """Give the slot a policy that remembers nothing, and the random numbers of its seed."""
@@ -246,14 +272,14 @@ class LeRobotAgent(Agent):
             return np.concatenate(actions)
 
     def _act(
-        self, policy: Any, envs: Sequence[Env], observations: Sequence[Observation]
+        self, policy: LeRobotPolicy, envs: Sequence[Env], observations: Sequence[Observation]
     ) -> Actions:
         """Ask one policy for the actions of a batch, through LeRobot's pipeline."""
         import torch
         from lerobot.envs.utils import preprocess_observation
 
         # Asked of the env: another arm may have become active since it was observed.
-        raw: dict[str, Any] = {"agent_pos": np.stack([env.agent_pos() for env in envs])}
+        raw: dict[str, object] = {"agent_pos": np.stack([env.agent_pos() for env in envs])}
         if self._encoder is None:
             raw["pixels"] = {
                 view: np.stack([frame_of(o, view) for o in observations]) for view in self.cameras
@@ -272,14 +298,14 @@ class LeRobotAgent(Agent):
         return np.asarray(action.to("cpu", torch.float32).numpy(), np.float32)
 
 
-def _random(device: str) -> Any:
+def _random(device: str) -> "torch.Tensor":
     """Return the state of a device's random numbers."""
     import torch
 
     return torch.get_rng_state() if device == "cpu" else torch.cuda.get_rng_state(device)
 
 
-def _set_random(device: str, state: Any) -> None:
+def _set_random(device: str, state: "torch.Tensor") -> None:
     """Put a device's random numbers into a state."""
     import torch
 
@@ -289,7 +315,7 @@ def _set_random(device: str, state: Any) -> None:
         torch.cuda.set_rng_state(state, device)
 
 
-def _load(folder: Path, weights: WeightsSource) -> tuple[Any, Any, Any]:
+def _load(folder: Path, weights: WeightsSource) -> tuple[LeRobotPolicy, Before, After]:
     """Return policy, pre- and post-processor.
 
     Plug-ins are found as LeRobot's own commands find them.
@@ -324,7 +350,7 @@ def _load(folder: Path, weights: WeightsSource) -> tuple[Any, Any, Any]:
     return policy.eval(), before, after
 
 
-def _encoder(inputs: Inputs, weights: WeightsSource) -> Any:
+def _encoder(inputs: Inputs, weights: WeightsSource) -> "Encoder":
     """Load the encoder whose features the policy sees, verified."""
     encoder = load_encoder(str(inputs.encoder), weights=weights)
     if inputs.sha256 and encoder.weights_sha256 != inputs.sha256:

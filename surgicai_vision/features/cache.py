@@ -25,14 +25,14 @@ from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from filelock import Timeout
 from numpy.typing import NDArray
 
 from surgicai_vision import __version__
-from surgicai_vision.core.config import digest, to_mapping
+from surgicai_vision.core.config import JSON, digest, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, UnknownName
 from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, locked, read_json, write_json
 
@@ -58,7 +58,7 @@ class Manifest(TypedDict):
     dataset: str
     view: str
     encoder: str
-    card: dict[str, Any]
+    card: dict[str, JSON]
     encoder_fingerprint: str
     weights_sha256: str
     pool: str

@@ -195,7 +195,7 @@ def _once(results: Sequence[Result]) -> list[Result]:
     return [result for result in results if result.trained or result in kept]
 
 
-def _outcomes(result: Result) -> set[tuple[Any, ...]]:
+def _outcomes(result: Result) -> set[tuple[int, bool, int]]:
     return {(row["seed"], row["success"], row["steps"]) for row in result.rows}
 
 

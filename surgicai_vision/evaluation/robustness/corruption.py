@@ -152,7 +152,7 @@ class CorruptedAgent(Agent):
     def _seen(self, slot: int, observation: Observation) -> Observation:
         changed = {}
         for view in self.cameras:
-            image = frame_of(observation, view)
+            image = frame_of(observation, view).astype(np.uint8, copy=False)
             moment = Moment(self._seeds[slot], self._steps[slot], camera_number(view))
             changed[view] = self._change(image, self._strength, moment)
         return {**observation, **changed} if isinstance(observation, dict) else observation
