@@ -332,7 +332,7 @@ def test_shipped_quickstart_is_the_default():
 def test_shipped_sweeps_list_their_cells(path, capsys):
     assert main(["sweep", str(path), "--dry-run", "--json"]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert result["cells"] > 0
+    assert result["runs"] > 0
 
 
 def test_a_wrong_grid_is_refused(tmp_path, capsys):
@@ -351,15 +351,15 @@ def test_cells_without_weights_are_listed_as_not_run(tmp_path, capsys):
     assert main(["sweep", str(path), "--dry-run", "--json"]) == 0
     out = capsys.readouterr().out
     result = json.loads(out.splitlines()[-1])
-    assert (result["cells"], result["not_run"], result["to_do"]) == (4, 2, 2)
+    assert (result["runs"], result["not_run"], result["to_do"]) == (4, 2, 2)
     assert "pytorch_model.bin" in out
 
 
 def test_interruption_says_how_to_continue(monkeypatch, capsys):
-    def interrupted(options):
+    def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(evaluate, "subject_of", interrupted)
+    monkeypatch.setattr(evaluate, "open_given", interrupted)
     assert main(["evaluate", "zero"]) == 1
     assert INTERRUPTED in capsys.readouterr().err
 
