@@ -3,14 +3,12 @@
     python benchmarks/coverage.py
     python benchmarks/coverage.py --repeats 500
 
-clopper_pearson  exact, not sampled: the chance over all k of n, at rates from 0.01 to 0.99.
-bootstrap        3, 5 and 10 training seeds of 20 episodes. Each seed has its own success rate,
-drawn from the Beta
-                 distribution of mean p and correlation r of two episodes of one seed (r = 0.2: the
-                 seeds' rates scatter by 0.22 at p = 0.5, by 0.1 at 0.95), and its episodes are
-                 Bernoulli draws.
-lengths          the same for trajectory lengths: normal seeds, log-normal episodes.
-area             20 starts, five strengths: each start fails from a strength on that is its own.
+* clopper_pearson: exact, not sampled: the chance over all k of n, at rates from 0.01 to 0.99.
+* bootstrap: 3, 5 and 10 training seeds of 20 episodes. Each seed has its own success rate, drawn
+  from the Beta distribution of mean p and correlation r of two episodes of one seed (r = 0.2: the
+  seeds' rates scatter by 0.22 at p = 0.5, by 0.1 at 0.95), and its episodes are Bernoulli draws.
+* lengths: the same for trajectory lengths: normal seeds, log-normal episodes.
+* area: 20 starts, five strengths: each start fails from a strength on that is its own.
 
 Beside `bootstrap` stands `percentile`, the plain hierarchical bootstrap of 5 seeds, to show what it
 would have covered. `worst` is the smallest coverage of a table, `held` whether none is below 95 %

@@ -9,10 +9,12 @@ is a frame), and rendered by `render-demos`, two views with depth. Then, in this
 environment of its own steps through each demonstration's executed actions from its seed, and what
 it sees live after each step is compared with the dataset's frame of that step, bit by bit: colours
 and depth. A frame is
- dropped     where the dataset has none for a step,
- black       where no pixel is above 8 of 255, or all are equal,
- misaligned  where it is not the live image of its step; `shifted` says how many equal the step
- before or after.
+
+* dropped where the dataset has none for a step,
+* black where no pixel is above 8 of 255, or all are equal,
+* misaligned where it is not the live image of its step; `shifted` says how many equal the step
+  before or after.
+
 Prints one JSON object last; exits with 1 unless all are 0.
 """
 

@@ -5,30 +5,32 @@ Physics, images, resets and workers, each against the bare thing at equal settin
     python benchmarks/speed.py
     python benchmarks/speed.py --only step --repeats 40
 
-step     `env.step` (obs_type state) along an expert's whole procedure, against a loop of
-`mj_step(…, nstep)` over the
-         same model, states and commands; both must end in the same positions. Without thread and
-         with 10 segments.
-frames   `FrameRenderer.render` against `mujoco.Renderer` with shadows, multisampling and triangles
-set alike, on the
-         same states; both must give the same pixels. One core: llvmpipe draws in the calling
-         thread.
-reset    per task [ms].
-workers  two worker processes against one, steps of all envs a second: gymnasium's asynchronous
-vector env (`async_…`:
-         an env a worker) and ours (`shares_…`: `--share` envs a worker), with state and with
-         images.
+* step: `env.step` (obs_type state) along an expert's whole procedure, against a loop of
+  `mj_step(…, nstep)` over the same model, states and commands. Both must end in the same positions.
+  Without thread and with 10 segments.
+* frames: `FrameRenderer.render` against `mujoco.Renderer` with shadows, multisampling and triangles
+  set alike, on the same states. Both must give the same pixels. One core: llvmpipe draws in the
+  calling thread.
+* reset: per task [ms].
+* workers: two worker processes against one, steps of all envs a second: gymnasium's asynchronous
+  vector env (`async_…`, an env a worker) and ours (`shares_…`, `--share` envs a worker), with state
+  and with images.
+* help: `--help` as a whole process [s].
 
 A and B take turns; figures are medians over the turns, and ratios are medians of the turns' ratios.
 `--clock cpu` counts the process's own CPU time instead of the wall's, for a machine that others use
-too; workers are timed by the wall in any case.
+too; workers and help are timed by the wall in any case.
 """
 
 import argparse
 import copy
+import functools
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -265,9 +267,19 @@ def _vector(workers: int, share: int, chosen: dict[str, Any]) -> gymnasium.vecto
     return gymnasium.make_vec(task, workers, "async", vector_kwargs={"context": "spawn"}, **chosen)
 
 
+def measure_help(repeats: int) -> dict[str, float]:
+    """Return the wall time of `--help` as a whole process [s], the median of `repeats`."""
+    program = str(Path(sys.executable).with_name("surgicai-vision"))
+    found = {}
+    for arguments in (["--help"], ["train", "--help"]):
+        call = functools.partial(subprocess.run, [program, *arguments], capture_output=True)
+        found[" ".join(arguments)] = median([timed(call) for _ in range(repeats)])
+    return found
+
+
 def main() -> None:
     """Measure and print one JSON line."""
-    parts = ("step", "frames", "reset", "workers")
+    parts = ("step", "frames", "reset", "workers", "help")
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -287,6 +299,9 @@ def main() -> None:
         row["frames"] = measure_frames(chosen.repeats, chosen.frames)
     if "reset" in chosen.only:
         row["reset_ms"] = measure_reset(chosen.repeats)
+    if "help" in chosen.only:
+        Clock.now = staticmethod(CLOCKS["wall"])
+        row["help_s"] = measure_help(chosen.repeats)
     if "workers" in chosen.only:
         Clock.now = staticmethod(CLOCKS["wall"])
         row["workers"] = {

@@ -1,4 +1,4 @@
-"""Curves: success against demonstrations, against the strength of a shift, and along the chain."""
+"""Curves: success against demonstrations, against a shift's strength, over the procedure."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -161,8 +161,8 @@ def _chart(
     return Chart(title, drawing, charts.key([line.name for line in drawn]), head, tuple(rows), more)
 
 
-def survival(groups: Sequence[Group]) -> Chart | None:
-    """How many episodes of the whole procedure finished each subtask and all before it."""
+def procedure(groups: Sequence[Group]) -> Chart | None:
+    """Return how many episodes of the whole procedure finished each subtask and all before it."""
     lines = []
     rows = []
     for item in groups:
@@ -186,7 +186,7 @@ def survival(groups: Sequence[Group]) -> Chart | None:
     drawn = lines[:MOST]
     ticks = {float(index + 1): name for index, name in enumerate(names.SUBTASKS)}
     drawing = charts.curves(
-        drawn, "finished, and all before it", label="survival along the chain", ticks=ticks
+        drawn, "finished, and all before it", label="progress in the procedure", ticks=ticks
     )
     more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
     key = charts.key([line.name for line in drawn])

@@ -26,8 +26,8 @@ _TABLE_2 = {
 STATE_BC = {"grasp": 0.96, "place": 1.00, "insert": 0.97, "handoff": 0.83, "pullout": 0.92}
 """Table 1: behaviour cloning from the state, the ceiling."""
 
-CHAIN = (0.88, 0.72, 0.60, 0.52)
-"""Table 3: the hierarchical policy, chains that begin with approach (grasp), from the shortest to
+HIERARCHICAL = (0.88, 0.72, 0.60, 0.52)
+"""Table 3: the hierarchical policy, sequences from approach (grasp) on, from the shortest to
 the whole.
 """
 

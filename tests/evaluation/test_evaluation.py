@@ -32,9 +32,7 @@ SHORT = TaskConfig("grasp", max_steps=12)
 
 
 class FakeEnv:
-    """Counts steps; seed s succeeds after s steps, 97 cannot start, 98 diverges, 99 raises in a
-    step.
-    """
+    """Counts steps; seed s succeeds after s steps, 97 cannot start, 98 diverges, 99 raises."""
 
     def __init__(self, config):
         self.config, self.closed = config, False
