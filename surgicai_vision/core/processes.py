@@ -72,6 +72,31 @@ def raise_on_terminate() -> None:
         signal.signal(signal.SIGTERM, terminate)
 
 
+@contextmanager
+def _termination_waits() -> Iterator[None]:
+    """Handle a SIGTERM or a Ctrl-C that arrives inside only afterwards.
+
+    A child that is started reads from a pipe what it is to do; broken off halfway it would show a
+    traceback beside our one line.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # the signals arrive in the main thread, which is elsewhere
+        return
+    arrived: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        arrived.append(number)
+
+    handlers = {kind: signal.signal(kind, note) for kind in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for kind, handler in handlers.items():
+            signal.signal(kind, signal.SIG_DFL if handler is None else handler)
+    if arrived:
+        signal.raise_signal(arrived[0])
+
+
 def end_with_parent(parent: int) -> None:
     """Let this process end as soon as `parent` is no longer the one that it belongs to."""
 
@@ -172,7 +197,7 @@ class Child:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         handed = (_ParentWatch(os.getpid()), theirs, serve, arguments)
-        with environment(variables):
+        with environment(variables), _termination_waits():
             self._process = context.Process(target=_live, args=handed)
             self._process.start()
         theirs.close()  # the child alone holds that end now: it closes when the child dies
