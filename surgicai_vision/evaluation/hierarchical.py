@@ -63,8 +63,8 @@ class HierarchicalConfig:
 
     Attributes:
         hlp: folder of the high-level policy's checkpoint, or "order".
-        grasp: what acts in the subtask, as `open_policy` takes it; likewise place, insert, handoff
-            and pullout.
+        grasp: what acts in the subtask, a checkpoint's folder or a baseline; likewise place,
+            insert, handoff and pullout. A file names no code: "module:factory" is refused.
         termination: one of `TERMINATIONS`.
         steps: control steps a subtask may take.
         decisions: decisions an episode may take.

@@ -126,7 +126,7 @@ def open_policy(
         spec = PolicySpec(RunConfig(config, policy=text), BASELINES[text])
     elif path.suffix in SUFFIXES:
         spec = hierarchical_policy(read_hierarchical(path), expert_swap, weights)
-    elif ":" in text and not path.exists():
+    elif _names_code(text):
         spec = _from_factory(text, TaskConfig(task or "grasp"))
     elif not path.exists() and path.parent == Path():
         raise UnknownName("policy or checkpoint folder", text, (*BASELINES, REPLAY))
@@ -138,6 +138,11 @@ def open_policy(
             "leave the task out, or give a policy of that task."
         )
     return _in_env(spec, env)
+
+
+def _names_code(text: str) -> bool:
+    """Return True for "module:factory"."""
+    return ":" in text and not Path(text).exists()
 
 
 def _in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
@@ -298,6 +303,11 @@ def hierarchical_policy(
     known: dict[str, RunConfig] = {}
     low: dict[str, MakeAgent] = {}
     for subtask, policy in config.low.items():
+        if _names_code(policy):
+            raise InputError(
+                f"{subtask}: {policy} names code, which a file may not; give a checkpoint or a "
+                f"baseline ({', '.join(BASELINES)})."
+            )
         spec = open_policy(policy, task=subtask, weights=weights)
         low[subtask] = spec.make_agent
         if spec.run.is_trained:

@@ -95,3 +95,11 @@ def test_an_evaluation_of_another_version_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadFile, match="of another version") as refused:
         read_evaluation(tmp_path)
     assert "\n" not in str(refused.value)
+
+
+def test_a_file_names_no_code(tmp_path: Path) -> None:
+    low = dict.fromkeys(names.SUBTASKS, "expert") | {"insert": "test_policy_spec:Still"}
+    path = tmp_path / "hierarchical.yaml"
+    path.write_text("hlp: order\n" + "".join(f"{name}: {low[name]}\n" for name in low))
+    with pytest.raises(InputError, match=r"insert: test_policy_spec:Still names code"):
+        open_policy(path)
