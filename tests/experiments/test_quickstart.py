@@ -105,8 +105,8 @@ def test_quickstart_refuses_the_folder_of_another_plan(folder, monkeypatch, caps
 def test_sweep_runs_reports_and_resumes(folder, monkeypatch, capsys):
     code, first = run(folder, monkeypatch, capsys, "sweep", "grid.yaml", "--out", "sweep")
     assert code == 0
-    counts = {name: first[name] for name in ("cells", "done", "cached", "failed", "not_run")}
-    assert counts == {"cells": 4, "done": 2, "cached": 0, "failed": 0, "not_run": 2}
+    counts = {name: first[name] for name in ("runs", "done", "cached", "failed", "not_run")}
+    assert counts == {"runs": 4, "done": 2, "cached": 0, "failed": 0, "not_run": 2}
     assert pq.read_table(folder / "sweep/episodes.parquet").num_rows == 4
     before = times(folder / "sweep")
     code, second = run(folder, monkeypatch, capsys, "sweep", "grid.yaml", "--out", "sweep")

@@ -87,7 +87,7 @@ def test_it_is_recorded_rendered_trained_evaluated_and_swept(run: Run, tmp_path:
     assert row["task"] == "touch_point"
     (tmp_path / "grid.yaml").write_text(GRID)
     swept = verb("sweep", "grid.yaml", *one, "sweep")
-    assert swept["done"] == swept["cells"] == 1
+    assert swept["done"] == swept["runs"] == 1
 
 
 @pytest.mark.parametrize(

@@ -141,7 +141,7 @@ def test_a_click_on_a_cell_shows_its_episodes(said, groups):
     assert said["frames"] == 8 * said["films"]
     assert said["pinned"] == 8
     assert "the disk is full" in said["dialog"]
-    assert "surgicai-vision evaluate outputs/sweeps/table/cells/" in said["dialog"]
+    assert "surgicai-vision evaluate outputs/sweeps/table/runs/" in said["dialog"]
     assert re.fullmatch(r"#cell-\d+", said["hash"])
     assert "weights are not here" in said["absent"]
     assert said["images"] == 0

@@ -340,10 +340,10 @@ def test_conditions_that_differ_in_two_things_are_no_pair():
     assert factor(blind, best) == "images", "without an encoder nothing is taken from it"
 
 
-def test_curves_chain_and_probes_are_drawn_with_their_numbers(text, groups):
-    for section in ("curves", "chain", "probes"):
+def test_curves_procedure_and_probes_are_drawn_with_their_numbers(text, groups):
+    for section in ("curves", "procedure", "probes"):
         assert f'<h2 id="{section}">' in text
-    curves = text.split('id="curves"')[1].split('id="chain"')[0]
+    curves = text.split('id="curves"')[1].split('id="procedure"')[0]
     assert curves.count('<svg class="curve"') == 3
     assert curves.count("<th>area (interval)</th>") == 2
     lite = [
@@ -354,11 +354,11 @@ def test_curves_chain_and_probes_are_drawn_with_their_numbers(text, groups):
     assert re.search(rf"{area:.2f} \(0\.\d\d–0\.\d\d\)", curves.split("<h3>place: light</h3>")[1])
     item = find(groups, task="place", encoder="imagenet", axis="light", strength=0.5)
     assert f"{item.successes}/{item.episodes}" in curves
-    chain = text.split('id="chain"')[1].split('id="probes"')[0]
+    procedure = text.split('id="procedure"')[1].split('id="probes"')[0]
     swapped = find(groups, task="suture", expert_swap="insert")
     finished = sum(row["stages"] > 2 for row in swapped.rows)
-    assert f"{finished}/20" in chain
-    assert "expert in insert" in chain
+    assert f"{finished}/20" in procedure
+    assert "expert in insert" in procedure
     probes = text.split('id="probes"')[1].split('id="pairs"')[0]
     assert re.search(r"handoff: -0\.\d\d over 9 pairs \(p [=&]", probes)
     assert probes.count('<svg class="curve"') == 1
