@@ -28,6 +28,7 @@ class Source:
     """A dataset of tiny frames, each another."""
 
     views = ("back",)
+    policy_views = views
     fingerprint = "benchmark"
 
     def __init__(self, length: int):

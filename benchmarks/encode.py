@@ -41,6 +41,7 @@ class Memory:
     """Frames in memory, as `features.encode` reads a dataset."""
 
     views = ("back",)
+    policy_views = views
     fingerprint = "memory"
 
     def __init__(self, frames: np.ndarray):

@@ -35,10 +35,12 @@ class Noise:
     task = "grasp"
     image_size = 224
     fingerprint = "noise"
+    fps = names.FPS
 
     def __init__(self, length: int, views: int):
         self.length = length
         self.views = names.CAMERAS[:views]
+        self.policy_views = self.views
         self.config = TaskConfig("grasp")
         self.episode_index = np.arange(length) // EPISODE
 

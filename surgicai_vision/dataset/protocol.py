@@ -34,7 +34,7 @@ class Dataset(Protocol):
         """Cameras, in the order of the dataset's columns."""
 
     @property
-    def sights(self) -> tuple[str, ...]:
+    def policy_views(self) -> tuple[str, ...]:
         """What `frames` shows: the views, and their depth views where depth was rendered."""
 
     @property
@@ -64,7 +64,7 @@ class Dataset(Protocol):
         """Return every column that is no image, (N,) or (N, n), by its key."""
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
-        """Return the images of one of the `sights`, (stop - start, H, W, 3) uint8 RGB."""
+        """Return the images of one of the `policy_views`, (stop - start, H, W, 3) uint8 RGB."""
 
 
 def episode_bounds(episode_index: NDArray[np.int64]) -> list[tuple[int, int]]:

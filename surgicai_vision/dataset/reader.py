@@ -112,7 +112,7 @@ class RenderedDataset:
         return self._column("episode_index").astype(np.int64, copy=False)
 
     @property
-    def sights(self) -> tuple[str, ...]:
+    def policy_views(self) -> tuple[str, ...]:
         """What `frames` shows: the views, and their depth views where depth was rendered."""
         depth = tuple(f"{view}_depth" for view in camera_names() if view in self.views)
         return self.views + (depth if self.has_depth else ())
@@ -138,7 +138,7 @@ class RenderedDataset:
         return {key: self._column(key) for key in keys}
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
-        """Return the images of one of the `sights`, (stop - start, H, W, 3) uint8 RGB."""
+        """Return the images of one of the `policy_views`, (stop - start, H, W, 3) uint8 RGB."""
         if names.is_depth_view(view):
             return codecs.grey(self.depth(names.camera_of(view), start, stop))
         return self._images(names.image_key(self._view(view)), start, stop, np.uint8)

@@ -104,7 +104,7 @@ class DatasetSubset:
 
     Attributes:
         rows: which frames of the whole it holds, (N,) int64, rising.
-        path, views, sights, image_size: those of the whole.
+        path, views, policy_views, image_size: those of the whole.
         config: configuration of the task.
         task: name of the task.
         fps: frames per second of simulated time.
@@ -139,7 +139,7 @@ class DatasetSubset:
         self.config = config or whole.config
         self.task = self.config.task if config else whole.task
         self.views = whole.views
-        self.sights = whole.sights
+        self.policy_views = whole.policy_views
         self.image_size = whole.image_size
         self.fps = fps or whole.fps
         self.length = len(rows)
@@ -168,7 +168,7 @@ class DatasetSubset:
         return columns
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
-        """Return the images of one of the `sights`, (stop - start, H, W, 3) uint8 RGB."""
+        """Return the images of one of the `policy_views`, (stop - start, H, W, 3) uint8 RGB."""
         stop = self.length if stop is None else stop
         if not 0 <= start <= stop <= self.length:
             selection = ", ".join(f"{key} {value}" for key, value in self._selection.items())

@@ -152,8 +152,8 @@ def encode(
         InputError: a cache folder that cannot be written.
         SurgicaiError: a feature that is not finite.
     """
-    if view not in dataset.sights:
-        raise UnknownName("view of this dataset", view, dataset.sights)
+    if view not in dataset.policy_views:
+        raise UnknownName("view of this dataset", view, dataset.policy_views)
     if not dataset.length:
         raise InputError("The dataset holds no frames; record and render some first.")
     folder = (cache_root or default_cache_root()) / "features" / entry_key(dataset, view, encoder)

@@ -14,7 +14,7 @@ from surgicai_vision.core.errors import SurgicaiError
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.storage import read_film
 from surgicai_vision.report.episodes import film_id
-from surgicai_vision.report.filmstrips import Choice, Reel, sight
+from surgicai_vision.report.filmstrips import Choice, Reel, camera_and_modality
 from surgicai_vision.report.groups import Group, best_trained
 
 SIZE = 224
@@ -89,7 +89,10 @@ def _strip(choice: Choice | None, kind: str) -> dict[str, object]:
     film = read_film(choice.result.folder, row["seed"])
     with contact_sheet.state_renderer(choice.result.config, SIZE) as image:
         frames = [
-            {"step": int(step), "data": _data(contact_sheet.jpeg(image(state, *sight(view))))}
+            {
+                "step": int(step),
+                "data": _data(contact_sheet.jpeg(image(state, *camera_and_modality(view)))),
+            }
             for step, state in zip(film.steps, film.states, strict=True)
         ]
     end = f"{row['d_trans_mm']:.1f} mm and {row['d_angle_deg']:.1f}° from the goal at the end"

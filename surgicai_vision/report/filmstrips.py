@@ -191,12 +191,14 @@ def _strip(choice: Choice, image: contact_sheet.Draw) -> Strip | None:
         return None
     kept = np.unique(np.linspace(0, len(film.steps) - 1, FRAMES).round().astype(int))
     frames = [
-        base64.b64encode(contact_sheet.jpeg(image(film.states[at], *sight(view)), QUALITY)).decode()
+        base64.b64encode(
+            contact_sheet.jpeg(image(film.states[at], *camera_and_modality(view)), QUALITY)
+        ).decode()
         for at in kept
     ]
     return Strip(choice, view, tuple(int(film.steps[at]) for at in kept), tuple(frames))
 
 
-def sight(view: str) -> tuple[str, str]:
+def camera_and_modality(view: str) -> tuple[str, str]:
     """Return camera and modality of a view."""
     return names.camera_of(view), names.DEPTH if names.is_depth_view(view) else names.RGB

@@ -22,7 +22,7 @@ class FakeData:
     episode_index: np.ndarray
 
     @property
-    def sights(self) -> tuple[str, ...]:
+    def policy_views(self) -> tuple[str, ...]:
         return self.views
 
     def bounds(self) -> list[tuple[int, int]]:
