@@ -32,10 +32,10 @@ import numpy as np
 VIEWS = ("front", "back")
 
 
-def compare(demos: Path, dataset_folder: Path, size: int, frame_stride: int) -> dict:
+def compare(demos: Path, dataset_folder: Path, size: int, episode_stride: int) -> dict:
     """Count what is wrong with a dataset's frames.
 
-    `every` so many episodes one is stepped through live.
+    One of `episode_stride` episodes is stepped through live.
     """
     from surgicai_vision import envs
     from surgicai_vision.dataset import open_dataset
@@ -56,7 +56,7 @@ def compare(demos: Path, dataset_folder: Path, size: int, frame_stride: int) -> 
         for colours, _ in stored.values():
             flat = colours.reshape(len(colours), -1)
             found["black"] += int(((flat.max(1) <= 8) | (flat.max(1) == flat.min(1))).sum())
-        if number % frame_stride:
+        if number % episode_stride:
             continue
         env = env or envs.make(
             demo.config, obs_type="pixels", cameras=VIEWS, image_size=size, depth=True
@@ -88,7 +88,7 @@ def main() -> int:
     )
     parser.add_argument("--frames", type=int, default=10_000, help="images to render, at least")
     parser.add_argument(
-        "--frame-stride", type=int, default=1, help="step live through one of so many episodes"
+        "--episode-stride", type=int, default=1, help="step live through one of so many episodes"
     )
     parser.add_argument("--size", type=int, default=224)
     parser.add_argument("--workers", type=int, default=2)
@@ -138,7 +138,7 @@ def main() -> int:
             depth=True,
             context=RunContext(arguments.workers),
         )
-        found = compare(demos, out, arguments.size, arguments.frame_stride)
+        found = compare(demos, out, arguments.size, arguments.episode_stride)
         print(f"{task}: {episodes} episodes, {len(VIEWS) * steps} frames, {found}", flush=True)
         total["frames"] += len(VIEWS) * steps
         for key, number in found.items():
