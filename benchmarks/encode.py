@@ -165,7 +165,7 @@ def main() -> None:
 
 
 def at_hand(name: str) -> bool:
-    """Say whether an encoder's weights are on this machine."""
+    """Return True if an encoder's weights are on this machine."""
     from surgicai_vision.core.errors import SurgicaiError
 
     try:

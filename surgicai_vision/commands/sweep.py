@@ -82,7 +82,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 def _list(
     grid: Grid, out: Path, choice: "Choice", workers: int, console: Console
 ) -> dict[str, object]:
-    """Say what each run is, and how long the rest takes where a finished run tells it."""
+    """Print what each run is, and how long the rest takes where a finished run tells it."""
     from surgicai_vision.experiments.sweep.estimate import estimate
     from surgicai_vision.experiments.sweep.plan import STATES, plan
 

@@ -10,7 +10,7 @@ frames are used, evenly spread over every episode: neighbouring frames say nearl
 orientation is fitted as two columns of its matrix and put back among the rotations (Gram–Schmidt).
 An episode's error is the median over its frames; reported is the median over episodes, with a
 percentile bootstrap over episodes. `chance` is the error of the mean pose of the episodes fitted
-on: what needs no seeing.
+on.
 """
 
 from collections.abc import Callable, Sequence

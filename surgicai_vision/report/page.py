@@ -172,6 +172,6 @@ def details(groups: Sequence[Group], reel: Reel, commands: dict[str, list[str]])
 
 
 def footer(collected: Collected) -> str:
-    """Say when and from what the page was written."""
+    """Return when and from what the page was written."""
     count = text.plural(len(collected.results), "stored evaluation")
     return f"Written on {datetime.date.today().isoformat()} from {count}."

@@ -40,5 +40,5 @@ def rate(task: str, encoder: str, view: str) -> float | None:
 
 
 def has(task: str, encoder: str) -> bool:
-    """Say whether Table 2 could hold the combination: one of its encoders, a subtask."""
+    """Return True if Table 2 could hold the combination: one of its encoders, a subtask."""
     return task in names.SUBTASKS and encoder in ENCODERS

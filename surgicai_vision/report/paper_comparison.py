@@ -68,7 +68,7 @@ def paper_rate(condition: Condition) -> float | None:
 
 
 def _comparable(condition: Condition) -> bool:
-    """Whether it is what the paper's Table 2 holds.
+    """Return True if it is what the paper's Table 2 holds.
 
     One view of the two, everything else as usual.
     """

@@ -288,7 +288,7 @@ def kinds(groups: Sequence[Group]) -> list[str]:
 
 
 def caption(groups: Sequence[Group]) -> str:
-    """Say what the numbers are and how the episodes were judged."""
+    """Return what the numbers are and how the episodes were judged."""
     results = [result for item in groups for result in item.results]
     if not results:
         return ""
