@@ -3,7 +3,7 @@
     make figures
 
 Counted are the tracked Python files that are shipped; tests, examples and benchmarks are not. The
-exit code is 1 where a limit is passed.
+exit code is 1 where a limit that binds is passed.
 """
 
 import ast
@@ -23,11 +23,17 @@ NOUNS = ("rendering.py", "training.py", "hole_crossing.py")
 
 
 class Figure(NamedTuple):
-    """What was counted, and the most there may be."""
+    """What was counted, and the most there may be; a size is orientation and binds nobody."""
 
     name: str
     value: float
     limit: float
+    binds: bool = True
+
+    @property
+    def is_within(self) -> bool:
+        """Whether there is no more than there may be."""
+        return self.value <= self.limit
 
 
 def sources() -> list[Path]:
@@ -94,7 +100,7 @@ def figures() -> list[Figure]:
         Figure("module files named by a gerund (but rendering, training)", gerunds, 0),
         Figure("lines with 'picture'", pictures, 5),
         Figure("loose modules", len(loose - {"__init__.py", "__main__.py"}), 0),
-        Figure("lines of the four packages", package_lines, 30_000),
+        Figure("lines of the four packages", package_lines, 30_000, binds=False),
     ]
 
 
@@ -102,9 +108,9 @@ def main() -> int:
     """Print one line a figure."""
     found = figures()
     for figure in found:
-        verdict = "" if figure.value <= figure.limit else "  too many"
+        verdict = "" if figure.is_within else "  too many" if figure.binds else "  (orientation)"
         print(f"{figure.name:<64}{figure.value:>9,}  at most {figure.limit:,}{verdict}")
-    return int(any(figure.value > figure.limit for figure in found))
+    return int(any(figure.binds and not figure.is_within for figure in found))
 
 
 if __name__ == "__main__":
