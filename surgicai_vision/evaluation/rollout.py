@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core import processes
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError, SurgicaiError
+from surgicai_vision.core.progress import Progress
 from surgicai_vision.evaluation.agent import Agent, Env, MakeAgent, Observation
 from surgicai_vision.evaluation.metrics import EpisodeMetrics, failure_kind
 
@@ -30,8 +31,6 @@ BATCH = 8
 
 FILM_FRAMES = 10
 """States kept of each episode, evenly spaced from the first to the last."""
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ there.
 """
 
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +35,7 @@ from surgicai_vision import __version__
 from surgicai_vision.core.config import JSON, digest, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, UnknownName
 from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, locked, read_json, write_json
+from surgicai_vision.core.progress import Progress
 
 if TYPE_CHECKING:
     from encoders.base import Encoder
@@ -46,9 +47,6 @@ MANIFEST = "manifest.json"
 PROGRESS = "progress.json"
 ROWS = "features.npy"
 LOCK = "lock"
-
-Progress = Callable[[int, int], None]
-"""Called with (frames done, frames in all)."""
 
 
 class Manifest(TypedDict):

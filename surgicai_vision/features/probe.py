@@ -13,7 +13,7 @@ percentile bootstrap over episodes. `chance` is the error of the mean pose of th
 on.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
 from surgicai_vision.scene.needle import TIP_ANGLE, point
@@ -35,8 +36,6 @@ SMALLEST_STD = 1e-6  # a feature that varies less is constant
 RESAMPLES = 10_000
 
 Array = NDArray[np.float64]
-Progress = Callable[[int, int], None]
-"""Called with (folds done, folds in all)."""
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,11 @@ states kept of each episode, so results stay small and the page can be rebuilt a
     reader → groups (over training seeds) → pairs, curves, films → page, tables
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from surgicai_vision.core import files
+from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.evaluation.storage import GRID_FILE, RUN_FILE
 from surgicai_vision.report import figures, filmstrips, page
 from surgicai_vision.report.failures import failure_sheet
@@ -39,7 +40,6 @@ __all__ = [
 
 PAGE_FILE = "report.html"
 FAILURES_FILE = "failures.jpg"
-Progress = Callable[..., None]
 
 
 def write_report(
@@ -62,7 +62,7 @@ def write_report(
     Raises:
         BadFile: a folder without a whole evaluation and without a cell that failed or was not run.
     """
-    report = progress or (lambda done, total: None)
+    report = progress or silent
     collected = collect(folder, planned)
     groups = group(collected)
     pairs = compare(groups)

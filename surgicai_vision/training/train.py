@@ -41,6 +41,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, UnknownName
 from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
+from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
 from surgicai_vision.training.checkpoint import (
@@ -62,8 +63,6 @@ MMAP_THRESHOLD = -3
 STATISTICS_ROWS = 1024  # rows summed at a time
 SMALLEST_STD = 1e-6  # an input that varies less is constant, and only its mean is removed
 
-Progress = Callable[[int, int], None]
-"""Called with (epochs done, epochs in all)."""
 Log = Callable[[int, dict[str, float]], None]
 """Called with (epoch, losses by name)."""
 
