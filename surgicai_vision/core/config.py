@@ -54,6 +54,10 @@ class SceneConfig:
         thread: number of thread segments, 0 for none.
         instrument: PSM instrument, "400006" (Large Needle Driver of SurgicAI) or "420006".
         grasp: "friction" (contact forces only) or "attach" (a weld, the released code's rule).
+        torque: limits of the arms' servos, a key of `scene.arm.TORQUES`: "effective" (about 10 N at
+            the tip) or "dvrk" (what its motors can give).
+        tissue: "channels" (rigid, with open holes, SurgicAI's) or "soft" (pierced anywhere).
+        tissue_forces: how soft tissue resists: "phantom", "skin" or "liver".
     """
 
     layout: str = "simple"
@@ -61,11 +65,17 @@ class SceneConfig:
     thread: int = 0
     instrument: str = "400006"
     grasp: str = "friction"
+    torque: str = "effective"
+    tissue: str = "channels"
+    tissue_forces: str = "phantom"
 
     def __post_init__(self) -> None:
         check_name("layout", self.layout, names.LAYOUTS)
         check_name("grasp level", self.grasp, names.GRASPS)
         check_name("instrument", self.instrument, ("400006", "420006"))
+        check_name("torque preset", self.torque, names.TORQUES)
+        check_name("tissue", self.tissue, names.TISSUES)
+        check_name("tissue forces", self.tissue_forces, names.TISSUE_FORCES)
         if self.hole_pair not in (1, 2, 3, 4):
             raise InputError(f"hole_pair is {self.hole_pair!r}; allowed: 1, 2, 3, 4.")
         if self.thread not in (0, 10, 20, 40):

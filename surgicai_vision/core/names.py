@@ -48,6 +48,9 @@ PARTS = ("background", "phantom", "needle", "thread", "psm1", "psm2")
 
 OBS_TYPES = ("state", "goal", "pixels", "pixels_agent_pos")
 GRASPS = ("friction", "attach")
+TORQUES = ("effective", "dvrk")
+TISSUES = ("channels", "soft")
+TISSUE_FORCES = ("phantom", "skin", "liver")
 LAYOUTS = ("simple", "3dmed", "3dmed_straight")
 
 ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "jaw")

@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.envs import randomisation
 from surgicai_vision.envs.base import SuturingEnv
-from surgicai_vision.envs.hole_crossing import JUMP, Point, crossing
+from surgicai_vision.envs.hole_crossing import JUMP, crossing
 from surgicai_vision.envs.success import Info
-from surgicai_vision.scene import needle
-from surgicai_vision.scene.holes import PAIRS
+from surgicai_vision.scene.holes import PAIRS, Point
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
@@ -58,7 +57,7 @@ class EpisodeMonitor:
         simulation = self._env.simulation
         self._pairs = [randomisation.shifted(pair, simulation.draws) for pair in self._layout]
         self._is_through_entry = simulation.task_state.holes_passed >= 1
-        self._tip = simulation.needle_point(needle.TIP_ANGLE)
+        self._tip = simulation.needle_point(simulation.tip_angle)
 
     def update(self, info: Info) -> None:
         """Read the state that a step ended in; `info` is that step's."""
@@ -68,7 +67,7 @@ class EpisodeMonitor:
         self.turn = max(self.turn, float(turn))
         self.tissue_force = max(self.tissue_force, self._plate.force(simulation.data))
         before = self._tip
-        self._tip = simulation.needle_point(needle.TIP_ANGLE)
+        self._tip = simulation.needle_point(simulation.tip_angle)
         if math.dist(before, self._tip) <= JUMP:
             self._note_crossings(before, self._tip)
 

@@ -12,8 +12,7 @@ import math
 from typing import Protocol
 
 from surgicai_vision.envs.task_state import TaskState
-from surgicai_vision.scene import needle
-from surgicai_vision.scene.holes import OPENING, Hole, HolePair
+from surgicai_vision.scene.holes import OPENING, Hole, HolePair, Point
 from surgicai_vision.scene.kinematics import Pose
 
 JUMP = 0.004
@@ -24,14 +23,14 @@ EJECTED = 5.0
 """A distance in one control step [m] that no fall explains: the contact solver shot the needle away
 (250 m/s)."""
 
-Point = tuple[float, float, float]
-
 
 class NeedlePose(Protocol):
     """Where a needle is; `Simulation` measures it."""
 
     radius: float
     """Of the needle's arc [m]."""
+    tip_angle: float
+    """Of its tip [rad]."""
 
     def needle(self) -> Pose:
         """Return T_world_needle."""
@@ -43,7 +42,7 @@ class NeedlePose(Protocol):
 def update(now: NeedlePose, state: TaskState, pair: HolePair) -> None:
     """Update `state.holes_passed` with the tip's move since the last control step."""
     before = state.needle_tip
-    tip = now.needle_point(needle.TIP_ANGLE)
+    tip = now.needle_point(now.tip_angle)
     state.needle_tip = tip
     passed = state.holes_passed
     moved = math.dist(tip, before)
@@ -68,7 +67,7 @@ def update(now: NeedlePose, state: TaskState, pair: HolePair) -> None:
 
 def remember_tip(now: NeedlePose, state: TaskState) -> None:
     """Watch the needle's tip from its present place on."""
-    state.needle_tip = now.needle_point(needle.TIP_ANGLE)
+    state.needle_tip = now.needle_point(now.tip_angle)
 
 
 def crossing(before: Point, now: Point, hole: Hole, *, inward: bool) -> tuple[float, float] | None:
@@ -84,17 +83,17 @@ def crossing(before: Point, now: Point, hole: Hole, *, inward: bool) -> tuple[fl
         (x, y) in the hole's frame [m], or None where the way does not cross the opening in this
         direction.
     """
-    cosine, sine = hole.slope
-    x, y, z = hole.centre
-    start = sine * (before[0] - x) + cosine * (before[2] - z)
-    end = sine * (now[0] - x) + cosine * (now[2] - z)
+    start = hole.height(before)
+    end = hole.height(now)
     if not (start > 0.0 >= end if inward else start <= 0.0 < end):
         return None
     share = start / (start - end)
     return _in_opening(
-        before[0] + share * (now[0] - before[0]) - x,
-        before[1] + share * (now[1] - before[1]) - y,
-        before[2] + share * (now[2] - before[2]) - z,
+        (
+            before[0] + share * (now[0] - before[0]),
+            before[1] + share * (now[1] - before[1]),
+            before[2] + share * (now[2] - before[2]),
+        ),
         hole,
     )
 
@@ -120,8 +119,8 @@ def is_out(now: NeedlePose, pair: HolePair) -> bool:
     low = math.remainder(phase - math.pi / 2, 2 * math.pi)
     lowest = (
         -1.0
-        if 0.0 <= low <= needle.TIP_ANGLE
-        else min(math.sin(-phase), math.sin(needle.TIP_ANGLE - phase))
+        if 0.0 <= low <= now.tip_angle
+        else min(math.sin(-phase), math.sin(now.tip_angle - phase))
     )
     return height + reach * lowest > 0.0
 
@@ -137,11 +136,9 @@ def _crosses(now: NeedlePose, hole: Hole, *, inward: bool) -> bool:
         return False
     rising = math.asin(height / reach)
     angle = math.remainder(phase + (math.pi + rising if inward else -rising), 2 * math.pi)
-    if not 0.0 <= angle <= needle.TIP_ANGLE:
+    if not 0.0 <= angle <= now.tip_angle:
         return False
-    px, py, pz = now.needle_point(angle)
-    x, y, z = hole.centre
-    return _in_opening(px - x, py - y, pz - z, hole) is not None
+    return _in_opening(now.needle_point(angle), hole) is not None
 
 
 def _heights(now: NeedlePose, hole: Hole) -> tuple[float, float, float]:
@@ -149,24 +146,19 @@ def _heights(now: NeedlePose, hole: Hole) -> tuple[float, float, float]:
 
     The height over the hole's plane is a + reach sin(θ - φ).
     """
-    cosine, sine = hole.slope
-    x, _, z = hole.centre
-    px, _, pz, r0, r1, _, _, _, _, r6, r7, _ = now.needle()
-    b = sine * r0 + cosine * r6
-    c = sine * r1 + cosine * r7
-    height = sine * (px - x) + cosine * (pz - z)
-    return height, now.radius * math.hypot(b, c), math.atan2(b, c)
+    u, v, w = hole.normal
+    px, py, pz, r0, r1, _, r3, r4, _, r6, r7, _ = now.needle()
+    b = u * r0 + v * r3 + w * r6
+    c = u * r1 + v * r4 + w * r7
+    return hole.height((px, py, pz)), now.radius * math.hypot(b, c), math.atan2(b, c)
 
 
-def _in_opening(dx: float, dy: float, dz: float, hole: Hole) -> tuple[float, float] | None:
-    """Return (x, y) in the hole's frame of a point of its plane, or None outside the opening.
+def _in_opening(point: Point, hole: Hole) -> tuple[float, float] | None:
+    """Return (x, y) in the hole's frame [m] of a point of its plane, or None outside the opening.
 
     Args:
-        dx: from the hole's centre to the point, in world [m].
-        dy: the same along y.
-        dz: the same along z.
+        point: in world [m].
         hole: the hole.
     """
-    cosine, sine = hole.slope
-    up = cosine * dx - sine * dz
-    return (up, dy) if abs(up) < OPENING / 2 and abs(dy) < OPENING / 2 else None
+    x, y, _ = hole.local(point)
+    return (x, y) if abs(x) < OPENING / 2 and abs(y) < OPENING / 2 else None

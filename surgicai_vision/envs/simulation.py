@@ -81,6 +81,7 @@ class Simulation:
         self.draws = randomisation.NOTHING
         self.offsets: dict[str, tuple[float, ...]] = {}
         self.radius = needle.RADIUS
+        self.tip_angle = needle.TIP_ANGLE
         self._welds = Welds(self.model, self.data) if welded else None
         self._own = own_model
         self._instrument = scene.config.instrument
@@ -213,9 +214,8 @@ class Simulation:
         if not finite:
             for name, command in self.commands.items():
                 self.command(name, command)
-        self.command(
-            arm, control.follow(self.commands[arm], action, step, self.bases[arm], self._instrument)
-        )
+        present = self._within_reach(arm)
+        self.command(arm, control.follow(present, action, step, self.bases[arm], self._instrument))
         if self.task_state.release_steps > 0:
             self._let_go()
         due = data.time + self._control_time
@@ -226,6 +226,26 @@ class Simulation:
         if self._welds:
             self._attach(self._welds)
         return finite and abs(data.time - due) < 1e-9
+
+    def _within_reach(self, arm: str) -> Command:
+        """Return an arm's command, drawn back to where its servos can still tell the difference.
+
+        A servo at its torque limit does not follow; without this the command of an arm that presses
+        on something would run away from it, and the way back would begin with as many lost steps.
+        """
+        command = self.commands[arm]
+        measured = self._qpos[self.scene.arms[arm].qpos].tolist()
+        told = self._with_error(arm, command.joints) if self.offsets else command.joints
+        leads = [a - b for a, b in zip(told, measured, strict=True)]
+        limits = self.scene.leads
+        if all(-limit <= lead <= limit for lead, limit in zip(leads, limits, strict=True)):
+            return command
+        a, b, c, d, e, f = (
+            joint - lead + max(-limit, min(lead, limit))
+            for joint, lead, limit in zip(command.joints, leads, limits, strict=True)
+        )
+        joints = (a, b, c, d, e, f)
+        return Command(kinematics.forward_flat(joints, self._instrument), command.jaw, joints)
 
     def _delayed(self, action: list[float]) -> list[float]:
         """Queue an action and return the one whose time has come."""

@@ -6,12 +6,13 @@ jaws, ±y the direction in which they open and x their hinge. The jaws' grasp po
 
 Actuators are position servos with the natural frequency `BANDWIDTH` on each joint's own inertia,
 gravity compensated: the joints follow a commanded pose as a dVRK's do, and give way to contact by a
-finite stiffness. The two fingers are coupled by an equality, so that one torque-limited motor
-closes both (about 2.5 N each). Numbers without another source were measured by
-`benchmarks/grip.py`.
+finite stiffness and a limited torque (`TORQUES`). The two fingers are coupled by an equality, so
+that one torque-limited motor closes both (about 10 N each). Numbers without another source were
+measured by `benchmarks/grip.py`.
 """
 
 import math
+from types import MappingProxyType
 
 import mujoco
 
@@ -30,8 +31,10 @@ JAW_LIMITS = (-0.06, 1.0)
 """Angle of each finger [rad]; below 0 only when the jaws close on nothing."""
 JAW_GAIN = 1.0
 """Gain of the servo of the coupled fingers [N·m/rad]."""
-JAW_TORQUE = 0.05
-"""Largest torque of that servo [N·m]."""
+JAW_TORQUE = 0.2
+"""Largest torque of that servo [N·m]: 10 N at each pad. Grips of EndoWrist instruments were
+measured at 2.3 to 39.9 N (Journal of Endourology 25:523, 2011). A needle that meets tissue turns in
+the jaws below 0.1 N·m (`docs/tissue.md`)."""
 JAW_ARMATURE = 1e-4
 """[kg·m²]: the servo has a natural frequency of 70 rad/s. With an armature of 1e-5 (220
 rad/s) the closing jaws struck the needle at 12 rad/s, 0.25 mm of the pads' way in one physics step:
@@ -41,6 +44,21 @@ SHAFT_LENGTH = 0.36
 WRIST_RADIUS = 0.003
 BANDWIDTH = 100.0
 """[rad/s]"""
+TORQUES = MappingProxyType(
+    {
+        "dvrk": (3.32, 3.32, 9.88, 0.344, 0.344, 0.344),
+        "effective": (0.7, 0.7, 5.0, 0.08, 0.06, 0.06),
+    }
+)
+"""Preset → largest torque of the six servos [N·m, the third N].
+
+"dvrk" is what the motors can give: current × gear ratio × torque constant, computed by
+`compute-ftmax.py` of the dVRK's software (sawIntuitiveResearchKit). "effective" is ours: the arm
+presses with at most about 10 N, as a surgeon who feels the tissue would let it; the expert needs at
+most 0.46, 0.39 N·m, 1.85 N, 0.027, 0.010, 0.023 N·m (`benchmarks/press.py` measures the force)."""
+FASTEST = (1.6, 1.6, 0.13, 6.0, 6.0, 6.0)
+"""Fastest that an action moves a joint [rad/s, the third m/s]: 1.5 mm along each axis and 3° about
+each in 20 ms, the largest step preset, 80 mm from the remote centre."""
 LIMIT_SOLREF = [0.004, 1.0]
 LIMIT_SOLIMP = [0.99, 0.999, 0.0001, 0.5, 2.0]
 """Of joint limits, of the fingers' coupling and of the weld: a servo told to go 0.5 rad past a
@@ -55,6 +73,7 @@ def add_arm(
     arm: str,
     base: mujoco.MjsBody,
     instrument: Instrument,
+    torque: str,
     bits: dict[str, int],
 ) -> None:
     """Add the arm `arm` to `spec` below its base body.
@@ -64,13 +83,14 @@ def add_arm(
         arm: "psm1" or "psm2".
         base: the body at the remote centre of motion, in the arm's base frame.
         instrument: lengths and joint limits.
+        torque: key of `TORQUES`.
         bits: collision bits of the instrument.
     """
     body = base
     # The six links of the DH table, with the physical shape of shaft and wrist.
     for index, name in enumerate(DVRK_JOINTS):
         body = _add_link(body, arm, name, index, instrument)
-        _add_servo(spec, f"{arm}_{name}", index)
+        _add_servo(spec, f"{arm}_{name}", index, TORQUES[torque][index])
         if index == 3:
             _capsule(
                 body, f"{arm}_shaft", [0, 0, -SHAFT_LENGTH, 0, 0, -SHAFT_RADIUS], SHAFT_RADIUS, bits
@@ -127,10 +147,26 @@ def _add_link(
     return body
 
 
-def _add_servo(spec: mujoco.MjSpec, joint: str, index: int) -> None:
-    """Add a position servo with natural frequency `BANDWIDTH`, critically damped."""
+def _add_servo(spec: mujoco.MjSpec, joint: str, index: int, torque: float) -> None:
+    """Add a position servo with natural frequency `BANDWIDTH`, critically damped.
+
+    It gives at most `torque` [N·m or N].
+    """
     actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     actuator.set_to_position(kp=ARMATURE[index] * BANDWIDTH**2, kv=2 * ARMATURE[index] * BANDWIDTH)
+    actuator.forcelimited = True
+    actuator.forcerange = [-torque, torque]
+
+
+def leads(torque: str) -> tuple[float, ...]:
+    """Return how far a command can be ahead of each joint to any effect [rad, the third m].
+
+    The servo then gives its largest torque at rest, and the joint moves as fast as any action asks.
+    """
+    return tuple(
+        limit / (armature * BANDWIDTH**2) + 2.0 * speed / BANDWIDTH
+        for limit, armature, speed in zip(TORQUES[torque], ARMATURE, FASTEST, strict=True)
+    )
 
 
 def _capsule(

@@ -69,6 +69,7 @@ class Scene:
         hash: sha256 (hex) of the compiled XML and the configuration.
         instrument: the PSM instrument.
         arms: arm name → its ids.
+        leads: how far a command can be ahead of each joint (`arm.leads`) [rad, the third m].
         pair: the hole pair of this scene's stitch.
         needle_qpos: the needle's position and quaternion in qpos.
         needle_geoms: ids of the needle's capsules, from base to tip.
@@ -79,6 +80,7 @@ class Scene:
     hash: str
     instrument: kinematics.Instrument
     arms: Mapping[str, ArmIds]
+    leads: tuple[float, ...]
     pair: holes.HolePair
     needle_qpos: slice
     needle_geoms: range
@@ -126,6 +128,7 @@ def _build_scene(config: SceneConfig, others: tuple[str, ...]) -> Scene:
         hash=hashlib.sha256(text.encode()).hexdigest(),
         instrument=kinematics.INSTRUMENTS[config.instrument],
         arms=MappingProxyType({name: _arm_ids(model, name) for name in names.ARMS}),
+        leads=arm.leads(config.torque),
         pair=holes.PAIRS[config.layout][config.hole_pair - 1],
         needle_qpos=slice(free, free + 7),
         needle_geoms=range(first, first + needle.SEGMENTS),
@@ -167,7 +170,8 @@ def _add_arm(spec: mujoco.MjSpec, config: SceneConfig, name: str) -> None:
         name
     ]
     bits = {"contype": touching[0], "conaffinity": touching[1]}
-    arm.add_arm(spec, name, base, kinematics.INSTRUMENTS[config.instrument], bits)
+    instrument = kinematics.INSTRUMENTS[config.instrument]
+    arm.add_arm(spec, name, base, instrument, config.torque, bits)
 
 
 def _set_options(spec: mujoco.MjSpec, thread: int) -> None:

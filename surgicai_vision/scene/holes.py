@@ -1,7 +1,7 @@
 """Holes: where the stitch goes in and out of each phantom layout.
 
-A hole's frame has +z along the outward normal of its flank and +y along the wound (world y); x runs
-up the flank at the entry and down it at the exit. World frame, metres.
+A hole's frame has +z along the outward normal of its flank and +y along the wound (world y, turned
+with the phantom); x runs up the flank at the entry and down it at the exit. World frame, metres.
 
 Sources: layout `simple` holds the entry and exit poses of SurgicAI's phantom (opening about 3.8 mm
 square). `3dmed` and `3dmed_straight` keep the gaps and tilts of the new surgical robotics
@@ -24,24 +24,64 @@ thickness.
 """
 
 
+Point = tuple[float, float, float]
+
+
 @dataclass(frozen=True)
 class Hole:
-    """One hole: its centre [m] and its outward normal's tilt about world y [rad]."""
+    """One hole.
 
-    centre: tuple[float, float, float]
+    Attributes:
+        centre: [m, world].
+        tilt: of its outward normal about the wound's direction [rad].
+        turn: of the phantom about world z [rad].
+    """
+
+    centre: Point
     tilt: float
+    turn: float = 0.0
 
     @functools.cached_property
-    def slope(self) -> tuple[float, float]:
-        """Return cosine and sine of the tilt."""
-        return math.cos(self.tilt), math.sin(self.tilt)
+    def axes(self) -> tuple[Point, Point, Point]:
+        """Return the hole's x, y and z axes in world; z is the outward normal."""
+        cosine = math.cos(self.tilt)
+        sine = math.sin(self.tilt)
+        along = math.cos(self.turn)
+        across = math.sin(self.turn)
+        return (
+            (along * cosine, across * cosine, -sine),
+            (-across, along, 0.0),
+            (along * sine, across * sine, cosine),
+        )
+
+    @property
+    def normal(self) -> Point:
+        """Return the outward normal in world."""
+        return self.axes[2]
+
+    def height(self, point: Point) -> float:
+        """Return the signed distance [m] of a point of the world over the hole's plane."""
+        x, y, z = self.centre
+        a, b, c = self.axes[2]
+        return a * (point[0] - x) + b * (point[1] - y) + c * (point[2] - z)
+
+    def local(self, point: Point) -> Point:
+        """Return a point of the world in the hole's frame [m]."""
+        x, y, z = self.centre
+        dx = point[0] - x
+        dy = point[1] - y
+        dz = point[2] - z
+        first, second, third = self.axes
+        return (
+            first[0] * dx + first[1] * dy + first[2] * dz,
+            second[0] * dx + second[1] * dy,
+            third[0] * dx + third[1] * dy + third[2] * dz,
+        )
 
     @property
     def rotation(self) -> NDArray[np.float64]:
         """Return R_world_hole, shape (3, 3)."""
-        cosine = math.cos(self.tilt)
-        sine = math.sin(self.tilt)
-        return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+        return np.array(self.axes).T
 
     @property
     def pose(self) -> NDArray[np.float64]:

@@ -52,7 +52,7 @@ def add_thread(
             mass=MASS / segments,
             material="thread",
             condim=1,
-            priority=1,
+            priority=2,
             **bits,
         )
         parent = body

@@ -302,7 +302,7 @@ def moved_world(monkeypatch):
 
     def move(shift):
         def moved(hole):
-            return holes.Hole(tuple(np.add(hole.centre, shift)), hole.tilt)
+            return holes.Hole(tuple(np.add(hole.centre, shift)), hole.tilt, hole.turn)
 
         pairs = tuple(
             holes.HolePair(moved(pair.entry), moved(pair.exit)) for pair in holes.PAIRS["simple"]
