@@ -6,10 +6,13 @@ Workers, medians, and one JSON line that says where and with what it was measure
 import json
 import os
 import statistics
+import sys
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any, TypeVar
 
 from surgicai_vision.evaluation.provenance import provenance
@@ -31,6 +34,46 @@ def spread(function: Callable[[Job], Result], jobs: Iterable[Job], workers: int)
         workers, mp_context=get_context("spawn"), initializer=_settle_in
     ) as pool:
         return list(pool.map(function, jobs))
+
+
+def spread_resumable(
+    function: Callable[[Job], dict[str, Any]],
+    jobs: Sequence[Job],
+    workers: int,
+    out: Path | None = None,
+) -> list[dict[str, Any]]:
+    """Return the results of `function` over `jobs`, in order, and say how far it is on stderr.
+
+    Args:
+        function: of one job; returns what JSON can hold.
+        jobs: what to do, each with a `repr` of its own.
+        workers: processes; 0 work in this one.
+        out: keep each result there as a line; a later call with the same jobs goes on from it.
+    """
+    done: dict[str, dict[str, Any]] = {}
+    if out is not None and out.exists():
+        # A line that was cut off by an interruption is not counted.
+        whole = out.read_text().split("\n")[:-1]
+        done = {row["job"]: row["result"] for row in map(json.loads, whole)}
+        out.write_text("".join(line + "\n" for line in whole))
+    waiting = [job for job in jobs if repr(job) not in done]
+    with ExitStack() as stack:
+        if workers < 1:
+            results: Iterable[dict[str, Any]] = map(function, waiting)
+        else:
+            pool = stack.enter_context(
+                ProcessPoolExecutor(
+                    workers, mp_context=get_context("spawn"), initializer=_settle_in
+                )
+            )
+            results = pool.map(function, waiting)
+        for job, result in zip(waiting, results, strict=True):
+            done[repr(job)] = result
+            if out is not None:
+                with out.open("a") as file:
+                    print(json.dumps({"job": repr(job), "result": result}), file=file)
+            print(f"{len(done)} of {len(jobs)} jobs", file=sys.stderr, flush=True)
+    return [done[repr(job)] for job in jobs]
 
 
 def _settle_in() -> None:
