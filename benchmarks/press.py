@@ -4,9 +4,10 @@
     python benchmarks/press.py --tissue soft --torque dvrk
 
 Each of the random policies is what an untrained network is to the arm: one action, drawn once and
-repeated for the whole episode, here among those that lead into the tissue: a direction within
-`CONE` of straight down at full step size, with a random turn of the tool. Policies with an even
-number drive PSM2 from a start of `grasp`, the others PSM1 from one of `handoff`.
+repeated for the whole episode, here among those that lead into the tissue: at full step size from
+the tip's start to a point anywhere within `REACH` of the stitch, with a random turn of the tool.
+Policies with an even number drive PSM2 from a start of `grasp`, the others PSM1 from one of
+`handoff`.
 
 * peak: the largest net force on the phantom in the episode, over every physics step of 2 ms, the
   impact included; `peak_50hz_n` as evaluations see it, once a control step.
@@ -16,7 +17,6 @@ Both in N, over the policies that touched the tissue: median, 90 % quantile, lar
 """
 
 import argparse
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -29,9 +29,13 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import SceneConfig, TaskConfig, to_mapping
 from surgicai_vision.envs.episode_monitor import STATE, ForcePlate
 from surgicai_vision.envs.simulation import SUBSTEPS
+from surgicai_vision.scene.holes import SURFACE
 
 STEPS = 200
-CONE = math.radians(60.0)
+REACH = (0.015, 0.020)
+"""How far to either side of the stitch, in world x and y, the policies aim [m]."""
+TURN = 0.1
+"""Largest turn a step, of the step size: up to 40° about each axis in an episode."""
 HELD = names.FPS
 """Control steps at the end of an episode over which the held force is measured: 1 s."""
 TASKS = ("grasp", "handoff")
@@ -61,7 +65,7 @@ class FinePlate:
 
     def __init__(self, env: envs.SuturingEnv):
         self._env = env
-        self._plate = ForcePlate(env)
+        self._plate = ForcePlate(env.model)
         self._again = mujoco.MjData(env.model)
         self._state = np.empty(mujoco.mj_stateSize(env.model, STATE))
 
@@ -79,7 +83,7 @@ class FinePlate:
         for _ in range(SUBSTEPS):
             mujoco.mj_step(model, again)
             largest = max(largest, float(np.linalg.norm(self._plate.net(again))))
-        return largest, self._plate.force()
+        return largest, self._plate.force(self._env.data)
 
 
 def press(job: Job) -> list[Press]:
@@ -106,14 +110,14 @@ def _policy(env: envs.SuturingEnv, plate: FinePlate, seed: int) -> Press:
 
 
 def _into_the_tissue(env: envs.SuturingEnv, rng: np.random.Generator) -> np.ndarray:
-    """Draw an action (7,): a direction about world's -z, evenly over the cone, and a turn."""
-    height = rng.uniform(math.cos(CONE), 1.0)
-    around = rng.uniform(0.0, 2 * math.pi)
-    side = math.sqrt(1.0 - height**2)
-    in_world = np.array([side * math.cos(around), side * math.sin(around), -height])
-    base = np.array(env.simulation.bases[env.subtask.arm][3:]).reshape(3, 3)
-    turn = rng.uniform(-1.0, 1.0, 3)
-    return np.array([*(base.T @ in_world), *turn, 0.0], np.float32)
+    """Draw an action (7,): straight to a point of the tissue, with a turn."""
+    arm = env.subtask.arm
+    offset = rng.uniform(-1.0, 1.0, 2) * REACH
+    goal = np.array([*(np.array(env.stitch.pair.entry.centre)[:2] + offset), SURFACE])
+    way = goal - env.simulation.tip(arm)[:3]
+    base = np.array(env.simulation.bases[arm][3:]).reshape(3, 3)
+    turn = rng.uniform(-TURN, TURN, 3)
+    return np.array([*(base.T @ way / np.linalg.norm(way)), *turn, 0.0], np.float32)
 
 
 def row(values: Sequence[float]) -> dict[str, float]:

@@ -9,9 +9,9 @@ holds drive the tools to the ends of their reach and into everything). Counted a
 ended as `physics_error`, episodes in which MuJoCo warned of divergence and no error was reported,
 and observations that are not finite.
 
-`--mid-insertion SHARE` of the episodes begin with the needle in the tissue: in equal parts at starts
-of `handoff` and of `pullout`, and half-way through `insert`: the expert drives until the tip is
-through the entry and up to `DEEPER` steps more. The others are shared among all five subtasks.
+`--mid-insertion SHARE` of the episodes begin with the needle in the tissue: in equal parts at
+starts of `handoff` and of `pullout`, and half-way through `insert`: the expert drives until the tip
+is through the entry and up to `DEEPER` steps more. The others are shared among all five subtasks.
 With `--out` an interrupted run goes on where it was.
 """
 

@@ -8,6 +8,9 @@ Physics, images, resets and workers, each against the bare thing at equal settin
 * step: `env.step` (obs_type state) along an expert's whole procedure, against a loop of
   `mj_step(…, nstep)` over the same model, states and commands. Both must end in the same positions.
   Without thread and with 10 segments.
+* tissue: `env.step` along an expert's whole procedure in tissue "soft" against "channels", each
+  with a procedure of its own; steps/s of the one over those of the other. Without thread and with
+  10 segments.
 * frames: `FrameRenderer.render` against `mujoco.Renderer` with shadows, multisampling and triangles
   set alike, on the same states. Both must give the same pixels. One core: llvmpipe draws in the
   calling thread.
@@ -101,9 +104,9 @@ def ratio(slow: list[float], fast: list[float]) -> float:
     return median([a / b for a, b in zip(slow, fast, strict=True)])
 
 
-def record(thread: int) -> Recording:
+def record(scene: SceneConfig) -> Recording:
     """Let the expert throw one stitch."""
-    config = TaskConfig("suture", SceneConfig(thread=thread))
+    config = TaskConfig("suture", scene)
     env = envs.make(config)
     env.reset(seed=names.VALIDATION_SEED)
     expert = Expert(env)
@@ -121,7 +124,7 @@ def record(thread: int) -> Recording:
 
 def measure_step(thread: int, repeats: int) -> dict[str, Any]:
     """Time the env's steps against the bare physics."""
-    env, start, actions, commands = record(thread)
+    env, start, actions, commands = record(SceneConfig(thread=thread))
     model = env.model
     data = mujoco.MjData(env.model)
     nstep = env.frame_skip
@@ -154,9 +157,39 @@ def measure_step(thread: int, repeats: int) -> dict[str, Any]:
     }
 
 
+def measure_tissue(thread: int, repeats: int) -> dict[str, Any]:
+    """Time the env's steps in soft tissue against those in channels."""
+    kinds = ("soft", "channels")
+    recordings = [record(SceneConfig(thread=thread, tissue=kind)) for kind in kinds]
+
+    def play(recording: Recording) -> None:
+        recording.env.set_state_vector(recording.start)
+        for action in recording.actions:
+            recording.env.step(action)
+
+    for recording in recordings:
+        play(recording)
+        if not recording.env.measure()["is_success"]:
+            raise SystemExit("The expert's procedure failed; the comparison is void.")
+    soft, channels = (functools.partial(play, recording) for recording in recordings)
+    times = in_turns(soft, channels, repeats)
+    rates = [
+        [len(recording.actions) / seconds for seconds in turns]
+        for recording, turns in zip(recordings, times, strict=True)
+    ]
+    return {
+        "control_steps": dict(zip(kinds, (len(r.actions) for r in recordings), strict=True)),
+        **{
+            f"{kind}_steps_per_s": round(median(rate))
+            for kind, rate in zip(kinds, rates, strict=True)
+        },
+        "of_channels": ratio(*rates),
+    }
+
+
 def measure_frames(repeats: int, frames: int) -> dict[str, Any]:
     """Time our images against MuJoCo's own renderer."""
-    env, start, actions, _ = record(0)
+    env, start, actions, _ = record(SceneConfig())
     env.set_state_vector(start)
     states = []
     for index, action in enumerate(actions):
@@ -279,7 +312,7 @@ def measure_help(repeats: int) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print one JSON line."""
-    parts = ("step", "frames", "reset", "workers", "help")
+    parts = ("step", "tissue", "frames", "reset", "workers", "help")
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -294,6 +327,10 @@ def main() -> None:
     if "step" in chosen.only:
         row["step"] = {
             f"thread_{thread}": measure_step(thread, chosen.repeats) for thread in (0, 10)
+        }
+    if "tissue" in chosen.only:
+        row["tissue"] = {
+            f"thread_{thread}": measure_tissue(thread, chosen.repeats) for thread in (0, 10)
         }
     if "frames" in chosen.only:
         row["frames"] = measure_frames(chosen.repeats, chosen.frames)

@@ -127,7 +127,7 @@ class ForcePlate:
         mujoco.mj_getState(self._model, data, self._state, STATE)
         mujoco.mj_setState(self._model, self._scratch, self._state, STATE)
         mujoco.mj_forward(self._model, self._scratch)
-        return float(np.linalg.norm(self._net(self._scratch)))
+        return float(np.linalg.norm(self.net(self._scratch)))
 
     def _touching(self, data: mujoco.MjData) -> NDArray[np.bool_]:
         """Return which contacts are of the tissue with the needle or an instrument, (contacts,)."""
@@ -138,8 +138,8 @@ class ForcePlate:
         )
         return touching
 
-    def _net(self, data: mujoco.MjData) -> NDArray[np.float64]:
-        """Return the net force in world (3,) [N]."""
+    def net(self, data: mujoco.MjData) -> NDArray[np.float64]:
+        """Return the net force in world (3,) [N] of data whose forces have been computed."""
         net = np.zeros(3)
         wrench = np.empty(6)
         for index in np.flatnonzero(self._touching(data)):
