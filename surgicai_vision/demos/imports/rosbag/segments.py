@@ -226,6 +226,7 @@ class _NeedleAlone:
     """A needle without a simulation, a `hole_crossing.NeedlePose`."""
 
     radius = needle.RADIUS
+    tip_angle = needle.TIP_ANGLE
 
     def __init__(self, pose: Pose):
         self._pose = pose
