@@ -109,4 +109,11 @@ def curve_line(rows: list[dict[str, Any]]) -> str:
     area = ""
     if first["auc"] is not None:
         area = f"; area {first['auc']:.2f} ({first['auc_low']:.2f}–{first['auc_high']:.2f})"
-    return f"{first['axis']:<16} {points}{area}"
+    last = rows[-1]
+    kept = ""
+    if last["retention"] is not None:
+        kept = (
+            f"; keeps {last['retention']:.2f} "
+            f"({last['retention_low']:.2f}–{last['retention_high']:.2f}) at {last['strength']:g}"
+        )
+    return f"{first['axis']:<16} {points}{area}{kept}"

@@ -42,6 +42,7 @@ class Options:
         quality: fast (as datasets are rendered) or high.
         sheet: File to write.
         film: Draw a film strip of the expert in every subtask instead, in the first view.
+        axes: Draw every axis of `robustness` at every strength instead, in the first view.
     """
 
     task: Annotated[str, TASK] = "grasp"
@@ -53,6 +54,7 @@ class Options:
         Path | None, Parameter(metavar="FILE.png"), default_text("outputs/scene-<task>.png")
     ] = None
     film: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
+    axes: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
     env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
@@ -66,6 +68,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 
     if options.film:
         return _film(options.film, options, console)
+    if options.axes:
+        return _axes(options.axes, options, console)
     config = task_config(options.task, options.env)
     path = options.sheet or folders.OUTPUTS / f"scene-{options.task}.png"
     folders.check_file(path, "--sheet", FIGURE_SUFFIXES)
@@ -141,3 +145,31 @@ def _film(path: Path, options: Options, console: Console) -> dict[str, object]:
     figure.savefig(path, dpi=110)
     console.say(f"film: {path}")
     return {"film": str(path), "view": options.view[0], "seed": options.seed, "subtasks": outcomes}
+
+
+def _axes(path: Path, options: Options, console: Console) -> dict[str, object]:
+    """Draw a row of images for every axis of `robustness`: the start of the episode, shifted."""
+    from surgicai_vision.envs import contact_sheet
+    from surgicai_vision.evaluation.robustness import AXES, STRENGTHS
+    from surgicai_vision.evaluation.robustness.sheet import axis_images, axis_names
+
+    folders.check_file(path, "--axes", FIGURE_SUFFIXES)
+    config = task_config(options.task, options.env)
+    view = options.view[0]
+    rows = []
+    shown = axis_names()
+    with console.stage("rendering", "axes") as progress:
+        for done, axis in enumerate(shown):
+            images = axis_images(
+                config, axis, view, options.seed, options.size, options.quality, STRENGTHS
+            )
+            rows.append((axis.replace("_", " "), images))
+            progress(done + 1, len(shown))
+    figure = contact_sheet.sheet(
+        rows,
+        [f"strength {strength:g}" for strength in STRENGTHS],
+        f"axes of robustness: {options.task}, seed {options.seed}, seen by {view}",
+    )
+    figure.savefig(path, dpi=100)
+    console.say(f"sheet: {path}")
+    return {"axes": {axis: AXES[axis].text for axis in shown}, "sheet": str(path), "view": view}

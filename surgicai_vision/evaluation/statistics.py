@@ -4,6 +4,7 @@ Interface:
     clopper_pearson(k, n)                exact interval of one success rate
     hierarchical_bootstrap(groups, rng)  interval of a mean over training seeds and their episodes
     mcnemar(a, b)                        exact test of two policies on the same starts
+    retention(plain, shifted)            what is left of a success rate, with its interval
     holm(p)                              p-values corrected for their number
     area_under_curve(strength, success)  mean success over a range of strengths
     area_interval(areas)                 its interval, from each episode's own area
@@ -15,6 +16,8 @@ it.
 
 import math
 from collections.abc import Sequence
+from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -171,6 +174,66 @@ def mcnemar(one: ArrayLike, other: ArrayLike) -> float:
         )
     first, second = int((a & ~b).sum()), int((b & ~a).sum())
     return min(1.0, 2.0 * float(binom.cdf(min(first, second), first + second, 0.5)))
+
+
+class Retention(NamedTuple):
+    """What is left of a success rate: shifted / plain on the same starts, with its interval.
+
+    All are None where the plain policy never succeeded.
+    """
+
+    ratio: float | None
+    low: float | None
+    high: float | None
+
+
+def retention(plain: ArrayLike, shifted: ArrayLike, level: float = 0.95) -> Retention:
+    """Return the ratio of two success rates on the same starts.
+
+    The interval is Bonett and Price's (Communications in Statistics 35, 2006): Wilson's bounds of
+    both rates, narrowed for their correlation. A test checks its coverage by exact sums.
+
+    Args:
+        plain: successes (n,) by start; the denominator.
+        shifted: successes (n,) on the same starts.
+        level: coverage.
+
+    Raises:
+        InputError: different lengths, or no start.
+    """
+    one = np.asarray(plain, dtype=bool)
+    other = np.asarray(shifted, dtype=bool)
+    if one.shape != other.shape or one.ndim != 1 or not len(one):
+        raise InputError(
+            f"retention got successes of shapes {one.shape} and {other.shape}; "
+            "it needs the same starts, at least one."
+        )
+    if not one.any():
+        return Retention(None, None, None)
+    first = int(other.sum())
+    second = int(one.sum())
+    lost = int((one & ~other).sum())
+    won = int((other & ~one).sum())
+    seen = int((one | other).sum())
+    both = math.sqrt((lost + won + 2) / ((first + 1) * (second + 1)))
+    spread = sum(
+        math.sqrt((1 - (count + 1) / (seen + 2)) / (count + 1)) for count in (first, second)
+    )
+    quantile = NormalDist().inv_cdf(0.5 + _checked(level) / 2) * both / spread
+    above = _wilson(first, seen, quantile)
+    below = _wilson(second, seen, quantile)
+    return Retention(first / second, above[0] / below[1], above[1] / below[0])
+
+
+def _wilson(successes: int, trials: int, quantile: float) -> tuple[float, float]:
+    """Return Wilson's bounds of a rate for a normal quantile."""
+    square = quantile * quantile
+    middle = 2 * successes + square
+    reach = quantile * math.sqrt(square + 4 * successes * (1 - successes / trials))
+    return (
+        max(0.0, (middle - reach) / (2 * (trials + square))),
+        min(1.0, (middle + reach) / (2 * (trials + square))),
+    )
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -15,7 +15,7 @@ from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
-from surgicai_vision.evaluation.robustness import AXES, CURVES, axes_of, curves, shifted
+from surgicai_vision.evaluation.robustness import ALL, AXES, CURVES, axes_of, curves, shifted
 from surgicai_vision.evaluation.robustness.corruption import CORRUPTIONS, CorruptedAgent, Moment
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.evaluation.statistics import clopper_pearson, mcnemar
@@ -292,7 +292,7 @@ def test_running_again_does_only_what_is_missing(tmp_path, pretend):
 
 def test_without_images_only_the_arm_can_shift(tmp_path):
     blind = open_policy("expert", env={"max_steps": 4})
-    assert axes_of(blind) == ("latency", "kinematic_error")
+    assert axes_of(blind) == ("latency", "kinematic_error", ALL)
     assert axes_of(seeing_spec()) == tuple(AXES)
     with pytest.raises(InputError, match="sees no images"):
         curves.robustness(blind, SEEDS, tmp_path, silent, ("blur",))
@@ -343,3 +343,46 @@ def test_wrong_options_end_with_one_line(more, wanted, tmp_path, capsys):
     error = capsys.readouterr().err.strip().splitlines()
     assert len(error) == 1 and wanted in error[0]
     assert not (tmp_path / "out").exists()
+
+
+def test_all_is_every_axis_at_once_and_spoils_an_image_in_their_order():
+    single = [axis for name, axis in AXES.items() if name != ALL]
+    assert set(AXES[ALL].world) == {name for axis in single for name in axis.world}
+    assert AXES[ALL].images == tuple(kind for axis in single for kind in axis.images)
+    chosen = shifted(seeing_spec(), ALL, 0.5)
+    each = [shifted(seeing_spec(), name, 0.5).config.randomisation for name in AXES if name != ALL]
+    for axis in chosen.config.randomisation.on:
+        values = {getattr(one, axis) for one in each} - {getattr(RandomisationConfig(), axis)}
+        assert values == {getattr(chosen.config.randomisation, axis)}
+    image = np.random.default_rng(0).integers(0, 256, (48, 48, 3), dtype=np.uint8)
+    moment = Moment(SEEDS[0], 0, 0)
+    by_hand = image
+    for kind in AXES[ALL].images:
+        by_hand = CORRUPTIONS[kind](by_hand, 0.5, moment)
+    seen = []
+
+    class Watching(Agent):
+        name = "watching"
+        cameras = ("front",)
+        image_size = 48
+        depth = False
+
+        def reset(self, slot, env, seed):
+            pass
+
+        def act(self, slots, envs, observations):
+            seen.append(observations[0]["front"])
+            return np.zeros((len(slots), 7), np.float32)
+
+    run = RunConfig(SHORT, OWN, ("front",), policy="watching")
+    agent = shifted(PolicySpec(run, Watching), ALL, 0.5).make_agent()
+    agent.reset(0, None, SEEDS[0])
+    agent.act([0], [None], [{"front": image}])
+    np.testing.assert_array_equal(seen[0], by_hand)
+
+
+def test_a_policy_without_images_meets_all_by_its_arm_and_world_alone():
+    run = RunConfig(SHORT, None, (), policy="blind")
+    spec = PolicySpec(run, seeing)
+    assert ALL in axes_of(spec)
+    assert shifted(spec, ALL, 1.0).make is seeing

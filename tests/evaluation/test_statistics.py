@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
-from scipy.stats import beta, binom, binomtest, t
+from scipy.stats import beta, binom, binomtest, multinomial, t
 
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.evaluation.statistics import (
@@ -19,6 +19,7 @@ from surgicai_vision.evaluation.statistics import (
     holm,
     mcnemar,
     mean_and_std,
+    retention,
 )
 
 TABLES = 1000
@@ -219,3 +220,38 @@ def test_mean_and_std():
     assert mean_and_std([3.0]) == {"mean": 3.0, "std": None}
     values = [1.0, 2.0, 4.0]
     assert mean_and_std(values)["std"] == pytest.approx(np.std(values, ddof=1))
+
+
+def test_retention_is_the_ratio_of_rates_on_the_same_starts():
+    plain = [1, 1, 1, 1, 0, 0]
+    shift = [1, 1, 0, 0, 1, 0]
+    kept = retention(plain, shift)
+    assert kept.ratio == pytest.approx(3 / 4)
+    assert kept.low < kept.ratio < kept.high
+    assert retention([0, 0], [1, 0]) == (None, None, None)
+    assert retention(plain, plain).ratio == 1.0
+    with pytest.raises(InputError, match="same starts"):
+        retention([1], [1, 0])
+
+
+@pytest.mark.parametrize(
+    ("both", "lost", "won"), [(0.5, 0.3, 0.05), (0.2, 0.6, 0.0), (0.85, 0.1, 0.02), (0.4, 0.2, 0.2)]
+)
+def test_the_interval_of_retention_covers_by_exact_sums(both, lost, won):
+    """All outcomes of 30 starts, weighed by their probability: at least 93 % are covered."""
+    n = 30
+    truth = (both + won) / (both + lost)
+    covered = 0.0
+    for a in range(n + 1):
+        for b in range(n + 1 - a):
+            for c in range(n + 1 - a - b):
+                weight = multinomial.pmf(
+                    [a, b, c, n - a - b - c], n, [both, lost, won, 1 - both - lost - won]
+                )
+                if weight < 1e-9 or a + b == 0:
+                    continue
+                plain = [1] * (a + b) + [0] * (n - a - b)
+                shift = [1] * a + [0] * b + [1] * c + [0] * (n - a - b - c)
+                kept = retention(plain, shift)
+                covered += weight * (kept.low <= truth <= kept.high)
+    assert covered >= 0.93

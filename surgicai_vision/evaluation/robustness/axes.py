@@ -1,9 +1,12 @@
 """Axes: what can shift, and how far strength 1 goes. A new axis is one line of `AXES`.
 
-An axis changes either the world, by the randomisation the env already has
-(`config.RandomisationConfig`), or only the images the agent is given (`corruption`). In the world
+An axis changes the world, by the randomisation the env already has (`config.RandomisationConfig`),
+or only the images the agent is given (`corruption`); `all` does everything at once. In the world
 every episode draws its own direction from its seed, uniform in ± the axis's size; the strength
 scales the size. It comes on top of the task's own randomisation of the axis.
+
+Strength 1 is where a person still recognises the scene, barely; `surgicai-vision scene --axis all`
+draws every axis at every strength.
 """
 
 import dataclasses
@@ -36,17 +39,19 @@ class Axis:
     Attributes:
         text: what it is, for people.
         world: field of `config.RandomisationConfig` → what is added to it.
-        images: key of `corruption.CORRUPTIONS`, or "".
+        images: keys of `corruption.CORRUPTIONS`, in the order in which they spoil an image.
         seen: whether it changes images only, so that a policy without them cannot notice.
     """
 
     text: str
     world: Mapping[str, float] = MappingProxyType({})
-    images: str = ""
+    images: tuple[str, ...] = ()
     seen: bool = True
 
 
-AXES: Mapping[str, Axis] = MappingProxyType(
+ALL = "all"
+"""The axis along which everything shifts at once, each by the same strength."""
+_SINGLE: Mapping[str, Axis] = MappingProxyType(
     {
         "camera": Axis(
             "cameras off by ±10 mm and ±10° about each axis",
@@ -54,13 +59,15 @@ AXES: Mapping[str, Axis] = MappingProxyType(
         ),
         "field_of_view": Axis("vertical field of view off by ±10°", {"camera_fovy": 10.0}),
         "light": Axis("brightness of each light off by ±80 %", {"light": 0.8}),
-        "texture": Axis("colour channels of tissue and surroundings off by ±80 %", {"colour": 0.8}),
-        "blur": Axis("Gaussian blur, standard deviation 1/56 of the image's height", images="blur"),
-        "noise": Axis(
-            "Gaussian pixel noise, standard deviation 64 of 255 grey levels", images="noise"
-        ),
+        "tint": Axis("colour channels of tissue and surroundings off by ±80 %", {"colour": 0.8}),
         "smoke": Axis(
-            "drifting grey smoke that hides 40 to 90 % of what lies behind it", images="smoke"
+            "drifting grey smoke that hides 40 to 90 % of what lies behind it", images=("smoke",)
+        ),
+        "blur": Axis(
+            "Gaussian blur, standard deviation 1/56 of the image's height", images=("blur",)
+        ),
+        "noise": Axis(
+            "Gaussian pixel noise, standard deviation 64 of 255 grey levels", images=("noise",)
         ),
         "latency": Axis(
             "actions take effect 5 control steps (100 ms) later", {"latency": 5}, seen=False
@@ -68,6 +75,17 @@ AXES: Mapping[str, Axis] = MappingProxyType(
         "kinematic_error": Axis(
             "first three joints off by ±5°, ±5°, ±5 mm, unknown to the arm",
             {"kinematic_error": 1.0},
+            seen=False,
+        ),
+    }
+)
+AXES: Mapping[str, Axis] = MappingProxyType(
+    {
+        **_SINGLE,
+        ALL: Axis(
+            "everything above at once, each at this strength",
+            {name: size for axis in _SINGLE.values() for name, size in axis.world.items()},
+            tuple(kind for axis in _SINGLE.values() for kind in axis.images),
             seen=False,
         ),
     }
@@ -98,18 +116,20 @@ def shifted(spec: "PolicySpec", axis: str, strength: float) -> "PolicySpec":
         raise InputError(f"strength is {strength}; allowed: 0 to 1.")
     chosen = AXES[axis]
     make = spec.make
-    if chosen.images:
-        make = functools.partial(_corrupted, make, chosen.images, strength)
+    if spec.run.views:
+        # The agent made last sees the image first.
+        for kind in reversed(chosen.images):
+            make = functools.partial(_corrupted, make, kind, strength)
     run = dataclasses.replace(
         spec.run,
-        env=_shifted_config(spec.config, chosen, strength),
+        env=shifted_config(spec.config, chosen, strength),
         shift=Shift(axis, float(strength)),
     )
     return dataclasses.replace(spec, run=run, make=make)
 
 
-def _shifted_config(config: TaskConfig, axis: Axis, strength: float) -> TaskConfig:
-    """Add `strength` of the axis to the task's randomisation, up to what is possible."""
+def shifted_config(config: TaskConfig, axis: Axis, strength: float) -> TaskConfig:
+    """Return a task with `strength` of the axis added to its randomisation, up to its limits."""
     table = dataclasses.asdict(config.randomisation)
     for name, size in axis.world.items():
         own = table[name]

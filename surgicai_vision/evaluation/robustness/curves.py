@@ -2,9 +2,10 @@
 
 `robustness(spec, seeds, out)` evaluates every axis of `axes.AXES` at every strength, one
 evaluation folder each (`<out>/<axis>/<strength>/`), and writes `robustness.parquet`: a row for
-every axis and strength with its successes, interval, and the axis's area under the curve. Every
-strength has the same starts, and an episode's shift keeps its direction and grows with the
-strength, so that strengths are paired. Strength 0 is the plain evaluation.
+every axis and strength with its successes, interval, retention (the share of the plain successes
+that is left, on the same starts), and the axis's area under the curve. Every strength has the same
+starts, and an episode's shift keeps its direction and grows with the strength, so that strengths
+are paired. Strength 0 is the plain evaluation.
 """
 
 import itertools
@@ -25,6 +26,7 @@ from surgicai_vision.evaluation.statistics import (
     clopper_pearson,
     holm,
     mcnemar,
+    retention,
 )
 from surgicai_vision.evaluation.storage import MARKER, Row, parquet_bytes, read_rows, read_versioned
 from surgicai_vision.training.run_config import Shift
@@ -139,9 +141,20 @@ def _curve(axis: str, strengths: Sequence[float], results: list[list[bool]]) -> 
         low, high = clopper_pearson(sum(successes), len(successes))
         compared = strengths[0] == 0 and strength > 0
         p = mcnemar(results[0], successes) if compared else None
+        kept = retention(results[0], successes) if compared else None
         counts = {"k": sum(successes), "n": len(successes), "low": low, "high": high}
         rows.append(
-            {"axis": axis, "strength": float(strength), **counts, "p": p, "p_holm": None, **area}
+            {
+                "axis": axis,
+                "strength": float(strength),
+                **counts,
+                "p": p,
+                "p_holm": None,
+                "retention": kept.ratio if kept else None,
+                "retention_low": kept.low if kept else None,
+                "retention_high": kept.high if kept else None,
+                **area,
+            }
         )
     return rows
 
