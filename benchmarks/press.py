@@ -27,7 +27,7 @@ from common import chunks, emit, spread
 from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import SceneConfig, TaskConfig, to_mapping
-from surgicai_vision.envs.episode_monitor import STATE, ForcePlate
+from surgicai_vision.envs.force_plate import STATE, ForcePlate
 from surgicai_vision.envs.simulation import SUBSTEPS
 from surgicai_vision.scene.holes import SURFACE
 

@@ -174,6 +174,8 @@ def summary_line(result: dict[str, Any]) -> str:
         f"{result['policy']} on {result['task']}: {result['successes']}/{result['episodes']} "
         f"({100 * result['success_rate']:.0f} %, 95 % interval {100 * low:.0f}–{100 * high:.0f} %)"
     )
+    if result["paper_successes"] != result["successes"]:
+        line += f", {result['paper_successes']} by the paper's tolerances alone"
     length, steps = result["trajectory_length_mm"], result["time_steps"]
     if length["mean"] is not None:
         line += f", {length['mean']:.1f} mm and {steps['mean']:.0f} steps"

@@ -2,33 +2,34 @@
 
 An `EpisodeMonitor` only reads: an episode is the same with and without it.
 
-* Where the needle's tip goes through the stitch's planes: `entry_error` and `exit_error`, the
-  distance of that point from the hole's centre in the hole's plane [m]; NaN where the tip did not
-  go through in this episode. The openings are squares of `holes.OPENING`, so an error is at most
-  their half diagonal, 2.7 mm. A tip that goes back and through again counts anew.
-* `wrong_hole`: the tip went through an opening of another stitch, or through this exit from
-  outside, and has not left through the right exit since.
+* `bite`: where the needle's tip went in and out, how deep and at which angles
+  (`envs.bite_measures`).
 * `slip`, `turn`: the needle's largest shift [m] and turn [rad] in the active jaws since they took
   it.
 * `tissue_force`: largest net force [N] of needle and instruments (not of the thread) on the
   phantom, as a force plate under it would show. Sampled when a control step ends, at 50 Hz: a
-  shorter blow can be missed.
+  shorter blow can be missed. `tissue_impulse` is its sum over time [N s].
+* `tears`: how often the tissue tore; NaN in channels, where nothing can.
+* `thread_drawn`: the most thread that was drawn out of the exit behind the needle [m]; 0 before the
+  needle is out, NaN without a thread.
+* `paper_success`: the paper's own success was reached (`envs.success`), whatever soft tissue asks
+  besides.
 """
 
+import itertools
 import math
+from collections.abc import Sequence
 
 import mujoco
-import numpy as np
-from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.envs import randomisation
+from surgicai_vision.envs import hole_crossing, randomisation
 from surgicai_vision.envs.base import SuturingEnv
-from surgicai_vision.envs.hole_crossing import JUMP, crossing
+from surgicai_vision.envs.bite_measures import BiteMeasures, BiteWatch, ChannelWatch
+from surgicai_vision.envs.force_plate import ForcePlate
 from surgicai_vision.envs.success import Info
-from surgicai_vision.scene.holes import PAIRS, Point
-
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+from surgicai_vision.scene.holes import PAIRS, Hole, Point
+from surgicai_vision.scene.thread import LENGTH
 
 
 class EpisodeMonitor:
@@ -42,110 +43,88 @@ class EpisodeMonitor:
         self._env = env
         self._plate = ForcePlate(env.model)
         self._layout = PAIRS[env.scene.config.layout]
-        self._chosen = env.scene.config.hole_pair - 1
+        self._thread = _thread_bodies(env.model)
+        self._watch: BiteWatch | None = None
         self.clear()
 
     def clear(self) -> None:
         """Forget the last episode."""
-        self.entry_error = self.exit_error = math.nan
-        self.slip = self.turn = self.tissue_force = 0.0
-        self.wrong_hole = False
+        self._watch = None
+        self.slip = 0.0
+        self.turn = 0.0
+        self.tissue_force = 0.0
+        self.tissue_impulse = 0.0
+        self.tears = math.nan
+        self.thread_drawn = 0.0 if self._thread else math.nan
+        self.paper_success = False
 
     def reset(self) -> None:
         """Begin an episode; the env has just been reset."""
         self.clear()
         simulation = self._env.simulation
-        self._pairs = [randomisation.shifted(pair, simulation.draws) for pair in self._layout]
-        self._is_through_entry = simulation.task_state.holes_passed >= 1
-        self._tip = simulation.needle_point(simulation.tip_angle)
+        pair = self._env.stitch.pair
+        pairs = [randomisation.shifted(other, simulation.draws) for other in self._layout]
+        others = [other for other in pairs if other.entry.centre != pair.entry.centre]
+        self._watch = ChannelWatch(simulation, pair, others)
 
     def update(self, info: Info) -> None:
         """Read the state that a step ended in; `info` is that step's."""
+        assert self._watch is not None, "reset() begins an episode"
         simulation = self._env.simulation
         slip, turn = info["needle_slip"]
         self.slip = max(self.slip, float(slip))
         self.turn = max(self.turn, float(turn))
-        self.tissue_force = max(self.tissue_force, self._plate.force(simulation.data))
-        before = self._tip
-        self._tip = simulation.needle_point(simulation.tip_angle)
-        if math.dist(before, self._tip) <= JUMP:
-            self._note_crossings(before, self._tip)
+        force = self._plate.force(simulation.data)
+        self.tissue_force = max(self.tissue_force, force)
+        self.tissue_impulse += force * self._env.dt
+        self.paper_success = self.paper_success or bool(info["paper_success"])
+        self._watch.update()
+        if self._thread and simulation.task_state.holes_passed == hole_crossing.OUT:
+            drawn = drawn_length(self._thread_points(), self._env.stitch.pair.exit)
+            self.thread_drawn = max(self.thread_drawn, drawn)
+
+    @property
+    def bite(self) -> BiteMeasures:
+        """Return the measures of the episode's latest bite."""
+        return BiteMeasures() if self._watch is None else self._watch.measures
 
     def is_held(self) -> bool:
         """Return True if either arm holds the needle now."""
         return any(self._env.simulation.holds(arm) for arm in names.ARMS)
 
-    def _note_crossings(self, before: Point, now: Point) -> None:
-        """Note where the tip went through the opening of any hole."""
-        pair = self._pairs[self._chosen]
-        entering = crossing(before, now, pair.entry, inward=True)
-        leaving = crossing(before, now, pair.exit, inward=False)
-        if entering is not None:
-            self.entry_error = math.hypot(*entering)
-            self._is_through_entry = True
-        elif leaving is not None and self._is_through_entry:
-            self.exit_error = math.hypot(*leaving)
-            self.wrong_hole = False
-        elif crossing(before, now, pair.entry, inward=False):
-            self._is_through_entry = False
-        elif not self._is_through_entry and crossing(before, now, pair.exit, inward=True):
-            self.wrong_hole = True
-        for index, other in enumerate(self._pairs):
-            if index != self._chosen:
-                self.wrong_hole |= any(
-                    crossing(before, now, hole, inward=True) for hole in (other.entry, other.exit)
-                )
+    def _thread_points(self) -> list[Point]:
+        """Return the joints of the thread from the needle's base to its end, in world [m]."""
+        data = self._env.data
+        points: list[Point] = data.xpos[self._thread].tolist()
+        last = self._thread[-1]
+        pitch = LENGTH / len(self._thread)
+        # A segment runs along its body's z.
+        points.append((data.xpos[last] + pitch * data.xmat[last].reshape(3, 3)[:, 2]).tolist())
+        return points
 
 
-class ForcePlate:
-    """A force plate under the phantom: the force of needle and instruments on it.
-
-    Contact forces are not part of a state that ends with MuJoCo's position stage, and computing
-    them in place would change the state's warm start. They are computed on data of the plate's own.
+def drawn_length(points: Sequence[Point], leave: Hole) -> float:
+    """Return the length of a thread from its first point to where it goes through a plane [m].
 
     Args:
-        model: the env's model, its own copy where the env has one.
+        points: of the thread from the needle on [m].
+        leave: the exit, whose plane parts what is out from what is not.
     """
+    length = 0.0
+    for before, after in itertools.pairwise(points):
+        high = leave.height(before)
+        low = leave.height(after)
+        if high <= 0.0:
+            break
+        step = math.dist(before, after)
+        if low <= 0.0:
+            return length + step * high / (high - low)
+        length += step
+    return length
 
-    def __init__(self, model: mujoco.MjModel):
-        self._model = model
-        self._scratch = mujoco.MjData(model)
-        self._state = np.empty(mujoco.mj_stateSize(model, STATE))
-        phantom = model.body("phantom").id
-        needle_id = model.body("needle").id
-        of_geom = model.geom_bodyid
-        self._tissue = of_geom == phantom
-        # The thread hangs on the needle and is not meant; every other moving body is part of an
-        # instrument.
-        thread = (model.body_rootid[of_geom] == needle_id) & (of_geom != needle_id)
-        self._presses = (model.body_weldid[of_geom] != 0) & ~thread
 
-    def force(self, data: mujoco.MjData) -> float:
-        """Return the size of the net force on the tissue [N]."""
-        if not self._touching(data).any():
-            return 0.0
-        mujoco.mj_getState(self._model, data, self._state, STATE)
-        mujoco.mj_setState(self._model, self._scratch, self._state, STATE)
-        mujoco.mj_forward(self._model, self._scratch)
-        return float(np.linalg.norm(self.net(self._scratch)))
-
-    def _touching(self, data: mujoco.MjData) -> NDArray[np.bool_]:
-        """Return which contacts are of the tissue with the needle or an instrument, (contacts,)."""
-        one = data.contact.geom[:, 0]
-        other = data.contact.geom[:, 1]
-        touching: NDArray[np.bool_] = (self._tissue[one] & self._presses[other]) | (
-            self._tissue[other] & self._presses[one]
-        )
-        return touching
-
-    def net(self, data: mujoco.MjData) -> NDArray[np.float64]:
-        """Return the net force in world (3,) [N] of data whose forces have been computed."""
-        net = np.zeros(3)
-        wrench = np.empty(6)
-        for index in np.flatnonzero(self._touching(data)):
-            contact = data.contact[int(index)]
-            mujoco.mj_contactForce(self._model, data, int(index), wrench)
-            # MuJoCo's force is that on the second geom.
-            sign = 1.0 if self._tissue[contact.geom[1]] else -1.0
-            net += sign * (contact.frame.reshape(3, 3).T @ wrench[:3])
-        return net
+def _thread_bodies(model: mujoco.MjModel) -> list[int]:
+    """Return the bodies of the thread's segments, from the needle on; none without a thread."""
+    found = {model.body(index).name: index for index in range(model.nbody)}
+    segments = sum(name.startswith("thread_") for name in found)
+    return [found[f"thread_{index}"] for index in range(segments)]

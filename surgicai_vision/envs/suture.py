@@ -4,6 +4,10 @@ The present subtask's success must hold for `DWELL` control steps before the nex
 paper's tolerances are met before a subtask is finished (an insertion counts 5 mm before its goal),
 and the next one needs it finished. When the pull-out begins PSM2 lets go by itself, as in the
 released code. A high-level policy may choose another subtask by `enter`.
+
+In soft tissue the next subtask begins by the paper's own success: a bite beside the marks is still
+pulled out. `subtask_success`, `progress` and `is_success` ask for the marks as well
+(`envs.success`).
 """
 
 from surgicai_vision.core.config import DWELL
@@ -22,12 +26,13 @@ class Suture(SuturingEnv):
         """Go on to the next subtask when the present one's success has held; return if so."""
         state = self.simulation.task_state
         info["subtask_success"] = info["is_success"]
-        state.dwell = state.dwell + 1 if info["is_success"] else 0
+        state.dwell = state.dwell + 1 if info["paper_success"] else 0
         is_last = state.phase == len(self._subtasks) - 1
         if info["is_success"] and state.phase == state.done:
             state.done += 1
         info["progress"] = state.done
         info["is_success"] = is_last and info["is_success"]
+        info["paper_success"] = is_last and info["paper_success"]
         if is_last or state.dwell < DWELL:
             return False
         self._make_present(state.phase + 1)

@@ -24,9 +24,16 @@ MEASURED = (
     "d_angle_deg",
     "entry_mm",
     "exit_mm",
+    "bite_depth_mm",
+    "bite_length_mm",
+    "entry_deg",
+    "exit_deg",
     "slip_mm",
     "slip_deg",
     "tissue_force_n",
+    "tissue_impulse_ns",
+    "tears",
+    "thread_mm",
 )
 """Columns a summary averages over all episodes where they were measured."""
 
@@ -50,12 +57,19 @@ class EpisodeMetrics:
         failure: "" for a success, else one of `KINDS`.
         stages: subtasks that succeeded in their order, of the whole procedure; 1 for a subtask's
             own success.
-        entry_mm: where the tip went through the entry, from the hole's centre [mm]; NaN where it
-            did not.
-        exit_mm: the same at the exit.
+        entry_mm: where the tip went in, from the entry's mark [mm]; NaN where it did not.
+        exit_mm: where it came out, from the exit's mark [mm].
         slip_mm: the needle's largest shift in the active jaws since they took it [mm].
         slip_deg: its largest turn [deg].
         tissue_force_n: largest net force of needle and instruments on the tissue [N].
+        bite_depth_mm: how deep the tip went under the straight line from entry to exit [mm].
+        bite_length_mm: straight from entry to exit [mm].
+        entry_deg: needle to the skin's normal where the tip went in [deg].
+        exit_deg: the same where it came out.
+        tissue_impulse_ns: that force summed over time [N s].
+        tears: how often the tissue tore; NaN where it cannot.
+        thread_mm: thread drawn out of the exit [mm]; NaN without a thread.
+        paper_success: whether the paper's own success was reached.
     """
 
     task: str
@@ -76,6 +90,14 @@ class EpisodeMetrics:
     slip_mm: float = 0.0
     slip_deg: float = 0.0
     tissue_force_n: float = 0.0
+    bite_depth_mm: float = math.nan
+    bite_length_mm: float = math.nan
+    entry_deg: float = math.nan
+    exit_deg: float = math.nan
+    tissue_impulse_ns: float = 0.0
+    tears: float = math.nan
+    thread_mm: float = math.nan
+    paper_success: bool = False
 
 
 def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, held: bool) -> str:
@@ -113,6 +135,7 @@ def summary(rows: Sequence[EpisodeMetrics]) -> dict[str, Any]:
         "successes": len(successes),
         "success_rate": len(successes) / len(rows),
         "ci95": list(clopper_pearson(len(successes), len(rows))),
+        "paper_successes": sum(row.paper_success for row in rows),
         **{key: mean_and_std(_finite(successes, column)) for key, column in ON_SUCCESSES},
         **{column: _spread(_finite(rows, column)) for column in MEASURED},
         "grasp": first.grasp,

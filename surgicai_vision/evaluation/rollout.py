@@ -210,8 +210,9 @@ class _Slot:
         contact = bool(self.info.get("contact", False))
         success = bool(self.info.get("is_success", False)) and not self.error
         monitor = self.monitor
+        bite = monitor.bite
         held = not self.error and monitor.is_held()
-        failure = failure_kind(self.error, self.diverged, self.touched, monitor.wrong_hole, held)
+        failure = failure_kind(self.error, self.diverged, self.touched, bite.wrong_hole, held)
         row = EpisodeMetrics(
             task=self.task_config.task,
             policy=self.agent.name,
@@ -226,11 +227,19 @@ class _Slot:
             grasp=self.task_config.scene.grasp,
             failure="" if success else failure,
             stages=int(self.info.get("progress", success)),
-            entry_mm=1e3 * monitor.entry_error,
-            exit_mm=1e3 * monitor.exit_error,
+            entry_mm=1e3 * bite.entry_error,
+            exit_mm=1e3 * bite.exit_error,
+            bite_depth_mm=1e3 * bite.depth,
+            bite_length_mm=1e3 * bite.length,
+            entry_deg=math.degrees(bite.entry_angle),
+            exit_deg=math.degrees(bite.exit_angle),
             slip_mm=1e3 * monitor.slip,
             slip_deg=math.degrees(monitor.turn),
             tissue_force_n=monitor.tissue_force,
+            tissue_impulse_ns=monitor.tissue_impulse,
+            tears=monitor.tears,
+            thread_mm=1e3 * monitor.thread_drawn,
+            paper_success=monitor.paper_success and not self.error,
         )
         self.seed = None
         return Episode(row, self._film())

@@ -22,16 +22,23 @@ from surgicai_vision.report.reader import Collected, Missing, Result
 MEASURES = (
     ("d_trans_mm", "position error", "mm", "distance to the goal when the episode ends"),
     ("d_angle_deg", "angle error", "°", "angle to the goal when the episode ends"),
-    ("entry_mm", "entry error", "mm", "where the needle passed the entry, from the hole's centre"),
-    ("exit_mm", "exit error", "mm", "where the needle passed the exit, from the hole's centre"),
+    ("entry_mm", "entry error", "mm", "where the needle went in, from the entry's mark"),
+    ("exit_mm", "exit error", "mm", "where the needle came out, from the exit's mark"),
+    ("bite_depth_mm", "bite depth", "mm", "of the tip's path under the line from entry to exit"),
+    ("bite_length_mm", "bite length", "mm", "straight from entry to exit"),
+    ("entry_deg", "entry angle", "°", "of the needle to the skin's normal where it went in"),
+    ("exit_deg", "exit angle", "°", "of the needle to the skin's normal where it came out"),
     ("slip_mm", "needle slip", "mm", "largest slip of the needle in the grip, where it was held"),
     ("slip_deg", "needle slip", "°", "largest turn of the needle in the grip, where it was held"),
     (
         "tissue_force_n",
         "tissue force",
         "N",
-        "largest contact force of needle or instrument on the tissue",
+        "largest force of needle and instruments on the tissue",
     ),
+    ("tissue_impulse_ns", "force × time", "N s", "force on the tissue, summed over the episode"),
+    ("tears", "tears", "count", "how often soft tissue tore"),
+    ("thread_mm", "thread drawn", "mm", "thread that came out of the exit behind the needle"),
 )
 """Columns of an episode's row that are no count: name, what, unit, explanation."""
 
@@ -75,6 +82,12 @@ class Group:
     def successes(self) -> int:
         """Episodes that succeeded, k."""
         return sum(bool(row["success"]) for row in self.rows)
+
+    @property
+    def paper_successes(self) -> int | None:
+        """Episodes that reached the paper's own success; None where 0.1 evaluated them."""
+        found = [row.get("paper_success") for row in self.rows]
+        return None if None in found else sum(bool(value) for value in found)
 
     @property
     def episodes(self) -> int:

@@ -59,6 +59,7 @@ def condition_record(item: Group) -> dict[str, object]:
         "cells_missing": len(item.missing),
         "successes": item.successes if evaluated else None,
         "episodes": item.episodes,
+        "paper_successes": item.paper_successes if evaluated else None,
         "rate": item.rate if evaluated else None,
         "low": low,
         "high": high,

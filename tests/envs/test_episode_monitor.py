@@ -9,13 +9,15 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.envs.episode_monitor import EpisodeMonitor, ForcePlate
+from surgicai_vision.envs.bite_measures import angle_to, depth_under
+from surgicai_vision.envs.episode_monitor import EpisodeMonitor, drawn_length
+from surgicai_vision.envs.force_plate import ForcePlate
 from surgicai_vision.envs.hole_crossing import crossing
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.holes import OPENING, PAIRS
 
 NO_ACTION = np.zeros(7, np.float32)
-INFO = {"needle_slip": (0.0, 0.0)}
+INFO = {"needle_slip": (0.0, 0.0), "paper_success": False}
 
 
 def started(task="grasp", seed=names.TEST_SEED, **options):
@@ -52,6 +54,7 @@ def test_an_instrument_that_is_driven_into_the_tissue_presses_it():
     for _ in range(env.config.max_steps):
         monitor.update(env.step(action)[4])
     assert monitor.tissue_force > 1.0
+    assert 0 < monitor.tissue_impulse < monitor.tissue_force * env.config.max_steps * env.dt
 
 
 def test_monitoring_changes_nothing():
@@ -73,11 +76,20 @@ def test_the_expert_goes_through_the_middle_of_both_holes():
         if ended:
             break
     assert info["is_success"]
-    assert 0 < monitor.entry_error < 1e-3 and 0 < monitor.exit_error < 1e-3
+    assert 0 < monitor.bite.entry_error < 1e-3 and 0 < monitor.bite.exit_error < 1e-3
     assert 0 < monitor.slip < 1e-3 and monitor.turn > 0
-    assert not monitor.wrong_hole
+    assert not monitor.bite.wrong_hole
+    # The needle begins square to the skin; its circle leaves 21° off the hole's axis
+    # (`envs.geometry`).
+    assert 0 < math.degrees(monitor.bite.entry_angle) < 10
+    assert math.degrees(monitor.bite.exit_angle) == pytest.approx(21, abs=4)
+    assert monitor.bite.length == pytest.approx(env.stitch.pair.gap, abs=1e-3)
+    sagitta = needle.RADIUS - math.sqrt(needle.RADIUS**2 - (monitor.bite.length / 2) ** 2)
+    assert monitor.bite.depth == pytest.approx(sagitta, abs=4e-4)
+    assert monitor.paper_success
+    assert math.isnan(monitor.tears) and math.isnan(monitor.thread_drawn)
     monitor.reset()
-    assert math.isnan(monitor.entry_error) and monitor.slip == 0.0
+    assert math.isnan(monitor.bite.entry_error) and monitor.slip == 0.0
 
 
 def lead_tip(monitor, *points):
@@ -108,44 +120,44 @@ def test_crossings_are_measured_from_the_holes_centre():
     _, monitor = started()
     pair = PAIRS["simple"][0]
     lead_tip(monitor, *through(pair.entry, True, (3e-4, 4e-4)))
-    assert monitor.entry_error == pytest.approx(5e-4, abs=1e-6)
-    assert math.isnan(monitor.exit_error)
+    assert monitor.bite.entry_error == pytest.approx(5e-4, abs=1e-6)
+    assert math.isnan(monitor.bite.exit_error)
     lead_tip(monitor, *through(pair.exit, False, (-1e-3, 0.0)))
-    assert monitor.exit_error == pytest.approx(1e-3, abs=1e-6)
-    assert not monitor.wrong_hole
+    assert monitor.bite.exit_error == pytest.approx(1e-3, abs=1e-6)
+    assert not monitor.bite.wrong_hole
 
 
 def test_another_stitchs_hole_is_the_wrong_one_until_the_right_exit():
     _, monitor = started()
     pairs = PAIRS["simple"]
     lead_tip(monitor, *through(pairs[2].entry, True))
-    assert monitor.wrong_hole and math.isnan(monitor.entry_error)
+    assert monitor.bite.wrong_hole and math.isnan(monitor.bite.entry_error)
     lead_tip(
         monitor,
         *through(pairs[2].entry, False),
         *through(pairs[0].entry, True),
         *through(pairs[0].exit, False),
     )
-    assert not monitor.wrong_hole
+    assert not monitor.bite.wrong_hole
 
 
 def test_the_exit_from_outside_is_the_wrong_hole():
     _, monitor = started()
     lead_tip(monitor, *through(PAIRS["simple"][0].exit, True))
-    assert monitor.wrong_hole
+    assert monitor.bite.wrong_hole
 
 
 def test_the_holes_of_the_chosen_pair_are_the_right_ones():
     _, monitor = started(scene=SceneConfig(hole_pair=3))
     lead_tip(monitor, *through(PAIRS["simple"][2].entry, True))
-    assert monitor.entry_error == pytest.approx(0.0, abs=1e-6)
-    assert not monitor.wrong_hole
+    assert monitor.bite.entry_error == pytest.approx(0.0, abs=1e-6)
+    assert not monitor.bite.wrong_hole
 
 
 def test_holes_move_with_a_shifted_phantom():
     env, monitor = started(randomisation=RandomisationConfig(phantom_shift=5.0))
     lead_tip(monitor, *through(env.stitch.pair.entry, True))
-    assert monitor.entry_error == pytest.approx(0.0, abs=1e-6)
+    assert monitor.bite.entry_error == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_jump_is_no_crossing():
@@ -159,7 +171,7 @@ def test_a_jump_is_no_crossing():
         simulation.pose_needle(tuple(pose))
         simulation.refresh()
         monitor.update(INFO)
-    assert math.isnan(monitor.entry_error)
+    assert math.isnan(monitor.bite.entry_error)
 
 
 def test_crossing_has_a_direction_and_an_opening():
@@ -186,3 +198,49 @@ def test_the_thread_does_not_press():
 def test_the_needle_is_held_by_either_arm():
     held = {task: started(task)[1].is_held() for task in ("grasp", "place", "handoff", "pullout")}
     assert held == {"grasp": False, "place": True, "handoff": True, "pullout": True}
+
+
+def test_depth_counts_only_what_lies_between_entry_and_exit():
+    path = [(-1e-3, 0, -5e-3), (2e-3, 1e-3, -1e-3), (5e-3, 0, -2e-3), (9e-3, 0, -5e-3)]
+    assert depth_under((0, 0, 0), (8e-3, 0, 0), path) == pytest.approx(2e-3)
+    # Over (5, 0, -2) a line that rises by 2 mm on its 8 is at 0.5625 of its way.
+    risen = depth_under((0, 0, -1e-3), (8e-3, 0, 1e-3), path[2:3])
+    assert risen == pytest.approx(2e-3 - 1e-3 + 2e-3 * (5 * 8 - 1 * 2) / 68, rel=1e-6)
+
+
+def test_a_bite_is_measured_from_entry_to_exit():
+    _, monitor = started()
+    pair = PAIRS["simple"][0]
+    lead_tip(monitor, *through(pair.entry, True))
+    assert math.isnan(monitor.bite.length)
+    lead_tip(monitor, (0.0, pair.entry.centre[1], 0.0705), *through(pair.exit, False))
+    assert monitor.bite.length == pytest.approx(pair.gap, abs=1e-5)
+    assert monitor.bite.depth == pytest.approx(0.0749 - 0.0705, abs=2e-4)
+
+
+def test_angles_lie_between_unit_vectors():
+    assert angle_to((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)) == 0.0
+    assert angle_to((0.0, 0.0, 1.0), (0.6, 0.0, 0.8)) == pytest.approx(math.acos(0.8))
+
+
+def test_thread_is_drawn_as_far_as_it_is_out_of_the_exit():
+    leave = PAIRS["simple"][0].exit
+    centre = np.array(leave.centre)
+    normal = np.array(leave.normal)
+    points = [tuple(centre + height * normal) for height in (5e-3, 2e-3, -2e-3, 4e-3)]
+    assert drawn_length(points, leave) == pytest.approx(5e-3)
+    assert drawn_length(points[2:], leave) == 0.0
+    assert drawn_length(points[:2], leave) == pytest.approx(3e-3)
+
+
+def test_a_pullout_draws_the_thread():
+    env, monitor = started("pullout", scene=SceneConfig(thread=10))
+    assert monitor.thread_drawn == 0.0
+    expert = Expert(env)
+    for _ in range(env.config.max_steps):
+        *_, ended, _, info = env.step(expert.action())
+        monitor.update(info)
+        if ended:
+            break
+    assert info["is_success"]
+    assert 0.0 < monitor.thread_drawn < 0.095

@@ -7,7 +7,7 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import SceneConfig, TaskConfig
 from surgicai_vision.core.errors import UnknownName
-from surgicai_vision.envs.episode_monitor import ForcePlate
+from surgicai_vision.envs.force_plate import ForcePlate
 from surgicai_vision.scene import arm, build_scene
 from surgicai_vision.scene.kinematics import DVRK_JOINTS
 

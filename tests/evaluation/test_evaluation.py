@@ -14,6 +14,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError
 from surgicai_vision.envs import episode_monitor
+from surgicai_vision.envs.bite_measures import BiteMeasures
 from surgicai_vision.evaluation import policy_spec, storage
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent, RandomAgent, ZeroAgent
@@ -76,9 +77,10 @@ class FakeMonitor:
         self.clear()
 
     def clear(self):
-        self.entry_error = self.exit_error = np.nan
-        self.slip = self.turn = self.tissue_force = 0.0
-        self.wrong_hole = False
+        self.bite = BiteMeasures()
+        self.slip = self.turn = self.tissue_force = self.tissue_impulse = 0.0
+        self.tears = self.thread_drawn = np.nan
+        self.paper_success = False
 
     reset = clear
 
@@ -86,7 +88,9 @@ class FakeMonitor:
         return self.env._info()["contact"]
 
     def update(self, info):
-        self.entry_error = 5e-4
+        self.bite = BiteMeasures(entry_error=5e-4)
+        self.tissue_impulse += 0.02
+        self.paper_success |= info["is_success"]
         self.slip, self.turn, self.tissue_force = (
             1e-4 * self.env.count,
             np.pi / 180,
@@ -214,12 +218,16 @@ def test_rows_and_summary_hold_what_was_measured(fake_envs, tmp_path):
     rows = {row.seed: row for row in rows_of(episodes)}
     assert (rows[3].entry_mm, rows[3].slip_mm, rows[3].slip_deg) == pytest.approx((0.5, 0.3, 1.0))
     assert rows[40].tissue_force_n == pytest.approx(1.2)
+    assert rows[40].tissue_impulse_ns == pytest.approx(0.24)
+    assert (rows[3].paper_success, rows[40].paper_success) == (True, False)
     # Nothing of the episode before is left in one that could not start.
     assert np.isnan([rows[97].entry_mm, rows[3].exit_mm]).all() and rows[97].slip_mm == 0.0
     result = storage.write_evaluation(tmp_path, episodes, RunConfig(policy="zero"), {})
     assert result["entry_mm"] == {"mean": pytest.approx(0.5), "std": pytest.approx(0.0), "n": 2}
     assert result["exit_mm"] == {"mean": None, "std": None, "n": 0}
     assert result["tissue_force_n"]["n"] == 3
+    assert result["paper_successes"] == 1
+    assert result["tears"] == result["thread_mm"] == {"mean": None, "std": None, "n": 0}
     assert json.loads((tmp_path / storage.MARKER).read_text())["summary"] == result
     assert repr(storage.read_rows(tmp_path)) == repr(as_table(rows_of(episodes)))
 

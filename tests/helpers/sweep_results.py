@@ -55,6 +55,12 @@ def episode(task, policy, seed, success, generator, stages=0):
         slip_mm=float(abs(generator.normal(0.2, 0.1))),
         slip_deg=float(abs(generator.normal(3, 1))),
         tissue_force_n=float(abs(generator.normal(0.4, 0.2))),
+        bite_depth_mm=1.1 if passed else float("nan"),
+        bite_length_mm=7.8 if passed else float("nan"),
+        entry_deg=21.0 if passed else float("nan"),
+        exit_deg=23.0 if passed else float("nan"),
+        tissue_impulse_ns=0.6,
+        paper_success=success,
     )
     kept = np.linspace(0, steps, 10).astype(np.int64)
     return Episode(row, Film(kept, np.stack([kept, np.full(10, seed)], axis=1).astype(np.float64)))

@@ -1,0 +1,177 @@
+"""Bite measures: where a stitch went in and out of the tissue, how deep, and at which angles.
+
+A *bite* is one passage of the needle through the tissue. Two watches follow its tip, one step after
+another, and give the same measures of the latest bite of an episode:
+
+* `ChannelWatch`, tissue "channels": a bite begins where the tip goes through the opening of the
+  entry, inwards, and ends where it goes through that of the exit, outwards. The openings are
+  squares of `holes.OPENING`, so an error is at most their half diagonal, 2.7 mm.
+* `SoftWatch`, tissue "soft": a bite is what the tissue says (`envs.tissue`): it can begin and end
+  anywhere.
+
+The measures, each NaN where its part of the bite was not made in this episode (a start inside the
+tissue brings its own bite):
+
+* `entry_error`, `exit_error`: from the bite's point to the mark (the hole's centre) [m].
+* `length`: straight from entry to exit [m].
+* `depth`: of the deepest point of the tip's path under that straight line, along world -z [m].
+* `entry_angle`, `exit_angle`: of the needle's tangent at its tip to the skin's normal at the mark,
+  when the tip goes in and out [rad]; 0 is square to the skin, as surgical textbooks ask.
+* `wrong_hole`: channels: the tip went through an opening of another stitch, or through this exit
+  from outside, and has not left through the right exit since. Soft: the latest bite begins or ends
+  nearer to another mark than to its own.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.hole_crossing import JUMP, crossing
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.scene.holes import Hole, HolePair, Point
+
+
+@dataclass(frozen=True)
+class BiteMeasures:
+    """Measures of one bite; see the module's docstring."""
+
+    entry_error: float = math.nan
+    exit_error: float = math.nan
+    depth: float = math.nan
+    length: float = math.nan
+    entry_angle: float = math.nan
+    exit_angle: float = math.nan
+    wrong_hole: bool = False
+
+
+class BiteWatch(Protocol):
+    """Follows the needle's tip."""
+
+    measures: BiteMeasures
+    """Of the latest bite."""
+
+    def update(self) -> None:
+        """Read the state that a control step ended in."""
+
+
+def depth_under(entry: Point, leave: Point, path: Sequence[Point]) -> float:
+    """Return how deep a path goes under the straight line from `entry` to `leave` [m].
+
+    Along world -z, over the points of the path that lie between the two in the line's direction; at
+    least 0.
+    """
+    way = [after - before for before, after in zip(entry, leave, strict=True)]
+    square = sum(part * part for part in way)
+    deepest = 0.0
+    for point in path:
+        offset = [now - before for before, now in zip(entry, point, strict=True)]
+        share = sum(a * b for a, b in zip(way, offset, strict=True)) / square
+        if 0.0 <= share <= 1.0:
+            deepest = max(deepest, share * way[2] - offset[2])
+    return deepest
+
+
+def angle_to(direction: Point, needle_tangent: Point) -> float:
+    """Return the angle between two unit vectors [rad]."""
+    cosine = sum(a * b for a, b in zip(direction, needle_tangent, strict=True))
+    return math.acos(max(-1.0, min(1.0, cosine)))
+
+
+def tip_tangent(simulation: Simulation) -> Point:
+    """Return the unit tangent of the needle at its tip, forwards, in world."""
+    r0, r1, _, r3, r4, _, r6, r7, _ = poses.rotation(simulation.needle())
+    along = math.sin(simulation.tip_angle)
+    across = math.cos(simulation.tip_angle)
+    return (r0 * along + r1 * across, r3 * along + r4 * across, r6 * along + r7 * across)
+
+
+def _inwards(hole: Hole) -> Point:
+    x, y, z = hole.normal
+    return (-x, -y, -z)
+
+
+def _in_world(hole: Hole, local: tuple[float, float]) -> Point:
+    """Return a point of a hole's plane in world [m]."""
+    first, second, _ = hole.axes
+    x, y, z = (
+        centre + local[0] * a + local[1] * b
+        for centre, a, b in zip(hole.centre, first, second, strict=True)
+    )
+    return (x, y, z)
+
+
+class ChannelWatch:
+    """Follows the tip through open channels.
+
+    Args:
+        simulation: read from its present state on.
+        pair: the stitch's holes.
+        others: the phantom's other pairs.
+    """
+
+    def __init__(self, simulation: Simulation, pair: HolePair, others: Sequence[HolePair]):
+        self.measures = BiteMeasures()
+        self._simulation = simulation
+        self._pair = pair
+        self._others = others
+        self._is_inside = simulation.task_state.holes_passed >= 1
+        self._entry: Point | None = None
+        self._path: list[Point] = []
+        self._tip = simulation.needle_point(simulation.tip_angle)
+
+    def update(self) -> None:
+        """Read the state that a control step ended in."""
+        before = self._tip
+        self._tip = now = self._simulation.needle_point(self._simulation.tip_angle)
+        if math.dist(before, now) <= JUMP:
+            self._note_crossings(before, now)
+        if self._is_inside:
+            self._path.append(now)
+
+    def _note_crossings(self, before: Point, now: Point) -> None:
+        """Note where the tip went through the opening of any hole."""
+        pair = self._pair
+        entering = crossing(before, now, pair.entry, inward=True)
+        leaving = crossing(before, now, pair.exit, inward=False)
+        if entering is not None:
+            self._enter(entering)
+        elif leaving is not None and self._is_inside:
+            self._leave(leaving)
+        elif crossing(before, now, pair.entry, inward=False):
+            self._is_inside = False
+        elif not self._is_inside and crossing(before, now, pair.exit, inward=True):
+            self.measures = replace(self.measures, wrong_hole=True)
+        if any(
+            crossing(before, now, hole, inward=True)
+            for other in self._others
+            for hole in (other.entry, other.exit)
+        ):
+            self.measures = replace(self.measures, wrong_hole=True)
+
+    def _enter(self, place: tuple[float, float]) -> None:
+        """Begin a bite; what was noted of one before stays but for its entry."""
+        hole = self._pair.entry
+        self._is_inside = True
+        self._entry = _in_world(hole, place)
+        self._path = []
+        self.measures = replace(
+            self.measures,
+            entry_error=math.hypot(*place),
+            entry_angle=angle_to(_inwards(hole), tip_tangent(self._simulation)),
+        )
+
+    def _leave(self, place: tuple[float, float]) -> None:
+        """End the bite."""
+        hole = self._pair.exit
+        leave = _in_world(hole, place)
+        entry = self._entry
+        self.measures = replace(
+            self.measures,
+            exit_error=math.hypot(*place),
+            exit_angle=angle_to(hole.normal, tip_tangent(self._simulation)),
+            depth=math.nan if entry is None else depth_under(entry, leave, self._path),
+            length=math.nan if entry is None else math.dist(entry, leave),
+            wrong_hole=False,
+        )

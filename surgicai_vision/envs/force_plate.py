@@ -1,0 +1,62 @@
+"""Force plate: the net force of needle and instruments on the phantom, as one under it would show.
+
+Contact forces are not part of a state that ends with MuJoCo's position stage, and computing them in
+place would change the state's warm start. They are computed on data of the plate's own. The thread
+hangs on the needle and is not meant: what it pulls in the tissue is not counted.
+"""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+class ForcePlate:
+    """A force plate under the phantom; see the module's docstring.
+
+    Args:
+        model: the env's model, its own copy where the env has one.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        self._model = model
+        self._scratch = mujoco.MjData(model)
+        self._state = np.empty(mujoco.mj_stateSize(model, STATE))
+        phantom = model.body("phantom").id
+        needle = model.body("needle").id
+        of_geom = model.geom_bodyid
+        self._tissue = of_geom == phantom
+        # Every moving body but needle and thread is part of an instrument.
+        thread = (model.body_rootid[of_geom] == needle) & (of_geom != needle)
+        self._presses = (model.body_weldid[of_geom] != 0) & ~thread
+
+    def force(self, data: mujoco.MjData) -> float:
+        """Return the size of the net force on the tissue [N]."""
+        if not self._touching(data).any():
+            return 0.0
+        mujoco.mj_getState(self._model, data, self._state, STATE)
+        mujoco.mj_setState(self._model, self._scratch, self._state, STATE)
+        mujoco.mj_forward(self._model, self._scratch)
+        return float(np.linalg.norm(self.net(self._scratch)))
+
+    def net(self, data: mujoco.MjData) -> NDArray[np.float64]:
+        """Return the net force in world (3,) [N] of data whose forces have been computed."""
+        net = np.zeros(3)
+        wrench = np.empty(6)
+        for index in np.flatnonzero(self._touching(data)):
+            contact = data.contact[int(index)]
+            mujoco.mj_contactForce(self._model, data, int(index), wrench)
+            # MuJoCo's force is that on the second geom.
+            sign = 1.0 if self._tissue[contact.geom[1]] else -1.0
+            net += sign * (contact.frame.reshape(3, 3).T @ wrench[:3])
+        return net
+
+    def _touching(self, data: mujoco.MjData) -> NDArray[np.bool_]:
+        """Return which contacts are of the tissue with the needle or an instrument, (contacts,)."""
+        one = data.contact.geom[:, 0]
+        other = data.contact.geom[:, 1]
+        touching: NDArray[np.bool_] = (self._tissue[one] & self._presses[other]) | (
+            self._tissue[other] & self._presses[one]
+        )
+        return touching
