@@ -46,6 +46,15 @@ MODALITIES = (RGB, DEPTH, SEGMENTATION)
 PARTS = ("background", "phantom", "needle", "thread", "psm1", "psm2")
 """Named parts; a part's index is its value in a segmentation image."""
 
+APPEARANCES = ("silicone", "mucosa", "skin", "muscle", "fat", "liver", "bowel", "scar")
+"""Families of looks (`scene.visual.families`). A state holds a family's place here: only append."""
+HELDOUT_APPEARANCES = ("liver", "bowel", "scar")
+"""Families that no training may see."""
+TRAIN_APPEARANCES = tuple(name for name in APPEARANCES if name not in HELDOUT_APPEARANCES)
+TRAIN = "train"
+HELDOUT = "heldout"
+"""Sets of families, as `RandomisationConfig.appearance` names them."""
+
 OBS_TYPES = ("state", "goal", "pixels", "pixels_agent_pos")
 GRASPS = ("friction", "attach")
 TORQUES = ("effective", "dvrk")

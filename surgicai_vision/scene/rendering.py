@@ -25,6 +25,7 @@ from surgicai_vision.core.names import DEPTH, MODALITIES, PARTS, RGB, SEGMENTATI
 from surgicai_vision.scene import opengl
 from surgicai_vision.scene.cameras import camera_id
 from surgicai_vision.scene.opengl import renderer_string
+from surgicai_vision.scene.visual import appearance
 
 __all__ = ["QUALITIES", "Frame", "FrameRenderer", "parts_of_geoms", "renderer_string"]
 
@@ -153,12 +154,19 @@ class _Target:
         self.depths = np.empty((height, width), dtype=np.float32)
         self.parts = parts_of_geoms(model)
         self.codes = np.zeros(0, dtype=np.uint8)
+        self.look = appearance.shown(model)
+        self.painted = [0.0] * len(self.look)
 
     def draw(
         self, data: mujoco.MjData, view: mujoco.MjvCamera, wanted: tuple[str, ...]
     ) -> dict[str, Frame]:
         """Return the wanted modalities from at most two passes."""
         opengl.make_current()
+        numbers = self.look.tolist()
+        if numbers != self.painted:
+            appearance.paint(self.model, self.context)
+            self.painted = numbers
+            self.codes = np.zeros(0, dtype=np.uint8)
         # Another target may have drawn since; without this its buffer would be drawn over and read.
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value

@@ -103,7 +103,7 @@ def test_images_are_bright_and_coloured_everywhere(model, camera):
     assert image[parts == 0].max(axis=1).min() > 30  # no black background
     needle_colour = image[parts == PARTS.index("needle")].mean()
     tissue_colour = image[parts == PARTS.index("phantom")].mean()
-    assert needle_colour > tissue_colour + 60
+    assert needle_colour > tissue_colour + 40  # of steel that is lit and does not glow
     assert (image == 255).all(axis=2).mean() < 0.01
 
 

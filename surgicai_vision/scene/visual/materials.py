@@ -15,7 +15,7 @@ from surgicai_vision.core.names import ARMS, PSM1, PSM2
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.phantom import ORIGIN, SIZE, TABLE
-from surgicai_vision.scene.visual import shapes, skin, textures, tool
+from surgicai_vision.scene.visual import appearance, shapes, skin, textures, tool
 from surgicai_vision.scene.visual.shapes import hide, show
 
 DRAPE_X = (0.04, 0.08, 0.13, 0.19, 0.27, 0.40, 0.60, 0.90)
@@ -24,6 +24,9 @@ look; between the first two, below the phantom, it has a hole, for every hidden 
 as a visible one."""
 DRAPE_WAVE = 0.006
 """Height of its folds [m]."""
+SPOT_NEAR = 0.2
+"""Constant part of the spot's attenuation; the rest grows with the square of the distance. Without
+it the shafts, which pass close to the endoscope, were white."""
 
 Shape = mujoco.mjtGeom.mjGEOM_MESH
 
@@ -34,7 +37,7 @@ MATERIALS: dict[str, Mapping[str, float | list[float]]] = {
     "ink": {"rgba": [0.16, 0.10, 0.42, 1.0], "specular": 0.05, "shininess": 0.1},
     "drape": {"rgba": [1.0, 1.0, 1.0, 1.0], "specular": 0.0, "shininess": 0.0},
     "tray": {"rgba": [0.72, 0.74, 0.74, 1.0], "specular": 0.2, "shininess": 0.3},
-    "needle": {"rgba": [0.97, 0.98, 1.0, 1.0], "specular": 1.0, "shininess": 0.9, "emission": 0.35},
+    "needle": {"rgba": [0.97, 0.98, 1.0, 1.0], "specular": 1.0, "shininess": 0.9},
     "thread": {"rgba": [0.07, 0.05, 0.16, 1.0], "specular": 0.3, "shininess": 0.4},
     "steel": {"rgba": [0.58, 0.60, 0.64, 1.0], "specular": 0.9, "shininess": 0.7},
     "jaw": {"rgba": [0.36, 0.37, 0.40, 1.0], "specular": 0.6, "shininess": 0.5},
@@ -48,6 +51,16 @@ def add_materials(spec: mujoco.MjSpec) -> None:
     """Add the materials of the scene and their textures."""
     textures.add_texture(spec, "tissue", textures.tissue())
     textures.add_texture(spec, "drape", textures.cloth())
+    for name in ("tray", "metal"):  # slots that only other appearances show
+        height, width = appearance.SIZES[name]
+        spec.add_texture(
+            name=name,
+            type=mujoco.mjtTexture.mjTEXTURE_2D,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+            height=height,
+            width=width,
+        )
+    spec.add_numeric(name=appearance.NUMBERS, size=2, data=[0.0, 0.0])
     for name, values in MATERIALS.items():
         material = spec.add_material(name=name, **values)
         if name in ("tissue", "drape"):
@@ -74,6 +87,14 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
             specular=[0.5 * strength] * 3,
             castshadow=name == "key",
         )
+    falloff = (1.0 - SPOT_NEAR) / appearance.SPOT_DISTANCE**2
+    world.add_light(
+        name="endoscope",
+        type=mujoco.mjtLightType.mjLIGHT_SPOT,
+        active=False,
+        attenuation=[SPOT_NEAR, 0.0, falloff],
+        castshadow=False,
+    )
     # Times the extent: a smaller shadow map shows stripes towards its edge.
     spec.visual.map.shadowclip = 9.0
     spec.add_texture(
