@@ -92,12 +92,19 @@ def main() -> None:
     parser.add_argument("--layout", default="simple")
     parser.add_argument("--hole-pair", type=int, default=1)
     parser.add_argument("--grasp", default="friction")
+    parser.add_argument("--tissue", default="channels", choices=names.TISSUES)
+    parser.add_argument("--tissue-forces", default="phantom", choices=names.TISSUE_FORCES)
     parser.add_argument("--step", default="paper")
     parser.add_argument("--tolerance", default="paper")
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
     scene = SceneConfig(
-        layout=chosen.layout, hole_pair=chosen.hole_pair, thread=chosen.thread, grasp=chosen.grasp
+        layout=chosen.layout,
+        hole_pair=chosen.hole_pair,
+        thread=chosen.thread,
+        grasp=chosen.grasp,
+        tissue=chosen.tissue,
+        tissue_forces=chosen.tissue_forces,
     )
     tasks = names.SUBTASKS if chosen.task == "all" else (chosen.task,)
     configs = [TaskConfig(task, scene, chosen.step, chosen.tolerance) for task in tasks]

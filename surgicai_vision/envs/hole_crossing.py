@@ -6,14 +6,20 @@ Two conditions must agree, so that tunnelling or teleporting never counts.
   the opening; from then on the needle stays in the exit's opening until the whole of it is beyond;
   and the tip never moves further than `JUMP` in one control step.
 * In space: the needle's arc crosses both planes inside the openings now.
+
+In soft tissue, which has no openings, the tissue's own events say it (`envs.tissue`): the flank of
+the entry is pierced, then that of the exit, then the needle is out.
 """
 
 import math
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from surgicai_vision.envs.task_state import TaskState
 from surgicai_vision.scene.holes import OPENING, Hole, HolePair, Point
 from surgicai_vision.scene.kinematics import Pose
+
+if TYPE_CHECKING:
+    from surgicai_vision.envs.tissue import Tissue
 
 JUMP = 0.004
 """Furthest the tip can move in one control step [m]: eight times the default step size."""
@@ -26,6 +32,9 @@ EJECTED = 5.0
 
 class NeedlePose(Protocol):
     """Where a needle is; `Simulation` measures it."""
+
+    tissue: "Tissue | None"
+    """The soft tissue it pierces, None in tissue with channels."""
 
     radius: float
     """Of the needle's arc [m]."""
@@ -51,6 +60,8 @@ def update(now: NeedlePose, state: TaskState, pair: HolePair) -> None:
             state.holes_passed = 0
         if moved > EJECTED:
             state.has_diverged = True
+    elif now.tissue is not None:
+        state.holes_passed = now.tissue.passed(pair)
     elif passed == 0:
         if crossing(before, tip, pair.entry, inward=True):
             state.holes_passed = 1

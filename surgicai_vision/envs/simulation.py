@@ -28,6 +28,7 @@ from surgicai_vision.envs import attach, control, poses, randomisation
 from surgicai_vision.envs.attach import Welds
 from surgicai_vision.envs.control import COMMAND_SIZE, Command, StepSize
 from surgicai_vision.envs.task_state import TaskState
+from surgicai_vision.envs.tissue import Tissue
 from surgicai_vision.scene import Scene, kinematics, needle
 from surgicai_vision.scene.arm import GRASP_DEPTH
 from surgicai_vision.scene.kinematics import Pose
@@ -55,7 +56,7 @@ _WELDS = _DRAWS + randomisation.SIZE
 _QUEUE = _WELDS + attach.SIZE
 USED = _QUEUE + 7 * LATENCY_LIMIT
 """What the user data hold, in this order: task state, commands, an episode's randomisation, welds,
-waiting actions."""
+waiting actions; soft tissue follows (`tissue.SIZE`)."""
 
 
 class Simulation:
@@ -72,7 +73,8 @@ class Simulation:
         self.scene = scene
         self.latency = latency
         welded = scene.config.grasp == "attach"
-        self.model = copy.copy(scene.model) if own_model or welded else scene.model
+        is_soft = scene.config.tissue == "soft"
+        self.model = copy.copy(scene.model) if own_model or welded or is_soft else scene.model
         self.data = data = mujoco.MjData(self.model)
         self._ctrl = data.ctrl
         self._qpos = data.qpos
@@ -83,6 +85,7 @@ class Simulation:
         self.radius = needle.RADIUS
         self.tip_angle = needle.TIP_ANGLE
         self._welds = Welds(self.model, self.data) if welded else None
+        self.tissue = Tissue(scene, self.model, data) if is_soft else None
         self._own = own_model
         self._instrument = scene.config.instrument
         self._fingers = {arm: scene.arms[arm].finger_qpos for arm in names.ARMS}
@@ -117,6 +120,8 @@ class Simulation:
             self.data.userdata[_DRAWS:_WELDS] = self.draws
         if self._welds:
             self._welds.unpack([0.0] * attach.SIZE)
+        if self.tissue:
+            self.tissue.clear()
         self.refresh()
 
     def randomise(self, draws: randomisation.Draws) -> None:
@@ -133,6 +138,8 @@ class Simulation:
         self.draws = draws
         self.offsets = randomisation.joint_offsets(draws)
         self.radius = randomisation.needle_radius(draws)
+        if self.tissue:
+            self.tissue.meet(self.radius, self.tip_angle)
 
     def refresh(self) -> None:
         """Recompute positions, velocities and contacts of the present state."""
@@ -174,11 +181,13 @@ class Simulation:
         _SET_SEVEN(self._ctrl, self._servos[arm], *joints, control.jaw_servo(command.jaw))
 
     def pose_needle(self, pose: Pose) -> None:
-        """Put the needle at a pose in world, at rest."""
+        """Put the needle at a pose in world, at rest; where that is in soft tissue, embedded."""
         free = self.scene.needle_qpos.start
         self.data.qpos[free : free + 3] = poses.position(pose)
         turn = matrix_to_quaternion_flat(poses.rotation(pose))
         self.data.qpos[free + 3 : free + 7] = turn
+        if self.tissue:
+            self.tissue.embed()
 
     def to_base(self, arm: str, pose: Pose) -> Pose:
         """Return a pose in world as one in the arm's base."""
@@ -189,6 +198,8 @@ class Simulation:
         if steps:
             mujoco.mj_step(self.model, self.data, steps)
         self.data.time = CLOCK_START
+        if self.tissue:
+            self.tissue.update()
         self.refresh()
         if self._welds:
             self._attach(self._welds)
@@ -221,6 +232,8 @@ class Simulation:
         due = data.time + self._control_time
         mujoco.mj_step2(self.model, data)
         mujoco.mj_step(self.model, data, SUBSTEPS - 1)
+        if self.tissue:
+            self.tissue.update()
         mujoco.mj_step1(self.model, data)
         self._read = None
         if self._welds:
@@ -395,8 +408,10 @@ class Simulation:
     def touches_phantom(self, *, needle: bool) -> bool:
         """Return True if an instrument, or with `needle` the needle too, touches the phantom.
 
-        The thread always may.
+        The thread always may. A needle in soft tissue touches it.
         """
+        if needle and self.tissue and self.tissue.stage:
+            return True
         bodies = self.model.geom_bodyid[self.data.contact.geom]
         may = self.model.body_rootid[bodies] == self._needle_id  # the thread hangs on the needle
         if needle:
@@ -414,6 +429,9 @@ class Simulation:
         self.data.userdata[: len(values)] = values
         if self._welds:
             self.data.userdata[_WELDS:_QUEUE] = self._welds.pack()
+        if self.tissue:
+            packed = self.tissue.pack()
+            self.data.userdata[USED : USED + len(packed)] = packed
         state = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, self.data, state, STATE)
         return state
@@ -444,4 +462,6 @@ class Simulation:
             self.randomise(draws)
         if self._welds:
             self._welds.unpack(values[_WELDS:_QUEUE])
+        if self.tissue:
+            self.tissue.unpack(values[USED:])
         self.refresh()

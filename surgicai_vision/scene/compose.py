@@ -22,7 +22,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.cameras import other_cameras
 from surgicai_vision.core.config import SceneConfig
 from surgicai_vision.core.errors import UnknownName
-from surgicai_vision.scene import arm, holes, kinematics, needle, phantom, rotations, thread
+from surgicai_vision.scene import arm, holes, kinematics, needle, phantom, rotations, thread, tissue
 from surgicai_vision.scene.cameras import add_cameras
 from surgicai_vision.scene.visual import materials
 
@@ -117,6 +117,8 @@ def _build_scene(config: SceneConfig, others: tuple[str, ...]) -> Scene:
     spec = build_spec(config)
     model = spec.compile()
     text = spec.to_xml() + configuration.digest(config)
+    if config.tissue == "soft":
+        text += configuration.digest(tissue.FORCES[config.tissue_forces])
     if others:
         add_cameras(spec, others, config.instrument)
         model = spec.compile()
@@ -144,11 +146,24 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     materials.add_surroundings(spec)
     soft = {"contype": 0, "conaffinity": SURFACES | THREAD}
     phantom.add_table(spec, soft)
-    phantom.add_phantom(spec, config.layout, needle=soft, arm={"contype": 0, "conaffinity": FIRM})
+    is_soft = config.tissue == "soft"
+    phantom.add_phantom(
+        spec,
+        config.layout,
+        needle=soft,
+        arm={"contype": 0, "conaffinity": FIRM},
+        ridge={"contype": 0, "conaffinity": FIRM | THREAD | (0 if is_soft else SURFACES)},
+        is_solid=is_soft,
+    )
     body = needle.add_needle(spec, {"contype": SURFACES | GRIP, "conaffinity": 0})
     thread.add_thread(
         spec, body, needle.point(0.0).tolist(), config.thread, {"contype": THREAD, "conaffinity": 0}
     )
+    if is_soft:
+        spec.nuserdata += tissue.SOFT_DATA
+        forces = tissue.FORCES[config.tissue_forces]
+        skin = {"contype": 0, "conaffinity": SURFACES}
+        tissue.add_soft_tissue(spec, config.layout, forces, config.thread, skin)
     for name in names.ARMS:
         _add_arm(spec, config, name)
     if config.grasp == "attach":

@@ -1,8 +1,9 @@
 """Phantom: a tissue pad with a ridge along y; the four hole pairs open on the ridge's two flanks.
 
-Only the walls are solid: each flank is a plate of `WALL` thickness with square openings, so the
-needle runs free inside the ridge, as in SurgicAI's phantom, whose holes hang on springs. The
-openings are wide for the same reason as there: the needle's arc meets them 21° off their axis.
+Only the walls are solid where the tissue has channels: each flank is a plate of `WALL` thickness
+with square openings, so the needle runs free inside the ridge, as in SurgicAI's phantom, whose
+holes hang on springs. The openings are wide for the same reason as there: the needle's arc meets
+them 21° off their axis. Soft tissue has no openings (`scene.tissue`).
 
 Tissue yields to steel: the jaws may dent the pad by `DENT` before they meet its firm layer, while
 the needle, a hundred times lighter, lies on its surface. Without it no jaw whose pads reach past
@@ -53,7 +54,13 @@ MuJoCo's default, which MuJoCo would take at equal priority."""
 
 
 def add_phantom(
-    spec: mujoco.MjSpec, layout: str, needle: dict[str, int], arm: dict[str, int]
+    spec: mujoco.MjSpec,
+    layout: str,
+    needle: dict[str, int],
+    arm: dict[str, int],
+    ridge: dict[str, int],
+    *,
+    is_solid: bool,
 ) -> None:
     """Add the phantom to `spec` as one fixed body.
 
@@ -62,9 +69,11 @@ def add_phantom(
         layout: a key of `holes.PAIRS`.
         needle: collision bits of what the needle and thread touch.
         arm: collision bits of what the instruments touch.
+        ridge: collision bits of the ridge's flanks and crest.
+        is_solid: no holes: what the needle meets there is added by `scene.tissue`.
     """
     body = spec.worldbody.add_body(name="phantom")
-    both = {key: needle[key] | arm[key] for key in needle}
+    add_flank = _add_solid_flank if is_solid else _add_flank
     half = [side / 2 for side in SIZE]
     for name, top, bits, group in (("pad", SURFACE, needle, 0), ("firm", SURFACE - DENT, arm, 4)):
         body.add_geom(
@@ -83,10 +92,10 @@ def add_phantom(
         zip(pairs, edges[:-1], edges[1:], strict=True), start=1
     ):
         for side, hole in (("entry", pair.entry), ("exit", pair.exit)):
-            _add_flank(
-                body, f"phantom_{side}{index}", hole, start, end, flank_height(pair, hole), both
+            add_flank(
+                body, f"phantom_{side}{index}", hole, start, end, flank_height(pair, hole), ridge
             )
-        _add_crest(body, f"phantom_crest{index}", pair, start, end, both)
+        add_crest(body, f"phantom_crest{index}", pair, start, end, ridge)
 
 
 def add_table(spec: mujoco.MjSpec, bits: dict[str, int]) -> None:
@@ -130,8 +139,7 @@ def _add_flank(
 ) -> None:
     """Add the four boxes that frame one opening, from the crest down to the pad."""
     opening = OPENING / 2
-    drop = (hole.centre[2] - SURFACE) / math.sin(abs(hole.tilt)) + WALL
-    up = -math.copysign(1.0, hole.tilt)
+    drop = flank_depth(hole)
     near = end - hole.centre[1]
     far = start - hole.centre[1]
     rectangles = {
@@ -141,20 +149,64 @@ def _add_flank(
         "right": (-opening, opening, opening, far),
     }
     for part, (low, high, first, last) in rectangles.items():
-        local = np.array([up * (low + high) / 2, (first + last) / 2, -WALL / 2])
-        body.add_geom(
-            name=f"{name}_{part}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=(np.asarray(hole.centre) + hole.rotation @ local).tolist(),
-            quat=[math.cos(hole.tilt / 2), 0.0, math.sin(hole.tilt / 2), 0.0],
-            size=[(high - low) / 2, (last - first) / 2, WALL / 2],
-            material="tissue",
-            **CONTACT,
-            **bits,
-        )
+        add_plate(body, f"{name}_{part}", hole, (low, high), (first, last), WALL, CONTACT | bits)
 
 
-def _add_crest(
+def _add_solid_flank(
+    body: mujoco.MjsBody,
+    name: str,
+    hole: Hole,
+    start: float,
+    end: float,
+    rise: float,
+    bits: dict[str, int],
+) -> None:
+    """Add one box without an opening, from the crest down to the pad."""
+    across = (end - hole.centre[1], start - hole.centre[1])
+    add_plate(body, name, hole, (-flank_depth(hole), rise), across, WALL, CONTACT | bits)
+
+
+def flank_depth(hole: Hole) -> float:
+    """Return the length of the flank from the hole's centre down into the pad [m]."""
+    return (hole.centre[2] - SURFACE) / math.sin(abs(hole.tilt)) + WALL
+
+
+def add_plate(
+    body: mujoco.MjsBody,
+    name: str,
+    hole: Hole,
+    along: tuple[float, float],
+    across: tuple[float, float],
+    thickness: float,
+    contact: dict[str, object],
+) -> None:
+    """Add a box whose outer face is a rectangle of a hole's plane.
+
+    Args:
+        body: the phantom.
+        name: of the geom.
+        hole: says the plane.
+        along: where the rectangle begins and ends, up the flank from the hole's centre [m].
+        across: the same along the wound [m].
+        thickness: of the box [m].
+        contact: collision bits and contact parameters.
+    """
+    low, high = along
+    first, last = across
+    up = -math.copysign(1.0, hole.tilt)
+    local = np.array([up * (low + high) / 2, (first + last) / 2, -thickness / 2])
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=(np.asarray(hole.centre) + hole.rotation @ local).tolist(),
+        quat=[math.cos(hole.tilt / 2), 0.0, math.sin(hole.tilt / 2), 0.0],
+        size=[(high - low) / 2, (last - first) / 2, thickness / 2],
+        material="tissue",
+        **contact,
+    )
+
+
+def add_crest(
     body: mujoco.MjsBody, name: str, pair: HolePair, start: float, end: float, bits: dict[str, int]
 ) -> None:
     """Add the ridge's rounded top, touching the upper ends of both flanks from inside."""

@@ -1,0 +1,251 @@
+"""Soft tissue: what of it is part of the MuJoCo model, and the forces it resists with.
+
+`add_soft_tissue` turns the phantom's ridge into tissue without holes that can be pierced anywhere.
+What happens during an episode, when the skin is pierced and what is held where, is
+`envs.tissue`. The elements:
+
+* Skin: on each flank a thick box that only the needle meets, `SKIN_STIFFNESS` soft. It gives way
+  before it is pierced. The jaws and the thread meet the flank as they do in tissue with channels.
+* Two carriers: weightless bodies on hinges through the centre of the needle's arc. The site on
+  each is a point of the needle that can slide along the arc.
+* Two holds: `connect` equalities between a carrier's site and an anchor, a mocap body. Along the
+  arc the hinge is free but for its `frictionloss`, the friction of the needle's shaft; across it
+  the equality is the lateral spring of the tissue. Solved as constraints both are stable at 2 ms:
+  an explicit spring of 0.5 N/mm on a needle of 0.2 g would not be.
+* Holds of the thread: the same between a capsule of the thread and an anchor, `THREAD_HOLDS` of
+  them. Which capsule, and where on it, is rewritten as the thread slides through.
+
+Every force is a field of `TissueForces`; `docs/tissue.md` says what is known and what is chosen.
+"""
+
+import math
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import mujoco
+
+from surgicai_vision.scene import needle, phantom
+from surgicai_vision.scene.holes import PAIRS
+
+THICKNESS = 0.0025
+"""Thickness of the skin's boxes [m]: a box pushes a needle out of its nearest face, so it must be
+thicker than the dent at which the skin is pierced."""
+RESPONSE = 62500.0
+"""Stiffness of the reference acceleration of skin and holds [1/s²]: the 4 ms of the scene's other
+contacts. Anything light diverges above 1/dt² = 250,000."""
+FRICTION_SOLREF = (0.004, 1.0)
+FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Of the shaft's friction. With MuJoCo's default it creeps, and holds 0.15 N in place of 0.62 N."""
+CARRIER_MASS = 1e-6
+"""[kg]; the two weigh 1 % of the needle."""
+CARRIER_ARMATURE = 1e-7
+"""[kg·m²]: along the arc a carrier is as inert as 1 g, which 2 ms can resolve."""
+CARRIER_DAMPING = 2e-7
+"""[N·m·s/rad]; below 2 I / dt, as the scene's damping is explicit."""
+THREAD_HOLDS = 4
+"""Places that can hold the thread: entry and exit of the last two bites."""
+HIDDEN = (0.0, 0.0, -0.1)
+"""Where anchors stay that hold nothing [m, world]."""
+SOFT_DATA = 520
+"""Numbers that `envs.tissue` keeps inside MuJoCo's state."""
+
+
+@dataclass(frozen=True)
+class TissueForces:
+    """How tissue resists a suture needle and its thread.
+
+    The parts are those that Okamura, Simone and O'Leary (IEEE Transactions on Biomedical
+    Engineering 51:1707, 2004) found in needle insertions: stiffness before the puncture, then
+    friction in proportion to the depth, and a constant cutting force. Across the shaft they are
+    those of Jackson and Çavuşoğlu (ICRA 2012): tissue that a needle off its own arc compresses.
+    None depends on the speed (Frick et al., Journal of Biomechanics 34:1335, 2001: 1 to 10 mm/s).
+
+    Attributes:
+        skin_stiffness: force on the tip per depth of the dent before it is pierced [N/m].
+        skin_friction: coefficient of friction between needle and skin.
+        puncture_in: force on the tip at which the skin is pierced [N].
+        puncture_out: the same from inside, where the tip leaves [N].
+        cutting: force on a tip that cuts its way [N].
+        friction: force along the shaft per embedded length [N/m].
+        lateral_stiffness: force across the shaft per displacement, at each place that holds [N/m].
+        yield_force: force across the shaft beyond which a part of the displacement stays [N].
+        hardening: by how much that force grows per displacement that stayed [N/m].
+        tear_force: force across the shaft at which the tissue tears, down to `yield_force` [N].
+        thread_friction: force along the thread per length of the bite [N/m].
+    """
+
+    skin_stiffness: float
+    skin_friction: float
+    puncture_in: float
+    puncture_out: float
+    cutting: float
+    friction: float
+    lateral_stiffness: float
+    yield_force: float
+    hardening: float
+    tear_force: float
+    thread_friction: float
+
+    @property
+    def dent_in(self) -> float:
+        """Return how deep the needle's tip dents the skin before it goes through [m].
+
+        The contact begins half a tip's thickness before the tip's middle.
+        """
+        return self.puncture_in / self.skin_stiffness - needle.TIP_RADIUS
+
+    @property
+    def dent_out(self) -> float:
+        """Return how far the tip lifts the skin from inside before it goes through [m]."""
+        return self.puncture_out / self.skin_stiffness
+
+
+FORCES = MappingProxyType(
+    {
+        "phantom": TissueForces(
+            skin_stiffness=1500.0,
+            skin_friction=0.3,
+            puncture_in=1.5,
+            puncture_out=1.0,
+            cutting=0.1,
+            friction=75.0,
+            lateral_stiffness=500.0,
+            yield_force=1.5,
+            hardening=500.0,
+            tear_force=3.0,
+            thread_friction=20.0,
+        ),
+        "skin": TissueForces(
+            skin_stiffness=1000.0,
+            skin_friction=0.3,
+            puncture_in=1.0,
+            puncture_out=0.7,
+            cutting=0.15,
+            friction=60.0,
+            lateral_stiffness=800.0,
+            yield_force=3.2,
+            hardening=800.0,
+            tear_force=6.0,
+            thread_friction=25.0,
+        ),
+        "liver": TissueForces(
+            skin_stiffness=400.0,
+            skin_friction=0.2,
+            puncture_in=0.6,
+            puncture_out=0.4,
+            cutting=0.05,
+            friction=25.0,
+            lateral_stiffness=200.0,
+            yield_force=0.4,
+            hardening=200.0,
+            tear_force=1.0,
+            thread_friction=8.0,
+        ),
+    }
+)
+"""Preset → forces. No publication gives all of them for a needle of 0.9 mm, so most are chosen:
+
+* "phantom": ours, a training phantom that is firmer than tissue. The curve over depth has the two
+  peaks, at the way in and at the way out, that Frick et al. measured in sheepskin.
+* "skin": `puncture_in` is the largest mean of Maloney et al. (Dermatologic Surgery, 2021: 0.48 to
+  1.00 N, tapered and cutting needles of 3-0 to 5-0 in human abdominal skin); `yield_force` is the
+  largest force with which a stitch closed a wound (Capek et al., Medical & Biological Engineering &
+  Computing 50:193, 2012: 1.1 to 3.2 N), which skin must bear. The share of cutting to friction over
+  a bite of 8 mm is ours: for hollow needles Barnett et al. (Journal of Manufacturing Science and
+  Engineering, 2015) give 61 % to tearing, 18 % to spreading, 21 % to friction. The rest is ours.
+* "liver": ours, softer than skin throughout, in the order of Okamura's bovine liver.
+"""
+
+
+def add_soft_tissue(
+    spec: mujoco.MjSpec, layout: str, forces: TissueForces, segments: int, bits: dict[str, int]
+) -> None:
+    """Add skin, carriers and holds to a scene that has its needle and its thread.
+
+    Args:
+        spec: the scene.
+        layout: a key of `holes.PAIRS`.
+        forces: how the tissue resists.
+        segments: capsules of the thread, 0 for no thread.
+        bits: collision bits of what only the needle meets.
+    """
+    _add_skin(spec.body("phantom"), layout, forces, bits)
+    for index in range(2):
+        _add_carrier(spec, index)
+        _add_hold(spec, f"hold_{index}", mujoco.mjtObj.mjOBJ_SITE, f"carrier_{index}")
+    for index in range(THREAD_HOLDS if segments else 0):
+        _add_hold(spec, f"thread_hold_{index}", mujoco.mjtObj.mjOBJ_BODY, "thread_0")
+
+
+def skin_name(side: str, piece: int) -> str:
+    """Return the name of the skin on the flank `side` ("entry", "exit") of a piece, from 1."""
+    return f"phantom_{side}{piece}_skin"
+
+
+def crest_skin_name(piece: int) -> str:
+    """Return the name of the needle's crest of a piece of the ridge, from 1."""
+    return f"phantom_crest{piece}_skin"
+
+
+def _add_skin(
+    body: mujoco.MjsBody, layout: str, forces: TissueForces, bits: dict[str, int]
+) -> None:
+    """Cover every flank with a box, and every crest with a capsule, that only the needle meets."""
+    pairs = PAIRS[layout]
+    edges = phantom.piece_edges(pairs)
+    contact = phantom.CONTACT | bits | {"friction": [forces.skin_friction, 0.002, 0.0001]}
+    for piece, pair in enumerate(pairs, start=1):
+        start, end = edges[piece - 1 : piece + 1]
+        for side, hole in (("entry", pair.entry), ("exit", pair.exit)):
+            along = (-phantom.flank_depth(hole), phantom.flank_height(pair, hole))
+            across = (end - hole.centre[1], start - hole.centre[1])
+            phantom.add_plate(body, skin_name(side, piece), hole, along, across, THICKNESS, contact)
+        phantom.add_crest(body, crest_skin_name(piece), pair, start, end, bits)
+
+
+def _add_carrier(spec: mujoco.MjSpec, index: int) -> None:
+    """Add a point that slides along the needle's arc."""
+    body = spec.body("needle").add_body(name=f"carrier_{index}")
+    body.mass = CARRIER_MASS
+    body.inertia = [CARRIER_MASS * 1e-5] * 3
+    body.explicitinertial = True
+    body.gravcomp = 1.0
+    body.add_joint(
+        name=f"carrier_{index}",
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=[0.0, 0.0, -1.0],
+        armature=CARRIER_ARMATURE,
+        damping=CARRIER_DAMPING,
+        solref_friction=FRICTION_SOLREF,
+        solimp_friction=FRICTION_SOLIMP,
+    )
+    body.add_site(
+        name=f"carrier_{index}", pos=[-needle.RADIUS, 0.0, 0.0], size=[0.0003] * 3, group=4
+    )
+
+
+def _add_hold(spec: mujoco.MjSpec, name: str, kind: mujoco.mjtObj, held: str) -> None:
+    """Add an anchor and an inactive equality that holds `held` there."""
+    anchor = spec.worldbody.add_body(name=name, mocap=True, pos=list(HIDDEN))
+    anchor.add_site(name=name, size=[0.0003] * 3, group=4)
+    equality = spec.add_equality(name=name, type=mujoco.mjtEq.mjEQ_CONNECT, objtype=kind)
+    equality.name1 = held
+    equality.name2 = name
+    equality.active = False
+
+
+def spring(stiffness: float, inverse_mass: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return solref and solimp of a constraint that is a spring of `stiffness` [N/m] at rest.
+
+    MuJoCo's force at rest is K' d² r / ((1 - d) A) with the impedance d, the reference stiffness K'
+    and the inverse mass A that it takes for the pair. K' d is `RESPONSE` here, damped critically;
+    d follows.
+
+    Args:
+        stiffness: static stiffness [N/m].
+        inverse_mass: sum of the two bodies' `body_invweight0` [1/kg].
+    """
+    impedance = 1.0 / (1.0 + RESPONSE / (stiffness * inverse_mass))
+    reference = RESPONSE * impedance
+    damping = 2.0 * math.sqrt(RESPONSE) * impedance
+    return (-reference, -damping), (impedance, impedance, 0.001, 0.5, 2.0)
