@@ -93,20 +93,31 @@ RANDOMISATION_LIMITS: Mapping[str, float] = types.MappingProxyType(
         "camera_fovy": 15.0,
         "needle_thickness": 0.3,
         "friction": 0.5,
-        "phantom_shift": 5.0,
+        "phantom_shift": 10.0,
         "kinematic_error": 1.0,
-        "needle_size": 0.1,
+        "needle_size": 0.2,
         "latency": LATENCY_LIMIT,
+        "phantom_turn": 15.0,
+        "robot_start": 15.0,
     }
 )
 """Axis → largest magnitude: beyond it the scene is out of view or the procedure impossible."""
+ANY = "any"
+"""A choice: each episode draws one of all."""
+NEEDLE_ARCS = ("1/3", "3/8", "1/2")
+"""Arcs of surgical needles, as parts of a circle; the scene's own is the first."""
+RANDOMISATION_CHOICES: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
+    {"pair": ("", ANY), "needle_arc": ("", ANY, *NEEDLE_ARCS)}
+)
+"""Axis that is a choice → what it may be; "" is off."""
 
 
 @dataclass(frozen=True)
 class RandomisationConfig:
     """Domain randomisation: each axis is drawn uniformly from ± its value for every episode.
 
-    The default of every axis is 0, which is off.
+    The default of every axis is 0 or "", which is off. What geometry forbids together is refused
+    when an env is made (`envs.feasibility`).
 
     Attributes:
         light: brightness of each light, as a fraction of it.
@@ -115,12 +126,18 @@ class RandomisationConfig:
         camera_turn: rotation of each camera about each axis [deg].
         camera_fovy: vertical field of view of each camera [deg].
         needle_thickness: fraction of the needle's thickness.
-        needle_size: fraction of the radius and the length of the needle's arc.
+        needle_size: fraction of the radius of the needle's arc, and so of its length.
         friction: fraction of every friction coefficient.
-        phantom_shift: place of the phantom, its holes and goals, in x and y [mm].
+        phantom_shift: place of the phantom, its holes and goals, in x and y [mm]; a needle that
+            lies on it moves along.
         kinematic_error: offset of each arm's first three joints that the arm does not know of; 1 is
             ±5°, ±5°, ±5 mm, the joint errors of the surgical robotics challenge.
         latency: an action takes effect this many control steps later; the same in every episode.
+        phantom_turn: turn of the phantom about world z [deg]; see `envs.placement` for the axis.
+        robot_start: place of each arm's tip at the start, along each axis of the world [mm].
+        pair: "any" draws the pair of holes to be sewn from all four; "" takes the scene's.
+        needle_arc: how much of a circle the needle is: one of `NEEDLE_ARCS`, or "any" of them; ""
+            takes the scene's, a third.
     """
 
     light: float = 0.0
@@ -134,6 +151,10 @@ class RandomisationConfig:
     kinematic_error: float = 0.0
     needle_size: float = 0.0
     latency: int = 0
+    phantom_turn: float = 0.0
+    robot_start: float = 0.0
+    pair: str = ""
+    needle_arc: str = ""
 
     def __post_init__(self) -> None:
         for axis, limit in RANDOMISATION_LIMITS.items():
@@ -141,11 +162,14 @@ class RandomisationConfig:
                 raise InputError(
                     f"randomisation: {axis} is {getattr(self, axis)}; allowed: 0 to {limit}."
                 )
+        for axis, choices in RANDOMISATION_CHOICES.items():
+            check_name(f"randomisation: {axis}", getattr(self, axis), choices)
 
     @property
     def on(self) -> tuple[str, ...]:
-        """Return the axes that are not 0."""
-        return tuple(axis for axis in RANDOMISATION_LIMITS if getattr(self, axis))
+        """Return the axes that are not 0 or empty."""
+        axes = (*RANDOMISATION_LIMITS, *RANDOMISATION_CHOICES)
+        return tuple(axis for axis in axes if getattr(self, axis))
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,7 @@ from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.envs.geometry import (
     EXTRA,
-    HANDOFF_ANGLE,
-    INSERT_ANGLE,
     INSERT_DEPTH,
-    WOUND,
     Stitch,
     grasp_in_needle,
 )
@@ -153,6 +150,11 @@ class WorldState:
         return needle_pose @ np.linalg.inv(self.needle) @ self.tip
 
     @property
+    def needle_line(self) -> Matrix:
+        """Return points of the needle from base to tip in its frame, (13, 3) [m]."""
+        return needle.polyline(13, self.stitch.radius, self.stitch.tip_angle)
+
+    @property
     def commanded_needle(self) -> Matrix:
         """Return where the held needle would be if the tool were where it is told to be."""
         return self.command @ np.linalg.inv(self.tip) @ self.needle
@@ -233,7 +235,7 @@ def _grasp(world: WorldState) -> ToolTarget:
 
 def _handoff(world: WorldState) -> ToolTarget:
     goal = world.needle @ grasp_in_needle(
-        world.arm, HANDOFF_ANGLE + HANDOFF_OFFSET, radius=world.stitch.radius
+        world.arm, world.stitch.handoff_angle + HANDOFF_OFFSET, radius=world.stitch.radius
     )
     return approach_and_grasp(world, goal, HANDOFF_BACK, OPEN_HANDOFF)
 
@@ -252,24 +254,24 @@ def on_path(stitch: Stitch, turned: float) -> Matrix:
         turned: the turn so far [rad].
     """
     start = stitch.place()
-    circle = stitch.on_arc(needle.TIP_ANGLE)
-    pivot = turn_about_wound(start, circle)
+    pivot = turn_about_wound(start, stitch.on_arc(stitch.tip_angle))
     if turned >= pivot:
-        return stitch.on_arc(needle.TIP_ANGLE - (turned - pivot))
+        return stitch.on_arc(stitch.tip_angle - (turned - pivot))
     pose = start.copy()
-    pose[:3, :3] = rotvec_to_matrix(-turned * WOUND) @ start[:3, :3]
+    pose[:3, :3] = rotvec_to_matrix(-turned * stitch.wound) @ start[:3, :3]
     tip = np.asarray(stitch.pair.entry.centre)
-    pose[:3, 3] = tip - pose[:3, :3] @ needle.point(needle.TIP_ANGLE, stitch.radius)
+    pose[:3, 3] = tip - pose[:3, :3] @ needle.point(stitch.tip_angle, stitch.radius)
     return pose
 
 
 def turn_about_wound(start: Matrix, pose: Matrix) -> float:
     """Return the turn about the wound from `start` to `pose` [rad], in (-π, π].
 
-    It is positive in the direction in which the needle is driven.
+    It is positive in the direction in which the needle is driven. The wound is the z axis of
+    `start`, the normal of the needle's plane.
     """
     x = start[:3, 0]
-    z = np.cross(WOUND, x)
+    z = start[:3, 1]
     return -math.atan2(float(pose[:3, 0] @ z), float(pose[:3, 0] @ x))
 
 
@@ -277,7 +279,7 @@ def _place(world: WorldState) -> ToolTarget:
     """Lift the needle, turn it upright before the entry, bring its tip in."""
     goal = world.stitch.place()
     outward = world.stitch.pair.entry.rotation[:, 2]
-    line = world.needle[:3, :3] @ needle.polyline(13, world.stitch.radius).T + world.needle[:3, 3:4]
+    line = world.needle[:3, :3] @ world.needle_line.T + world.needle[:3, 3:4]
     if float(line[2].min()) < SURFACE + CLEAR and _angle_between(world.needle, goal) > math.radians(
         20.0
     ):
@@ -296,7 +298,7 @@ def _insert(world: WorldState) -> ToolTarget:
     """Bring the tip in, then drive the needle along its path."""
     start = world.stitch.place()
     tip = (
-        world.needle[:3, :3] @ needle.point(needle.TIP_ANGLE, world.stitch.radius)
+        world.needle[:3, :3] @ needle.point(world.stitch.tip_angle, world.stitch.radius)
         + world.needle[:3, 3]
     )
     local = world.stitch.pair.entry.rotation.T @ (tip - np.asarray(world.stitch.pair.entry.centre))
@@ -306,9 +308,11 @@ def _insert(world: WorldState) -> ToolTarget:
         tilt = _angle_between(world.needle, on_path(world.stitch, max(turned, 0.0)))
         if not (near and tilt < math.radians(4.0)):
             return _place(world)
-    pivot = turn_about_wound(start, world.stitch.on_arc(needle.TIP_ANGLE))
+    pivot = turn_about_wound(start, world.stitch.on_arc(world.stitch.tip_angle))
     last = (
-        pivot + needle.TIP_ANGLE - world.stitch.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA)
+        pivot
+        + world.stitch.tip_angle
+        - world.stitch.angle_at_entry(world.stitch.insert_angle, INSERT_DEPTH + EXTRA)
     )
     return _drive(world, turned, last)
 
@@ -332,9 +336,7 @@ def _pullout(world: WorldState) -> ToolTarget:
     stitch = world.stitch
     if world.task_state.release_steps > 30:
         return ToolTarget(world.command, 0.0)
-    line = (
-        world.needle[:3, :3] @ needle.polyline(13, world.stitch.radius).T + world.needle[:3, 3:4]
-    ).T
+    line = (world.needle[:3, :3] @ world.needle_line.T + world.needle[:3, 3:4]).T
     outside = ((line - np.asarray(stitch.pair.exit.centre)) @ stitch.pair.exit.rotation)[:, 2]
     if float(outside.min()) > 0.0005:
         return ToolTarget(world.tip_for_needle(stitch.pulled()), 0.0)
@@ -342,8 +344,8 @@ def _pullout(world: WorldState) -> ToolTarget:
     turned = turn_about_wound(start, world.needle) % (2 * math.pi)
     commanded = turned + _wrap(turn_about_wound(start, world.commanded_needle) - turned)
     ahead = max(min(commanded, turned + LEAD), turned - LEAD)
-    pivot = turn_about_wound(start, stitch.on_arc(needle.TIP_ANGLE))
-    last = pivot + needle.TIP_ANGLE + 2 * stitch.half + math.radians(12.0)
+    pivot = turn_about_wound(start, stitch.on_arc(stitch.tip_angle))
+    last = pivot + stitch.tip_angle + 2 * stitch.half + math.radians(12.0)
     return ToolTarget(world.tip_for_needle(on_path(stitch, min(ahead + DRIVE, last))), 0.0)
 
 

@@ -29,12 +29,13 @@ from surgicai_vision.core.tasks import task_text
 from surgicai_vision.envs import hole_crossing, observation, poses, randomisation
 from surgicai_vision.envs.camera_rig import Images
 from surgicai_vision.envs.control import StepSize
+from surgicai_vision.envs.feasibility import refuse_impossible
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.observation import ObservationConfig
 from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.envs.success import Info, Target, measure, meets_demands
-from surgicai_vision.scene import build_scene, needle
+from surgicai_vision.scene import build_scene
 from surgicai_vision.scene.rendering import Frame
 
 START_DRAWS = 60
@@ -80,41 +81,17 @@ class SuturingEnv(gymnasium.Env):
         self.scene = build_scene(config.scene)
         axes = config.randomisation
         self.simulation = Simulation(self.scene, own_model=bool(axes.on), latency=axes.latency)
+        for subtask in subtasks:
+            kind = f"tolerance preset of '{subtask.name}'"
+            check_name(kind, config.tolerance, subtask.tolerances)
+        refuse_impossible(config, any(subtask.through for subtask in subtasks))
         self.stitch = Stitch.of(self.scene.pair)
-        self._refuse_impossible(subtasks)
         self.observation_space = view.space()
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
         self._subtasks = subtasks
         self.simulation.task_state.phase = subtasks[0].phase
         self._step_size = StepSize.of(config.step)
         self._images = Images(self.simulation.model)
-
-    def _refuse_impossible(self, subtasks: tuple[Subtask, ...]) -> None:
-        """Refuse subtasks for which the holes are too far apart, with the smallest needle drawn."""
-        config = self.config
-        pair = self.scene.pair
-        for subtask in subtasks:
-            kind = f"tolerance preset of '{subtask.name}'"
-            check_name(kind, config.tolerance, subtask.tolerances)
-        smallest = needle.RADIUS * (1.0 - config.randomisation.needle_size)
-        if Stitch.of(pair, smallest).possible or not any(subtask.through for subtask in subtasks):
-            return
-        layout = config.scene.layout
-        why = (
-            f"the holes of pair {config.scene.hole_pair} are {pair.gap * 1e3:.1f} mm apart, too "
-            "far for this needle"
-        )
-        if self.stitch.possible:
-            raise InputError(
-                f"randomisation: needle_size {config.randomisation.needle_size} makes "
-                f"'{config.task}' impossible in layout '{layout}': {why} when it is smallest. "
-                "Take a smaller one, or layout simple."
-            )
-        raise InputError(
-            f"'{config.task}' is not possible in layout '{layout}': {why} (see "
-            "surgicai_vision.envs.geometry). Allowed there: grasp, place. "
-            "All tasks: simple, 3dmed_straight."
-        )
 
     # -- gymnasium ---------------------------------------------------------------------------------
 
@@ -341,10 +318,10 @@ class SuturingEnv(gymnasium.Env):
 
     def _meet_draws(self) -> None:
         """Follow new draws: goals move with the phantom, the renderer redraws the needle."""
-        pair = randomisation.shifted(self.scene.pair, self.simulation.draws)
+        simulation = self.simulation
         axes = self.config.randomisation
-        self.stitch = Stitch.of(pair, self.simulation.radius)
-        if axes.needle_thickness or axes.needle_size:
+        self.stitch = Stitch.of(simulation.pair, simulation.radius, simulation.tip_angle)
+        if axes.needle_thickness or axes.needle_size or axes.needle_arc:
             self._images.close()
 
     def _remember_tool(self) -> None:

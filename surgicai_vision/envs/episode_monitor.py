@@ -23,7 +23,7 @@ from collections.abc import Sequence
 import mujoco
 
 from surgicai_vision.core import names
-from surgicai_vision.envs import hole_crossing, randomisation
+from surgicai_vision.envs import hole_crossing
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.bite_measures import BiteMeasures, BiteWatch, ChannelWatch
 from surgicai_vision.envs.force_plate import ForcePlate
@@ -63,8 +63,8 @@ class EpisodeMonitor:
         self.clear()
         simulation = self._env.simulation
         pair = self._env.stitch.pair
-        pairs = [randomisation.shifted(other, simulation.draws) for other in self._layout]
-        others = [other for other in pairs if other.entry.centre != pair.entry.centre]
+        pairs = [simulation.placement.placed_pair(other) for other in self._layout]
+        others = [other for index, other in enumerate(pairs) if index != simulation.pair_index]
         self._watch = ChannelWatch(simulation, pair, others)
 
     def update(self, info: Info) -> None:

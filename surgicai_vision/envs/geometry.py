@@ -7,6 +7,11 @@ point's angle: y = ± radial(θ), z = -normal, tip frame at `GRASP_DEPTH` above 
 +radial, PSM1 -radial: the signs for which no joint limit is met on the whole path (and those of
 SurgicAI's demonstrations).
 
+A needle of another arc keeps the shares: the goals stand at 5/6 and 7/8 of it (100° and 105° of
+120°), so that as large a part of it is out of the exit; and PSM2 grasps it as far before the
+insertion's goal as the 120° needle, up to 95°, because that decides how its wrist stands. (From
+the base of a half circle the roll would have to go 125° past its limit.)
+
 The path: the holes of layout `simple` lie 7.8 mm apart on flanks tilted 46.1°, their axes 43.9°
 below the horizontal. A circle of the needle's radius R through both centres has its centre √(R² -
 (gap/2)²) = 9.4 mm above their middle and runs there at asin(gap / 2R) = 22.6° to the horizontal:
@@ -32,32 +37,34 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.envs import poses
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.arm import GRASP_DEPTH, PAD_WIDTH
 from surgicai_vision.scene.holes import HolePair
 from surgicai_vision.scene.kinematics import Pose
+from surgicai_vision.scene.rotations import rotvec_to_matrix, rpy_to_matrix
 
 Matrix = NDArray[np.float64]
 
 GRASP_SIGNS = {PSM1: -1.0, PSM2: 1.0}
-WOUND = np.array([0.0, 1.0, 0.0])
-"""Direction of the wound in world: the normal of the needle's plane during the stitch."""
 INSERT_ANGLE = math.radians(100.0)
-"""The needle's point that the insertion brings beyond the exit (released code)."""
+"""The point of a 120° needle that the insertion brings beyond the exit (released code)."""
 INSERT_DEPTH = 0.002
 """How far beyond the exit it brings it [m]."""
 EXTRA = 0.0014
 """How far the expert goes on past that goal, to make room for PSM1's jaws [m]."""
 FIRST_GRASP = math.radians(6.5)
-"""Needle angle from which on a grasp off by its error has the needle between the pads."""
+"""Angle of the scene's own needle from which on a grasp off by its error has the needle between
+the pads; of another one the angle of as long an arc."""
 HANDOFF_ANGLE = math.radians(105.0)
-"""The needle's point that PSM1 grasps (released code)."""
+"""The point of a 120° needle that PSM1 grasps (released code)."""
 PULLOUT_SHIFT = np.array([0.030, 0.0, 0.030])
-"""End of the pull-out from the exit [m, world] (released code)."""
+"""End of the pull-out from the exit [m], in world for a phantom that is not turned (released
+code)."""
 PULLOUT_TURN = math.radians(-50.0)
-"""Rotation of the handoff grasp about y at that end (released code)."""
+"""Rotation of the handoff grasp about the wound at that end (released code)."""
 
 
 def grasp_in_needle(
@@ -101,28 +108,60 @@ class Stitch:
         centre: centre of the circle through both holes [m, world].
         half: half of the circle's angle between the holes [rad].
         radius: of the circle and of the needle's arc [m].
+        tip_angle: of the needle's tip [rad].
     """
 
     pair: HolePair
     centre: Matrix
     half: float
     radius: float = needle.RADIUS
+    tip_angle: float = needle.TIP_ANGLE
 
     @classmethod
-    def of(cls, pair: HolePair, radius: float = needle.RADIUS) -> "Stitch":
-        """Return the stitch through `pair` by a needle whose arc has `radius` [m]."""
+    def of(
+        cls,
+        pair: HolePair,
+        radius: float = needle.RADIUS,
+        tip_angle: float = needle.TIP_ANGLE,
+    ) -> "Stitch":
+        """Return the stitch through `pair` by a needle whose arc has `radius` [m].
+
+        Raises:
+            InputError: the holes are further apart than the needle is wide.
+        """
         entry = np.asarray(pair.entry.centre)
         leave = np.asarray(pair.exit.centre)
         chord = leave - entry
         half = float(np.linalg.norm(chord)) / 2
-        up = np.cross(chord / (2 * half), WOUND)
+        if half >= radius:
+            raise InputError(
+                f"The holes are {2e3 * half:.1f} mm apart; a needle of {1e3 * radius:.1f} mm "
+                "radius cannot reach both."
+            )
+        up = np.cross(chord / (2 * half), pair.entry.rotation[:, 1])
         centre = (entry + leave) / 2 + up * math.sqrt(radius**2 - half**2)
-        return cls(pair, centre, math.asin(half / radius), radius)
+        return cls(pair, centre, math.asin(half / radius), radius, tip_angle)
+
+    @functools.cached_property
+    def wound(self) -> Matrix:
+        """Return the wound's direction in world (3,): the normal of the needle's plane."""
+        along: Matrix = self.pair.entry.rotation[:, 1]
+        return along
+
+    @functools.cached_property
+    def insert_angle(self) -> float:
+        """Return the needle's point that the insertion brings beyond the exit [rad]."""
+        return INSERT_ANGLE * (self.tip_angle / needle.TIP_ANGLE)
+
+    @functools.cached_property
+    def handoff_angle(self) -> float:
+        """Return the needle's point that PSM1 grasps [rad]."""
+        return HANDOFF_ANGLE * (self.tip_angle / needle.TIP_ANGLE)
 
     def on_arc(self, angle_at_entry: float) -> Matrix:
         """Return the needle's pose on the circle with `angle_at_entry` [rad] in the entry."""
         radial = (np.asarray(self.pair.entry.centre) - self.centre) / self.radius
-        return _needle_pose(angle_at_entry, radial, self.centre)
+        return _needle_pose(angle_at_entry, radial, self.centre, self.wound)
 
     def angle_at_entry(self, angle: float, beyond: float) -> float:
         """Return the needle angle in the entry when `angle` is `beyond` the exit [m]."""
@@ -132,38 +171,46 @@ class Stitch:
         """Return the needle's pose with its tip in the entry, perpendicular to its plane."""
         entry = self.pair.entry
         inward = -entry.rotation[:, 2]
-        radial = np.cross(WOUND, inward)
-        pose = _needle_pose(needle.TIP_ANGLE, radial, np.zeros(3))
+        radial: Matrix = np.cross(self.wound, inward)
+        pose = _needle_pose(self.tip_angle, radial, np.zeros(3), self.wound)
         pose[:3, 3] = np.asarray(entry.centre) - pose[:3, :3] @ needle.point(
-            needle.TIP_ANGLE, self.radius
+            self.tip_angle, self.radius
         )
         return pose
 
     def inserted(self, extra: float = 0.0) -> Matrix:
         """Return the goal of the insertion, driven `extra` further [m]."""
-        return self.on_arc(self.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + extra))
+        return self.on_arc(self.angle_at_entry(self.insert_angle, INSERT_DEPTH + extra))
 
     def pulled(self) -> Matrix:
         """Return the goal of the pull-out.
 
         The handoff point is at the end point, turned with the inserted needle.
         """
-        cosine = math.cos(PULLOUT_TURN)
-        sine = math.sin(PULLOUT_TURN)
-        turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
         pose = np.eye(4)
-        pose[:3, :3] = turn @ self.inserted()[:3, :3]
+        pose[:3, :3] = rotvec_to_matrix(PULLOUT_TURN * self.wound) @ self.inserted()[:3, :3]
         pose[:3, 3] = (
             np.asarray(self.pair.exit.centre)
-            + PULLOUT_SHIFT
-            - pose[:3, :3] @ needle.point(HANDOFF_ANGLE, self.radius)
+            + rpy_to_matrix(0.0, 0.0, self.pair.exit.turn) @ PULLOUT_SHIFT
+            - pose[:3, :3] @ needle.point(self.handoff_angle, self.radius)
         )
         return pose
 
     @functools.cached_property
     def last_grasp(self) -> float:
         """Return the largest needle angle [rad] at which PSM2's jaws stay outside the entry."""
-        return self.angle_at_entry(INSERT_ANGLE, INSERT_DEPTH + EXTRA) - PAD_WIDTH / 2 / self.radius
+        beyond = INSERT_DEPTH + EXTRA
+        return self.angle_at_entry(self.insert_angle, beyond) - PAD_WIDTH / 2 / self.radius
+
+    @property
+    def ahead(self) -> float:
+        """Return how far PSM2's grasp is ahead of that on a 120° needle [rad]."""
+        return self.insert_angle - INSERT_ANGLE
+
+    @property
+    def first_grasp(self) -> float:
+        """Return the smallest needle angle [rad] at which PSM2 may aim its grasp."""
+        return FIRST_GRASP * (needle.RADIUS / self.radius)
 
     @property
     def possible(self) -> bool:
@@ -171,33 +218,40 @@ class Stitch:
 
         Where they do not, only grasp and place can be done.
         """
-        return self.last_grasp >= FIRST_GRASP
+        return self.last_grasp >= self.first_grasp
 
     def grasps(self, low: float, high: float) -> tuple[float, float]:
-        """Return the part of a range of grasp angles [rad] that the stitch leaves room for."""
-        return (low, min(high, self.last_grasp)) if self.possible else (low, high)
+        """Return the range of grasp angles [rad] on this needle for one on a 120° needle.
+
+        It lies as far before the insertion's goal, and nearer to the base where the stitch leaves
+        no room for all of it.
+        """
+        if not self.possible:
+            return low + self.ahead, high + self.ahead
+        last = min(high + self.ahead, self.last_grasp)
+        return min(low + self.ahead, max(low, last - (high - low))), last
 
     @functools.cached_property
     def place_tip(self) -> Pose:
         """Return the goal of `place` for the needle's frame at its tip."""
-        return poses.flat(self.place() @ needle_frame(needle.TIP_ANGLE, self.radius))
+        return poses.flat(self.place() @ needle_frame(self.tip_angle, self.radius))
 
     @functools.cached_property
     def insert_point(self) -> Pose:
-        """Return the goal of `insert` for the needle's frame at `INSERT_ANGLE`."""
-        return poses.flat(self.inserted() @ needle_frame(INSERT_ANGLE, self.radius))
+        """Return the goal of `insert` for the needle's frame at `insert_angle`."""
+        return poses.flat(self.inserted() @ needle_frame(self.insert_angle, self.radius))
 
     @functools.cached_property
     def pullout_point(self) -> Pose:
-        """Return the goal of `pullout` for the needle's frame at `HANDOFF_ANGLE`."""
-        return poses.flat(self.pulled() @ needle_frame(HANDOFF_ANGLE, self.radius))
+        """Return the goal of `pullout` for the needle's frame at `handoff_angle`."""
+        return poses.flat(self.pulled() @ needle_frame(self.handoff_angle, self.radius))
 
 
-def _needle_pose(angle: float, radial: Matrix, centre: Matrix) -> Matrix:
-    """Return the needle's pose with its plane's normal along the wound and `radial` at `angle`."""
-    tangent = np.cross(radial, WOUND)
+def _needle_pose(angle: float, radial: Matrix, centre: Matrix, wound: Matrix) -> Matrix:
+    """Return the needle's pose with its plane's normal along `wound` and `radial` at `angle`."""
+    tangent = np.cross(radial, wound)
     x = -math.cos(angle) * radial + math.sin(angle) * tangent
     pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, np.cross(WOUND, x), WOUND], axis=1)
+    pose[:3, :3] = np.stack([x, np.cross(wound, x), wound], axis=1)
     pose[:3, 3] = centre
     return pose

@@ -23,16 +23,33 @@ SPREAD_Y = 0.020
 """Half widths of the needle's start about its home [m] (released code, Approach)."""
 SPREAD_TURN = math.radians(30.0)
 """Half width of its rotation [rad]."""
+REACH = needle.RADIUS * math.cos(math.pi - needle.TIP_ANGLE - SPREAD_TURN)
+"""How far from its centre the scene's own needle may reach towards the ridge [m], whose foot is
+then 1 mm away: its tip lies at 180° - 120° from the phantom's x axis, or as much nearer to it as it
+may be turned. A needle that would reach further lies as much further away; the largest, a half
+circle, then still has 1.2 mm to the pad's edge."""
 
 
-def lying_needle(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw T_world_needle (4, 4) of a needle that lies on the tissue."""
+def lying_needle(
+    simulation: Simulation, stitch: Stitch, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Draw T_world_needle (4, 4) of a needle that lies on the tissue, wherever that is.
+
+    Where PSM2 grasps it, it lies as a 120° needle does: from the other end of a half circle the
+    wrist could not turn it upright.
+    """
+    shape = simulation.shape
     pose = np.eye(4)
-    pose[:3, :3] = rpy_to_matrix(0.0, 0.0, rng.uniform(-SPREAD_TURN, SPREAD_TURN))
+    yaw = stitch.ahead + rng.uniform(-SPREAD_TURN, SPREAD_TURN)
+    pose[:3, :3] = rpy_to_matrix(0.0, 0.0, yaw)
     pose[:3, 3] = needle.HOME + np.array(
         [rng.uniform(-SPREAD_X, SPREAD_X), rng.uniform(-SPREAD_Y, SPREAD_Y), 0.0]
     )
-    return pose
+    tip = math.pi - shape.tip_angle + stitch.ahead - SPREAD_TURN
+    pose[0, 3] -= max(0.0, shape.radius * math.cos(max(0.0, tip)) - REACH)
+    pose[2, 3] += shape.body_radius - needle.BODY_RADIUS
+    bed: NDArray[np.float64] = simulation.placement.T_world_bed
+    return bed @ pose
 
 
 class Grasp(Subtask):
@@ -49,7 +66,7 @@ class Grasp(Subtask):
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Put the needle on the tissue, both arms at home."""
-        simulation.pose_needle(poses.flat(lying_needle(rng)))
+        simulation.pose_needle(poses.flat(lying_needle(simulation, stitch, rng)))
         simulation.task_state.grasp_angle = rng.uniform(*stitch.grasps(*GRASP_ANGLES))
         simulation.settle(20)
         return True

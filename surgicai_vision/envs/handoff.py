@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.names import PSM1, PSM2
-from surgicai_vision.envs.geometry import HANDOFF_ANGLE, Stitch
+from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.grasp import grasp_goal
 from surgicai_vision.envs.insert import draw_in_ball
 from surgicai_vision.envs.place import draw_psm2_grasp
@@ -55,4 +55,4 @@ class Handoff(Subtask):
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the jaws' grasp frame and the grasp frame on the needle."""
-        return simulation.grasp(PSM1), grasp_goal(simulation, PSM1, HANDOFF_ANGLE)
+        return simulation.grasp(PSM1), grasp_goal(simulation, PSM1, stitch.handoff_angle)

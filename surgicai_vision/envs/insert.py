@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.names import PSM2
 from surgicai_vision.envs import poses
-from surgicai_vision.envs.geometry import INSERT_ANGLE, Stitch, needle_frame_flat
+from surgicai_vision.envs.geometry import Stitch, needle_frame_flat
 from surgicai_vision.envs.place import draw_psm2_grasp
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import about_point, draw_rotation, hold_needle
@@ -36,7 +36,7 @@ class Insert(Subtask):
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the needle with its tip near the entry, outside the tissue."""
         nominal = stitch.place()
-        tip = nominal[:3, :3] @ needle.point(needle.TIP_ANGLE, stitch.radius) + nominal[:3, 3]
+        tip = nominal[:3, :3] @ needle.point(stitch.tip_angle, stitch.radius) + nominal[:3, 3]
         shift = draw_in_ball(rng, START_SHIFT)
         outward = stitch.pair.entry.rotation[:, 2]
         if shift @ outward < -0.0005:
@@ -46,9 +46,9 @@ class Insert(Subtask):
         return held and not simulation.touches_phantom(needle=True)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
-        """Return the needle's frame at 100° and where it ends."""
+        """Return the needle's frame at the goal's angle and where it ends."""
         return poses.compose(
-            simulation.needle(), needle_frame_flat(INSERT_ANGLE, stitch.radius)
+            simulation.needle(), needle_frame_flat(stitch.insert_angle, stitch.radius)
         ), stitch.insert_point
 
 

@@ -19,7 +19,6 @@ from surgicai_vision.envs.starts import (
     hold_needle,
 )
 from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
-from surgicai_vision.scene import needle
 from surgicai_vision.scene.kinematics import Pose
 
 GRASP_SHIFT = 0.0015
@@ -38,10 +37,12 @@ def draw_psm2_grasp(
         needle_pose: T_world_needle (4, 4).
         stitch: leaves room for some angles.
     """
-    angle = rng.uniform(*GRASP_ANGLES)
+    angle = rng.uniform(*GRASP_ANGLES) + stitch.ahead
     error = draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
-    low, high = (limit - error.along / stitch.radius for limit in stitch.grasps(*SAFE_ANGLES))
-    return grasp_pose(PSM2, needle_pose, min(max(angle, low), high), error, stitch.radius)
+    low, high = stitch.grasps(*SAFE_ANGLES)
+    off = error.along / stitch.radius
+    angle = min(max(angle, max(low, stitch.first_grasp) - off), high - off)
+    return grasp_pose(PSM2, needle_pose, angle, error, stitch.radius)
 
 
 class Place(Subtask):
@@ -58,11 +59,11 @@ class Place(Subtask):
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the needle that still lies on the tissue."""
-        needle_pose = lying_needle(rng)
+        needle_pose = lying_needle(simulation, stitch, rng)
         return hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch))
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at its tip and that frame in the entry."""
         return poses.compose(
-            simulation.needle(), needle_frame_flat(needle.TIP_ANGLE, stitch.radius)
+            simulation.needle(), needle_frame_flat(stitch.tip_angle, stitch.radius)
         ), stitch.place_tip

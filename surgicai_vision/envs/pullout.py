@@ -7,7 +7,7 @@ import numpy as np
 
 from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.envs import poses
-from surgicai_vision.envs.geometry import HANDOFF_ANGLE, Stitch, needle_frame_flat
+from surgicai_vision.envs.geometry import Stitch, needle_frame_flat
 from surgicai_vision.envs.handoff import STRAIGHT, inserted_needle
 from surgicai_vision.envs.place import draw_psm2_grasp
 from surgicai_vision.envs.simulation import Simulation
@@ -44,12 +44,12 @@ class Pullout(Subtask):
         away[:3, 3] -= RETREAT * away[:3, 2]
         simulation.pose_arm(PSM2, simulation.to_base(PSM2, poses.flat(away)), RELEASED_JAW)
         error = draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
-        grasp = grasp_pose(PSM1, needle_pose, HANDOFF_ANGLE, error, stitch.radius)
+        grasp = grasp_pose(PSM1, needle_pose, stitch.handoff_angle, error, stitch.radius)
         held = hold_needle(simulation, PSM1, needle_pose, grasp, STRAIGHT)
         return held and not simulation.touches_phantom(needle=False)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
-        """Return the needle's frame at 105° and where it ends."""
+        """Return the needle's frame at the handoff's angle and where it ends."""
         return poses.compose(
-            simulation.needle(), needle_frame_flat(HANDOFF_ANGLE, stitch.radius)
+            simulation.needle(), needle_frame_flat(stitch.handoff_angle, stitch.radius)
         ), stitch.pullout_point

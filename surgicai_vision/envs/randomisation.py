@@ -5,7 +5,6 @@ numbers are part of the whole state, so a restored state looks and moves as it d
 drawn whichever are on: turning one on leaves the others as they were.
 """
 
-import dataclasses
 import math
 from itertools import accumulate, pairwise
 from types import MappingProxyType
@@ -16,9 +15,12 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import other_cameras
-from surgicai_vision.core.config import RandomisationConfig
+from surgicai_vision.core.config import ANY, NEEDLE_ARCS, RandomisationConfig
+from surgicai_vision.envs.placement import SLIDE, Placement
 from surgicai_vision.scene import Scene, needle
-from surgicai_vision.scene.holes import Hole, HolePair
+from surgicai_vision.scene.holes import PAIRS
+from surgicai_vision.scene.needle import NeedleShape
+from surgicai_vision.scene.reshape import reshape_needle
 from surgicai_vision.scene.rotations import (
     matrix_to_quaternion,
     quaternion_to_matrix,
@@ -56,16 +58,28 @@ UNITS = MappingProxyType(
         "phantom_shift": (1e-3,) * 2,
         "kinematic_error": JOINT_ERROR * len(names.ARMS),
         "needle_size": (1.0,),
+        "phantom_turn": (math.radians(1.0),),
+        "robot_start": (1e-3,) * 3 * len(names.ARMS),
     }
 )
 """Axis → what a magnitude of 1 is in each of its numbers (fractions, m, rad; the field of view in
 degrees).
 """
+TIP_ANGLES = MappingProxyType(
+    dict(zip(NEEDLE_ARCS, (math.radians(degrees) for degrees in (120, 135, 180)), strict=True))
+)
+"""Arc of the needle → angle of its tip [rad]."""
+CHOICES = ("pair", "needle_arc")
+"""Axes that are a choice, one number each: the pair that is sewn, 1 to 4, or 0 for the scene's own;
+the angle of the needle's tip beyond the own one's [rad]."""
+STAND = ("phantom", "tray")
+"""Bodies that the phantom's placement moves; in the scene's own model they are at the origin."""
 DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0")
 """What MuJoCo derives from masses and places."""
-_EDGES = tuple(accumulate((len(unit) for unit in UNITS.values()), initial=0))
+_SIZES = {axis: len(unit) for axis, unit in UNITS.items()} | dict.fromkeys(CHOICES, 1)
+_EDGES = tuple(accumulate(_SIZES.values(), initial=0))
 _PLACES = {
-    axis: slice(start, end) for axis, (start, end) in zip(UNITS, pairwise(_EDGES), strict=True)
+    axis: slice(start, end) for axis, (start, end) in zip(_SIZES, pairwise(_EDGES), strict=True)
 }
 SIZE = _EDGES[-1]
 """Numbers of one episode."""
@@ -77,13 +91,18 @@ def draw(config: RandomisationConfig, rng: np.random.Generator) -> Draws:
     values: list[float] = []
     for axis, unit in UNITS.items():
         values += (rng.uniform(-1.0, 1.0, len(unit)) * unit * getattr(config, axis)).tolist()
+    pair = int(rng.integers(1, 5))
+    arc = NEEDLE_ARCS[int(rng.integers(len(NEEDLE_ARCS)))]
+    if config.needle_arc != ANY:
+        arc = config.needle_arc or NEEDLE_ARCS[0]
+    values += [pair if config.pair == ANY else 0, TIP_ANGLES[arc] - TIP_ANGLES[NEEDLE_ARCS[0]]]
     return tuple(value + 0.0 for value in values)  # no -0.0
 
 
 def report(config: RandomisationConfig, draws: Draws) -> dict[str, Array | int]:
     """Return axis → drawn numbers of the axes that are on, for `info["randomisation"]`."""
     drawn: dict[str, Array | int] = {
-        axis: np.array(draws[_PLACES[axis]]) for axis in config.on if axis in UNITS
+        axis: np.array(draws[_PLACES[axis]]) for axis in config.on if axis in _PLACES
     }
     return drawn | ({"latency": config.latency} if config.latency else {})
 
@@ -99,21 +118,30 @@ def joint_offsets(draws: Draws) -> dict[str, Draws]:
     }
 
 
-def needle_radius(draws: Draws) -> float:
-    """Return the radius of the needle's arc [m]."""
-    return needle.RADIUS * (1.0 + draws[_PLACES["needle_size"]][0])
+def needle_shape(draws: Draws) -> NeedleShape:
+    """Return the shape of the needle."""
+    return NeedleShape(
+        needle.RADIUS * (1.0 + draws[_PLACES["needle_size"]][0]),
+        needle.TIP_ANGLE + draws[_PLACES["needle_arc"]][0],
+        needle.BODY_RADIUS * (1.0 + draws[_PLACES["needle_thickness"]][0]),
+    )
 
 
-def shifted(pair: HolePair, draws: Draws) -> HolePair:
-    """Return where a hole pair is when the phantom is shifted."""
+def placement(scene: Scene, draws: Draws) -> Placement:
+    """Return where the phantom lies and which pair is sewn."""
+    pairs = PAIRS[scene.config.layout]
+    drawn = int(draws[_PLACES["pair"]][0])
+    pair = (drawn or scene.config.hole_pair) - 1
+    beyond = pairs[0].entry.centre[1] - pairs[pair].entry.centre[1]
     x, y = draws[_PLACES["phantom_shift"]]
+    (turn,) = draws[_PLACES["phantom_turn"]]
+    return Placement(pair, SLIDE * beyond if drawn else 0.0, (x, y), turn)
 
-    def moved(hole: Hole) -> Hole:
-        return dataclasses.replace(
-            hole, centre=(hole.centre[0] + x, hole.centre[1] + y, hole.centre[2])
-        )
 
-    return HolePair(moved(pair.entry), moved(pair.exit))
+def start_shift(draws: Draws, arm: str) -> Array:
+    """Return how far an arm's tip starts from its home, (3,) [m, world]."""
+    first = 3 * names.ARMS.index(arm)
+    return np.array(draws[_PLACES["robot_start"]][first : first + 3])
 
 
 def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
@@ -128,13 +156,29 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
         _aim(source, model, cameras, shift, turn, fovy)
     for name in other_cameras():
         _aim(source, model, (name,), shifts[0], turns[0], numbers["camera_fovy"][0])
-    size, thickness = (
-        1.0 + float(numbers[axis][0]) for axis in ("needle_size", "needle_thickness")
-    )
-    _shape_needle(source, model, scene.needle_geoms, size, thickness)
     model.geom_friction[:] = source.geom_friction * (1.0 + float(numbers["friction"][0]))
-    phantom = source.body("phantom").id
-    model.body_pos[phantom] = source.body_pos[phantom] + [*numbers["phantom_shift"], 0.0]
+    _place_phantom(scene, model, placement(scene, draws))
+    shape = needle_shape(draws)
+    reshape_needle(source, model, shape)
+    if shape == needle.OWN_SHAPE:
+        for name in DERIVED:
+            getattr(model, name)[:] = getattr(source, name)
+        return
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    # They place the cameras' near and far planes.
+    model.stat.extent = source.stat.extent
+    model.stat.center[:] = source.stat.center
+
+
+def _place_phantom(scene: Scene, model: mujoco.MjModel, where: Placement) -> None:
+    """Move the phantom, and the tray it stands in."""
+    source = scene.model
+    pose = where.T_world_phantom
+    turn = matrix_to_quaternion(pose[:3, :3])
+    for name in STAND:
+        body = source.body(name).id
+        model.body_pos[body] = source.body_pos[body] + pose[:3, 3]
+        model.body_quat[body] = turn
 
 
 def _light(source: mujoco.MjModel, model: mujoco.MjModel, factors: Array) -> None:
@@ -176,58 +220,3 @@ def _aim(
             rotation @ quaternion_to_matrix(source.cam_quat[index])
         )
         model.cam_fovy[index] = source.cam_fovy[index] * (1.0 + fovy / source.cam_fovy[first])
-
-
-def _shape_needle(
-    source: mujoco.MjModel, model: mujoco.MjModel, geoms: range, size: float, thickness: float
-) -> None:
-    """Scale the needle's arc and thickness: what collides, its bounds, and what is drawn."""
-    of = slice(geoms.start, geoms.stop)
-    body = source.body("needle").id
-    radius = source.geom_size[of, 0] * thickness
-    half = source.geom_size[of, 1] * size
-    model.geom_size[of, 0] = radius
-    model.geom_size[of, 1] = half
-    model.geom_pos[of] = source.geom_pos[of] * size
-    model.geom_rbound[of] = radius + half
-    model.geom_aabb[of, 3:] = np.stack([radius, radius, radius + half], axis=1)
-    tree = slice(source.body_bvhadr[body], source.body_bvhadr[body] + source.body_bvhnum[body])
-    grown = max(0.0, float((radius - source.geom_size[of, 0] * size).max()))
-    model.bvh_aabb[tree] = source.bvh_aabb[tree] * size
-    model.bvh_aabb[tree, 3:] += grown
-    _weigh_needle(source, model, body, size)
-    mesh = source.mesh("needle").id
-    of = slice(source.mesh_vertadr[mesh], source.mesh_vertadr[mesh] + source.mesh_vertnum[mesh])
-    turn = quaternion_to_matrix(source.mesh_quat[mesh])
-    origin = source.mesh_pos[mesh]
-    points = source.mesh_vert[of] @ turn.T + origin
-    angles = np.clip(np.arctan2(points[:, 1], -points[:, 0]), 0.0, needle.TIP_ANGLE)
-    line = np.stack(
-        [-needle.RADIUS * np.cos(angles), needle.RADIUS * np.sin(angles), np.zeros_like(angles)],
-        axis=1,
-    )
-    model.mesh_vert[of] = (line * size + (points - line) * thickness - origin) @ turn
-
-
-def _weigh_needle(source: mujoco.MjModel, model: mujoco.MjModel, body: int, size: float) -> None:
-    """Scale mass and inertia with the arc's length, and derive MuJoCo's constants anew.
-
-    What is fixed to the needle moves with it.
-    """
-    model.body_mass[body] = source.body_mass[body] * size
-    model.body_inertia[body] = source.body_inertia[body] * size**3
-    model.body_ipos[body] = source.body_ipos[body] * size
-    for sites in np.flatnonzero(source.site_bodyid == body):
-        model.site_pos[sites] = source.site_pos[sites] * size
-    for thread in np.flatnonzero(source.body_parentid == body):
-        model.body_pos[thread] = source.body_pos[thread] * size
-    if size == 1.0:
-        for name in DERIVED:
-            getattr(model, name)[:] = getattr(source, name)
-        return
-    extent = source.stat.extent
-    centre = source.stat.center.copy()
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    # They place the cameras' near and far planes.
-    model.stat.extent = extent
-    model.stat.center[:] = centre

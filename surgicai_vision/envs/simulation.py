@@ -29,8 +29,9 @@ from surgicai_vision.envs.attach import Welds
 from surgicai_vision.envs.control import COMMAND_SIZE, Command, StepSize
 from surgicai_vision.envs.task_state import TaskState
 from surgicai_vision.envs.tissue import Tissue
-from surgicai_vision.scene import Scene, kinematics, needle
+from surgicai_vision.scene import Scene, kinematics
 from surgicai_vision.scene.arm import GRASP_DEPTH
+from surgicai_vision.scene.holes import PAIRS
 from surgicai_vision.scene.kinematics import Pose
 from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
 
@@ -82,8 +83,7 @@ class Simulation:
         self._xmat = data.xmat
         self.draws = randomisation.NOTHING
         self.offsets: dict[str, tuple[float, ...]] = {}
-        self.radius = needle.RADIUS
-        self.tip_angle = needle.TIP_ANGLE
+        self._meet_draws()
         self._welds = Welds(self.model, self.data) if welded else None
         self.tissue = Tissue(scene, self.model, data) if is_soft else None
         self._own = own_model
@@ -113,9 +113,10 @@ class Simulation:
         self.data.time = CLOCK_START
         self.task_state = TaskState()
         for arm in names.ARMS:
-            self.pose_arm(
-                arm, poses.flat(kinematics.start_in_base(arm)), kinematics.STARTS[arm].jaw
-            )
+            start = kinematics.start_in_base(arm)
+            to_base = kinematics.base_in_world(arm)[:3, :3].T
+            start[:3, 3] += to_base @ randomisation.start_shift(self.draws, arm)
+            self.pose_arm(arm, poses.flat(start), kinematics.STARTS[arm].jaw)
         if self._own:
             self.data.userdata[_DRAWS:_WELDS] = self.draws
         if self._welds:
@@ -137,9 +138,19 @@ class Simulation:
         randomisation.apply(self.scene, self.model, draws)
         self.draws = draws
         self.offsets = randomisation.joint_offsets(draws)
-        self.radius = randomisation.needle_radius(draws)
+        self._meet_draws()
         if self.tissue:
             self.tissue.meet(self.radius, self.tip_angle)
+
+    def _meet_draws(self) -> None:
+        """Take the needle's shape, the phantom's place and the pair from the draws."""
+        self.shape = randomisation.needle_shape(self.draws)
+        self.radius = self.shape.radius
+        self.tip_angle = self.shape.tip_angle
+        self.placement = randomisation.placement(self.scene, self.draws)
+        self.pair_index = self.placement.pair
+        own = PAIRS[self.scene.config.layout][self.pair_index]
+        self.pair = self.placement.placed_pair(own)
 
     def refresh(self) -> None:
         """Recompute positions, velocities and contacts of the present state."""

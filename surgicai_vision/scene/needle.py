@@ -11,6 +11,7 @@ both taper towards the tip. Contact numbers were measured by `benchmarks/grip.py
 
 import itertools
 import math
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -49,6 +50,37 @@ two flat pads hold a round needle. With the default 0.005 m the grip crept 0.7°
 at most; with 0.01 m 0.4° and 1.2°."""
 
 
+@dataclass(frozen=True)
+class NeedleShape:
+    """The shape of a needle; the scene's own by default.
+
+    Attributes:
+        radius: of the arc [m].
+        tip_angle: of the tip [rad]: how much of a circle the needle is.
+        body_radius: half of its thickness [m].
+    """
+
+    radius: float = RADIUS
+    tip_angle: float = TIP_ANGLE
+    body_radius: float = BODY_RADIUS
+
+    @property
+    def mass(self) -> float:
+        """Return its mass [kg]: that of steel, as long and as thick."""
+        length = (self.radius / RADIUS) * (self.tip_angle / TIP_ANGLE)
+        return MASS * length * (self.body_radius / BODY_RADIUS) ** 2
+
+    def thickness(self, angle: float) -> float:
+        """Return half of the thickness [m] at `angle` [rad]; the last quarter tapers."""
+        share = max(0.0, (angle / self.tip_angle - 0.75) / 0.25)
+        end = TIP_RADIUS * (self.body_radius / BODY_RADIUS)
+        return self.body_radius + share * (end - self.body_radius)
+
+
+OWN_SHAPE = NeedleShape()
+"""The shape of the scene's own needle."""
+
+
 def point(angle: float, radius: float = RADIUS) -> NDArray[np.float64]:
     """Return the point (3,) [m] at `angle` [rad] of an arc of `radius` [m] in its frame."""
     return np.array([-radius * math.cos(angle), radius * math.sin(angle), 0.0])
@@ -64,41 +96,46 @@ def radial(angle: float) -> NDArray[np.float64]:
     return np.array([-math.cos(angle), math.sin(angle), 0.0])
 
 
-def polyline(points: int = 61, radius: float = RADIUS) -> NDArray[np.float64]:
+def polyline(
+    points: int = 61, radius: float = RADIUS, tip_angle: float = TIP_ANGLE
+) -> NDArray[np.float64]:
     """Return points along the needle from base to tip in its frame, shape (points, 3) [m]."""
-    angles = np.linspace(0.0, TIP_ANGLE, points)
+    angles = np.linspace(0.0, tip_angle, points)
     return np.stack(
         [-radius * np.cos(angles), radius * np.sin(angles), np.zeros_like(angles)], axis=1
     )
 
 
 def thickness(angle: float) -> float:
-    """Return half of the needle's thickness [m] at `angle` [rad]; its last quarter tapers."""
-    share = max(0.0, (angle / TIP_ANGLE - 0.75) / 0.25)
-    return BODY_RADIUS + share * (TIP_RADIUS - BODY_RADIUS)
+    """Return half of the own needle's thickness [m] at `angle` [rad]; its last quarter tapers."""
+    return OWN_SHAPE.thickness(angle)
 
 
-def add_needle(spec: mujoco.MjSpec, collision: dict[str, int]) -> mujoco.MjsBody:
+def add_needle(
+    spec: mujoco.MjSpec, collision: dict[str, int], shape: NeedleShape = OWN_SHAPE
+) -> mujoco.MjsBody:
     """Add the needle's free body to `spec` at `HOME` and return it.
 
     Args:
         spec: the scene.
         collision: `contype` and `conaffinity` of the needle.
+        shape: of the needle.
     """
     body = spec.worldbody.add_body(name="needle", pos=HOME.tolist())
     body.add_joint(name="needle", type=mujoco.mjtJoint.mjJNT_FREE, damping=DRAG, armature=ARMATURE)
-    edges = np.linspace(0.0, TIP_ANGLE, SEGMENTS + 1)
+    radius = shape.radius
+    edges = np.linspace(0.0, shape.tip_angle, SEGMENTS + 1)
     for index, (start, end) in enumerate(itertools.pairwise(edges)):
         body.add_geom(
             name=f"needle_{index}",
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            fromto=[*point(start), *point(end)],
-            size=[thickness((start + end) / 2), 0, 0],
-            mass=MASS / SEGMENTS,
+            fromto=[*point(start, radius), *point(end, radius)],
+            size=[shape.thickness((start + end) / 2), 0, 0],
+            mass=shape.mass / SEGMENTS,
             material="needle",
             **CONTACT,
             **collision,
         )
-    body.add_site(name="needle_base", pos=point(0.0).tolist(), size=[0.0003] * 3, group=4)
-    body.add_site(name="needle_tip", pos=point(TIP_ANGLE).tolist(), size=[0.0003] * 3, group=4)
+    for name, angle in (("needle_base", 0.0), ("needle_tip", shape.tip_angle)):
+        body.add_site(name=name, pos=point(angle, radius).tolist(), size=[0.0003] * 3, group=4)
     return body

@@ -109,7 +109,8 @@ def add_table(spec: mujoco.MjSpec, bits: dict[str, int]) -> None:
     """
     half = [SIZE[0] / 2 + TRAY_RIM, SIZE[1] / 2 + TRAY_RIM, TRAY_HEIGHT / 2]
     place = {"pos": [*ORIGIN, TABLE + half[2]], "size": half, "material": "tray", "group": 0}
-    spec.worldbody.add_geom(name="tray", type=mujoco.mjtGeom.mjGEOM_BOX, **place, **CONTACT, **bits)
+    tray = spec.worldbody.add_body(name="tray")
+    tray.add_geom(name="tray", type=mujoco.mjtGeom.mjGEOM_BOX, **place, **CONTACT, **bits)
     flat = {"pos": [*ORIGIN, TABLE], "size": [0.0, 0.0, 1.0], "group": 4}
     spec.worldbody.add_geom(
         name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, **flat, **CONTACT, **bits

@@ -113,7 +113,7 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
 def dress(spec: mujoco.MjSpec, layout: str = "simple", instrument: str = "400006") -> None:
     """Give finished bodies their visible shape and hide the physical geoms beneath it."""
     _dress_phantom(spec, layout)
-    _dress_needle(spec)
+    dress_needle(spec)
     length = INSTRUMENTS[instrument].pitch_to_yaw
     tool.add_tool_meshes(spec, length)
     for arm in ARMS:
@@ -136,15 +136,15 @@ def _dress_phantom(spec: mujoco.MjSpec, layout: str) -> None:
         show(body, Shape, material, meshname=mesh)
 
 
-def _dress_needle(spec: mujoco.MjSpec) -> None:
+def dress_needle(spec: mujoco.MjSpec, shape: needle.NeedleShape = needle.OWN_SHAPE) -> None:
     """Draw the needle as one tube along its arc that ends in a point."""
     body = spec.body("needle")
     hide(body)
-    angles = np.append(np.linspace(0.0, needle.TIP_ANGLE, 33), needle.TIP_ANGLE)
-    radii = [needle.thickness(angle) for angle in angles]
-    centres = np.array([needle.point(angle) for angle in angles])
+    angles = np.append(np.linspace(0.0, shape.tip_angle, 33), shape.tip_angle)
+    radii = [shape.thickness(angle) for angle in angles]
+    centres = np.array([needle.point(angle, shape.radius) for angle in angles])
     radii[-1] = 0.00003
-    centres[-1] += needle.tangent(needle.TIP_ANGLE) * radii[-2]
+    centres[-1] += needle.tangent(shape.tip_angle) * radii[-2]
     shapes.tube(centres, radii, [0.0, 0.0, -1.0]).add_to(spec, "needle")
     show(body, Shape, "needle", meshname="needle")
 

@@ -1,0 +1,250 @@
+"""Feasibility: what geometry forbids is refused before an env is made, with the reason.
+
+`refuse_impossible(config, through)` looks at the corners of what a task's randomisation may draw:
+
+* Room for PSM2's jaws at the end of the insertion (`geometry`): every pair that may be sewn, with
+  the smallest needle of every arc that may be drawn.
+* Reach: the joints of both arms along the needle's whole way, and at the grasp of a needle that
+  lies on the tissue, for the corners of the phantom's places.
+* View: with the phantom's place varied, both holes stay in the image of `VIEW`.
+
+Within the limits of `core.config` the layout `simple` with instrument 400006 passes the last two
+for every draw: the limits were chosen so (`tests/envs/test_feasibility.py`).
+"""
+
+import functools
+import itertools
+import math
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core.config import (
+    ANY,
+    NEEDLE_ARCS,
+    RandomisationConfig,
+    SceneConfig,
+    TaskConfig,
+)
+from surgicai_vision.core.errors import InputError, UnreachablePose
+from surgicai_vision.core.names import PSM1, PSM2
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.geometry import EXTRA, INSERT_DEPTH, Stitch, grasp_in_needle
+from surgicai_vision.envs.placement import SLIDE, Placement
+from surgicai_vision.envs.randomisation import TIP_ANGLES
+from surgicai_vision.envs.starts import GRASP_ANGLES
+from surgicai_vision.scene import build_scene, kinematics, needle
+from surgicai_vision.scene.holes import PAIRS, HolePair
+from surgicai_vision.scene.kinematics import Joints
+
+VIEW = "front"
+"""The camera in whose image the holes must stay: the endoscope."""
+WAY = 9
+"""Places along the needle's way at which the joints are checked."""
+OUT = math.radians(12.0)
+"""How far past the exit the pull-out turns the needle's base [rad] (`demos.expert`)."""
+
+
+def refuse_impossible(config: TaskConfig, through: bool) -> None:
+    """Refuse a task that geometry forbids for something that may be drawn.
+
+    Args:
+        config: the task.
+        through: True if the needle is driven through the tissue; else only view and reach matter.
+
+    Raises:
+        InputError: naming what is in the way, and the largest value that is allowed.
+    """
+    if through:
+        _refuse_narrow(config)
+    axes = config.randomisation
+    if axes.phantom_shift or axes.phantom_turn or axes.pair or axes.needle_arc:
+        _refuse_hidden(config.scene, axes)
+        if through and all(Stitch.of(*case).possible for case in _cases(config.scene, axes)):
+            _refuse_unreachable(config.scene, axes)
+
+
+def _arcs(axes: RandomisationConfig) -> tuple[str, ...]:
+    """Return the arcs that may be drawn."""
+    return NEEDLE_ARCS if axes.needle_arc == ANY else (axes.needle_arc or NEEDLE_ARCS[0],)
+
+
+def _pairs(scene: SceneConfig, axes: RandomisationConfig) -> tuple[int, ...]:
+    """Return the indices of the pairs that may be sewn."""
+    return (0, 1, 2, 3) if axes.pair == ANY else (scene.hole_pair - 1,)
+
+
+def _cases(
+    scene: SceneConfig, axes: RandomisationConfig
+) -> Iterator[tuple[HolePair, float, float]]:
+    """Yield the pairs that may be sewn with the smallest needle of each arc that may be drawn."""
+    smallest = needle.RADIUS * (1.0 - axes.needle_size)
+    for index, arc in itertools.product(_pairs(scene, axes), _arcs(axes)):
+        yield PAIRS[scene.layout][index], smallest, TIP_ANGLES[arc]
+
+
+# -- room for the jaws -----------------------------------------------------------------------------
+
+
+def has_room(pair: HolePair, radius: float, tip_angle: float = needle.TIP_ANGLE) -> bool:
+    """Return True if a needle can be driven through a pair with PSM2's jaws outside the entry."""
+    return pair.gap < 2 * radius and Stitch.of(pair, radius, tip_angle).possible
+
+
+def largest_size(pair: HolePair, tip_angle: float) -> float:
+    """Return the largest `needle_size` at which the smallest needle still can be driven through.
+
+    Returns:
+        A share of the radius in thousandths, rounded down; negative if the scene's own radius is
+        too small.
+    """
+    low = -1.0  # twice the radius
+    high = 0.5
+    while high - low > 1e-4:
+        middle = (low + high) / 2
+        if has_room(pair, needle.RADIUS * (1.0 - middle), tip_angle):
+            low = middle
+        else:
+            high = middle
+    return math.floor(low * 1e3) / 1e3
+
+
+def _refuse_narrow(config: TaskConfig) -> None:
+    """Refuse pairs whose holes are too far apart for the smallest needle that may be drawn."""
+    axes = config.randomisation
+    layout = config.scene.layout
+    for index, arc in itertools.product(_pairs(config.scene, axes), _arcs(axes)):
+        pair = PAIRS[layout][index]
+        allowed = largest_size(pair, TIP_ANGLES[arc])
+        if axes.needle_size <= allowed:
+            continue
+        why = (
+            f"the holes of pair {index + 1} are {pair.gap * 1e3:.1f} mm apart, too far for this "
+            "needle"
+        )
+        if allowed >= 0:
+            limit = min(largest_size(*case[::2]) for case in _cases(config.scene, axes))
+            raise InputError(
+                f"randomisation: needle_size {axes.needle_size} makes '{config.task}' impossible "
+                f"in layout '{layout}': {why}, an arc of {arc} circle, when it is smallest: PSM2's "
+                "jaws would meet the entry (see surgicai_vision.envs.geometry). The largest "
+                f"needle_size here is {max(limit, 0.0)}."
+            )
+        raise InputError(
+            f"'{config.task}' is not possible in layout '{layout}': {why} (see "
+            "surgicai_vision.envs.geometry). Allowed there: grasp, place. "
+            "All tasks: simple, 3dmed_straight."
+        )
+
+
+# -- view and reach --------------------------------------------------------------------------------
+
+
+def corners(scene: SceneConfig, axes: RandomisationConfig) -> Iterator[Placement]:
+    """Yield the phantom's furthest places with each pair that may be sewn."""
+    shift = axes.phantom_shift / 1e3
+    turn = math.radians(axes.phantom_turn)
+    for index in _pairs(scene, axes):
+        rows = PAIRS[scene.layout]
+        beyond = rows[0].entry.centre[1] - rows[index].entry.centre[1]
+        slide = SLIDE * beyond if axes.pair == ANY else 0.0
+        signs = itertools.product((-1.0, 1.0), repeat=3)
+        for x, y, angle in signs:
+            yield Placement(index, slide, (x * shift, y * shift), angle * turn)
+
+
+def _placed(scene: SceneConfig, where: Placement) -> HolePair:
+    return where.placed_pair(PAIRS[scene.layout][where.pair])
+
+
+@functools.lru_cache(maxsize=32)
+def _refuse_hidden(scene: SceneConfig, axes: RandomisationConfig) -> None:
+    """Refuse places of the phantom at which a hole leaves the endoscope's image."""
+    for where in corners(scene, axes):
+        pair = _placed(scene, where)
+        if all(_in_view(hole.centre) for hole in (pair.entry, pair.exit)):
+            continue
+        x, y = where.shift
+        raise InputError(
+            f"randomisation: with the phantom shifted by {x * 1e3:.1f}, {y * 1e3:.1f} mm "
+            f"and turned by {math.degrees(where.turn):.1f}° pair {where.pair + 1} is outside the "
+            f"image of camera '{VIEW}'. Allowed: a smaller phantom_shift or phantom_turn, "
+            "hole_pair 1 or 2, or pair: any, for which the phantom slides under the endoscope."
+        )
+
+
+@functools.cache
+def _view() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return the endoscope's place (3,), rotation (3, 3) and tangent of half its field of view."""
+    model = build_scene().model
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_camlight(model, data)
+    index = model.camera(VIEW).id
+    half = math.tan(math.radians(model.cam_fovy[index]) / 2)
+    return data.cam_xpos[index].copy(), data.cam_xmat[index].reshape(3, 3).copy(), half
+
+
+def _in_view(point: tuple[float, float, float]) -> bool:
+    """Return True if a point of the world is in the endoscope's square image."""
+    place, rotation, half = _view()
+    x, y, z = rotation.T @ (np.asarray(point) - place)
+    return bool(max(abs(x), abs(y)) < -z * half)
+
+
+@functools.lru_cache(maxsize=32)
+def _refuse_unreachable(scene: SceneConfig, axes: RandomisationConfig) -> None:
+    """Refuse places of the phantom at which an arm cannot follow the needle's way."""
+    sizes = sorted({1.0 - axes.needle_size, 1.0 + axes.needle_size})
+    angles = [TIP_ANGLES[arc] for arc in _arcs(axes)]
+    for where, size, tip_angle in itertools.product(corners(scene, axes), sizes, angles):
+        stitch = Stitch.of(_placed(scene, where), needle.RADIUS * size, tip_angle)
+        for arm, tips in (
+            *((PSM2, insertion(stitch, angle)) for angle in stitch.grasps(*GRASP_ANGLES)),
+            (PSM1, extraction(stitch)),
+        ):
+            try:
+                follow(arm, tips, scene.instrument)
+            except UnreachablePose as error:
+                x, y = where.shift
+                raise InputError(
+                    f"randomisation: with the phantom shifted by {x * 1e3:.1f}, {y * 1e3:.1f} mm "
+                    f"and turned by {math.degrees(where.turn):.1f}° {arm} cannot sew pair "
+                    f"{where.pair + 1} with a needle of {stitch.radius * 1e3:.1f} mm radius and "
+                    f"{math.degrees(tip_angle):.0f}°: {error} Allowed: a smaller phantom_turn, "
+                    "phantom_shift or needle_size, or a shorter needle_arc."
+                ) from error
+
+
+def insertion(stitch: Stitch, angle: float) -> list[NDArray[np.float64]]:
+    """Return T_world_tip (4, 4) along the insertion by a grasp at `angle` [rad]."""
+    grasp = grasp_in_needle(PSM2, angle, radius=stitch.radius)
+    last = stitch.angle_at_entry(stitch.insert_angle, INSERT_DEPTH + EXTRA)
+    return [stitch.place() @ grasp] + [
+        stitch.on_arc(at) @ grasp for at in np.linspace(stitch.tip_angle, last, WAY)
+    ]
+
+
+def extraction(stitch: Stitch) -> list[NDArray[np.float64]]:
+    """Return T_world_tip (4, 4) along the pull-out by the nominal grasp."""
+    grasp = grasp_in_needle(PSM1, stitch.handoff_angle, radius=stitch.radius)
+    first = stitch.angle_at_entry(stitch.insert_angle, INSERT_DEPTH + EXTRA)
+    last = -2 * stitch.half - OUT
+    way = [stitch.on_arc(at) @ grasp for at in np.linspace(first, last, WAY)]
+    return [*way, stitch.pulled() @ grasp]
+
+
+def follow(arm: str, tips: list[NDArray[np.float64]], instrument: str) -> list[Joints]:
+    """Return an arm's joints along T_world_tip (4, 4), each found from the one before.
+
+    Raises:
+        UnreachablePose: past a joint limit.
+    """
+    from_world = np.linalg.inv(kinematics.base_in_world(arm))
+    joints: list[Joints] = []
+    for tip in tips:
+        pose = poses.flat(from_world @ tip)
+        joints.append(kinematics.inverse_flat(pose, instrument, joints[-1] if joints else None))
+    return joints
