@@ -171,7 +171,7 @@ class Stitch:
         """Return the needle's pose with its tip in the entry, perpendicular to its plane."""
         entry = self.pair.entry
         inward = -entry.rotation[:, 2]
-        radial: Matrix = np.cross(self.wound, inward)
+        radial = np.cross(self.wound, inward).astype(np.float64)
         pose = _needle_pose(self.tip_angle, radial, np.zeros(3), self.wound)
         pose[:3, 3] = np.asarray(entry.centre) - pose[:3, :3] @ needle.point(
             self.tip_angle, self.radius
