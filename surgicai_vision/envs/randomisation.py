@@ -182,10 +182,11 @@ def _place_phantom(scene: Scene, model: mujoco.MjModel, where: Placement) -> Non
 
 
 def _light(source: mujoco.MjModel, model: mujoco.MjModel, factors: Array) -> None:
-    """Scale the head light and the two lamps."""
+    """Scale the head light, with the endoscope's own, and the two lamps."""
+    lamps = np.append(factors[1:], factors[0])[:, None]
     for kind in ("ambient", "diffuse", "specular"):
         getattr(model.vis.headlight, kind)[:] = getattr(source.vis.headlight, kind) * factors[0]
-        getattr(model, f"light_{kind}")[:] = getattr(source, f"light_{kind}") * factors[1:, None]
+        getattr(model, f"light_{kind}")[:] = getattr(source, f"light_{kind}") * lamps
 
 
 def _tint(source: mujoco.MjModel, model: mujoco.MjModel, factors: Array) -> None:
