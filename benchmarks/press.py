@@ -65,7 +65,7 @@ class FinePlate:
 
     def __init__(self, env: envs.SuturingEnv):
         self._env = env
-        self._plate = ForcePlate(env.model)
+        self._plate = ForcePlate(env.model, env.simulation.tissue)
         self._again = mujoco.MjData(env.model)
         self._state = np.empty(mujoco.mj_stateSize(env.model, STATE))
 

@@ -30,6 +30,7 @@ from typing import Protocol
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.hole_crossing import JUMP, crossing
 from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.envs.tissue import Bite, Tissue
 from surgicai_vision.scene.holes import Hole, HolePair, Point
 
 
@@ -54,6 +55,19 @@ class BiteWatch(Protocol):
 
     def update(self) -> None:
         """Read the state that a control step ended in."""
+
+
+def watch_of(simulation: Simulation, pair: HolePair, others: Sequence[HolePair]) -> BiteWatch:
+    """Return what follows the tip of a simulation from its present state on.
+
+    Args:
+        simulation: the simulation.
+        pair: the stitch's marks.
+        others: the phantom's other pairs.
+    """
+    if simulation.tissue is None:
+        return ChannelWatch(simulation, pair, others)
+    return SoftWatch(simulation, simulation.tissue, pair, others)
 
 
 def depth_under(entry: Point, leave: Point, path: Sequence[Point]) -> float:
@@ -175,3 +189,79 @@ class ChannelWatch:
             length=math.nan if entry is None else math.dist(entry, leave),
             wrong_hole=False,
         )
+
+
+class SoftWatch:
+    """Follows the bites that soft tissue notes.
+
+    Args:
+        simulation: read from its present state on.
+        tissue: its tissue.
+        pair: the stitch's marks.
+        others: the phantom's other pairs.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        tissue: Tissue,
+        pair: HolePair,
+        others: Sequence[HolePair],
+    ):
+        self.measures = BiteMeasures()
+        self._simulation = simulation
+        self._tissue = tissue
+        self._pair = pair
+        self._marks = [hole for each in (pair, *others) for hole in (each.entry, each.exit)]
+        self._is_own = False
+        self._seen = self._latest()
+
+    def update(self) -> None:
+        """Read the state that a control step ended in."""
+        before = self._seen
+        now = self._seen = self._latest()
+        if now is None:
+            return
+        if before is None or now.entry != before.entry:
+            self._is_own = True
+            self._enter(now)
+        if now.exit is None:
+            self.measures = replace(
+                self.measures,
+                exit_error=math.nan,
+                exit_angle=math.nan,
+                depth=math.nan,
+                length=math.nan,
+            )
+        elif before is None or now.exit != before.exit:
+            self._leave(now, now.exit)
+
+    def _latest(self) -> Bite | None:
+        bites = self._tissue.bites
+        return bites[-1] if bites else None
+
+    def _enter(self, bite: Bite) -> None:
+        """Begin a bite."""
+        mark = self._nearest(bite.entry)
+        self.measures = BiteMeasures(
+            entry_error=math.dist(bite.entry, self._pair.entry.centre),
+            entry_angle=angle_to(_inwards(mark), tip_tangent(self._simulation)),
+            wrong_hole=mark is not self._pair.entry,
+        )
+
+    def _leave(self, bite: Bite, leave: Point) -> None:
+        """Note where the tip came out."""
+        mark = self._nearest(leave)
+        own = self._is_own
+        self.measures = replace(
+            self.measures,
+            exit_error=math.dist(leave, self._pair.exit.centre),
+            exit_angle=angle_to(mark.normal, tip_tangent(self._simulation)),
+            depth=depth_under(bite.entry, leave, bite.path) if own else math.nan,
+            length=math.dist(bite.entry, leave) if own else math.nan,
+            wrong_hole=self.measures.wrong_hole or mark is not self._pair.exit,
+        )
+
+    def _nearest(self, point: Point) -> Hole:
+        """Return the mark that is nearest to a point."""
+        return min(self._marks, key=lambda mark: math.dist(mark.centre, point))

@@ -18,6 +18,7 @@ An `EpisodeMonitor` only reads: an episode is the same with and without it.
 
 import itertools
 import math
+import re
 from collections.abc import Sequence
 
 import mujoco
@@ -25,7 +26,7 @@ import mujoco
 from surgicai_vision.core import names
 from surgicai_vision.envs import hole_crossing
 from surgicai_vision.envs.base import SuturingEnv
-from surgicai_vision.envs.bite_measures import BiteMeasures, BiteWatch, ChannelWatch
+from surgicai_vision.envs.bite_measures import BiteMeasures, BiteWatch, watch_of
 from surgicai_vision.envs.force_plate import ForcePlate
 from surgicai_vision.envs.success import Info
 from surgicai_vision.scene.holes import PAIRS, Hole, Point
@@ -41,7 +42,7 @@ class EpisodeMonitor:
 
     def __init__(self, env: SuturingEnv):
         self._env = env
-        self._plate = ForcePlate(env.model)
+        self._plate = ForcePlate(env.model, env.simulation.tissue)
         self._layout = PAIRS[env.scene.config.layout]
         self._thread = _thread_bodies(env.model)
         self._watch: BiteWatch | None = None
@@ -54,7 +55,7 @@ class EpisodeMonitor:
         self.turn = 0.0
         self.tissue_force = 0.0
         self.tissue_impulse = 0.0
-        self.tears = math.nan
+        self.tears = math.nan if self._env.simulation.tissue is None else 0.0
         self.thread_drawn = 0.0 if self._thread else math.nan
         self.paper_success = False
 
@@ -65,7 +66,7 @@ class EpisodeMonitor:
         pair = self._env.stitch.pair
         pairs = [simulation.placement.placed_pair(other) for other in self._layout]
         others = [other for index, other in enumerate(pairs) if index != simulation.pair_index]
-        self._watch = ChannelWatch(simulation, pair, others)
+        self._watch = watch_of(simulation, pair, others)
 
     def update(self, info: Info) -> None:
         """Read the state that a step ended in; `info` is that step's."""
@@ -79,6 +80,8 @@ class EpisodeMonitor:
         self.tissue_impulse += force * self._env.dt
         self.paper_success = self.paper_success or bool(info["paper_success"])
         self._watch.update()
+        if simulation.tissue is not None:
+            self.tears = float(simulation.tissue.tears)
         if self._thread and simulation.task_state.holes_passed == hole_crossing.OUT:
             drawn = drawn_length(self._thread_points(), self._env.stitch.pair.exit)
             self.thread_drawn = max(self.thread_drawn, drawn)
@@ -125,6 +128,6 @@ def drawn_length(points: Sequence[Point], leave: Hole) -> float:
 
 def _thread_bodies(model: mujoco.MjModel) -> list[int]:
     """Return the bodies of the thread's segments, from the needle on; none without a thread."""
-    found = {model.body(index).name: index for index in range(model.nbody)}
-    segments = sum(name.startswith("thread_") for name in found)
-    return [found[f"thread_{index}"] for index in range(segments)]
+    names_of_bodies = (model.body(index).name for index in range(model.nbody))
+    found = [name for name in names_of_bodies if re.fullmatch(r"thread_\d+", name)]
+    return [model.body(f"thread_{index}").id for index in range(len(found))]

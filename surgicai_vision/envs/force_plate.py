@@ -1,13 +1,16 @@
 """Force plate: the net force of needle and instruments on the phantom, as one under it would show.
 
 Contact forces are not part of a state that ends with MuJoCo's position stage, and computing them in
-place would change the state's warm start. They are computed on data of the plate's own. The thread
-hangs on the needle and is not meant: what it pulls in the tissue is not counted.
+place would change the state's warm start. They are computed on data of the plate's own. In soft
+tissue the holds that the needle hangs in count as well (`envs.tissue`). The thread is not meant:
+what it pulls in the tissue is not counted.
 """
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+from surgicai_vision.envs.tissue import OUTSIDE, Tissue
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
@@ -17,10 +20,12 @@ class ForcePlate:
 
     Args:
         model: the env's model, its own copy where the env has one.
+        tissue: the simulation's soft tissue, if it has any.
     """
 
-    def __init__(self, model: mujoco.MjModel):
+    def __init__(self, model: mujoco.MjModel, tissue: Tissue | None = None):
         self._model = model
+        self._soft = tissue
         self._scratch = mujoco.MjData(model)
         self._state = np.empty(mujoco.mj_stateSize(model, STATE))
         phantom = model.body("phantom").id
@@ -33,7 +38,8 @@ class ForcePlate:
 
     def force(self, data: mujoco.MjData) -> float:
         """Return the size of the net force on the tissue [N]."""
-        if not self._touching(data).any():
+        holds = self._soft is not None and self._soft.stage != OUTSIDE
+        if not holds and not self._touching(data).any():
             return 0.0
         mujoco.mj_getState(self._model, data, self._state, STATE)
         mujoco.mj_setState(self._model, self._scratch, self._state, STATE)
@@ -42,7 +48,7 @@ class ForcePlate:
 
     def net(self, data: mujoco.MjData) -> NDArray[np.float64]:
         """Return the net force in world (3,) [N] of data whose forces have been computed."""
-        net = np.zeros(3)
+        net = np.zeros(3) if self._soft is None else -self._soft.hold_force(data)
         wrench = np.empty(6)
         for index in np.flatnonzero(self._touching(data)):
             contact = data.contact[int(index)]

@@ -1,5 +1,13 @@
-"""Success: whether a task is solved, judged from the measured state, never from the command."""
+"""Success: whether a task is solved, judged from the measured state, never from the command.
 
+* `paper_success`: the paper's own: position and angle within the tolerance, and what the subtask
+  demands besides (contact, both holes passed, needle out).
+* `is_success`: in channels the same. Soft tissue leads no needle, so it asks for more: the tissue
+  has not torn, and, from the insertion on, the latest bite goes in and comes out within `ON_MARK`
+  of its marks.
+"""
+
+import math
 from typing import Any
 
 import numpy as np
@@ -12,6 +20,9 @@ from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.scene.kinematics import Pose
 from surgicai_vision.scene.rotations import geodesic_angle_flat, multiply_flat
 
+ON_MARK = 0.002
+"""How far from its mark a bite in soft tissue may go in and come out [m]: about half of a channel's
+opening."""
 Info = dict[str, Any]
 Target = tuple[Pose, Pose]
 """The measured frame that success is judged by, and where it should be, both in world."""
@@ -28,10 +39,10 @@ def measure(
     turn = poses.angle(achieved, desired)
     tolerance = subtask.tolerances[preset]
     near = distance <= tolerance.distance and turn <= tolerance.angle and not state.has_diverged
-    solved = near and _meets_demands(simulation, subtask, stitch, preset, contact)
+    as_in_paper = near and _meets_demands(simulation, subtask, stitch, preset, contact)
     return {
-        "is_success": solved,
-        "paper_success": solved,
+        "is_success": as_in_paper and _is_well_stitched(simulation, subtask, stitch),
+        "paper_success": as_in_paper,
         "d_trans": distance,
         "d_angle": turn,
         "contact": contact,
@@ -44,20 +55,22 @@ def measure(
 
 
 def meets_demands(simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str) -> bool:
-    """Return True if what success needs besides the pose holds: contact, holes, needle out.
+    """Return True if what success needs besides the pose holds: contact, holes, needle out, marks.
 
     After a physics error nothing holds.
     """
     contact = simulation.holds(subtask.arm)
-    return not simulation.task_state.has_diverged and _meets_demands(
-        simulation, subtask, stitch, preset, contact
+    return (
+        not simulation.task_state.has_diverged
+        and _meets_demands(simulation, subtask, stitch, preset, contact)
+        and _is_well_stitched(simulation, subtask, stitch)
     )
 
 
 def _meets_demands(
     simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str, contact: bool
 ) -> bool:
-    """Return True if what success needs besides the pose holds."""
+    """Return True if what the paper asks for besides the pose holds."""
     demands = subtask.demands[preset]
     passed = simulation.task_state.holes_passed
     if demands.contact and not contact:
@@ -68,6 +81,25 @@ def _meets_demands(
         return False
     return not demands.out or (
         passed == hole_crossing.OUT and hole_crossing.is_out(simulation, stitch.pair)
+    )
+
+
+def _is_well_stitched(simulation: Simulation, subtask: Subtask, stitch: Stitch) -> bool:
+    """Return True in channels, and in soft tissue that is whole and pierced at its marks."""
+    tissue = simulation.tissue
+    if tissue is None:
+        return True
+    if tissue.tears:
+        return False
+    if not subtask.through:
+        return True
+    bites = tissue.bites
+    if not bites or bites[-1].exit is None:
+        return False
+    pair = stitch.pair
+    return (
+        math.dist(bites[-1].entry, pair.entry.centre) <= ON_MARK
+        and math.dist(bites[-1].exit, pair.exit.centre) <= ON_MARK
     )
 
 

@@ -367,7 +367,7 @@ class Tissue:
         mujoco.mj_getState(model, self._data, self._vector, _STATE)
         mujoco.mj_setState(model, scratch, self._vector, _STATE)
         mujoco.mj_forward(model, scratch)
-        return self._contact_force(scratch) + self._hold_force(scratch)
+        return self._contact_force(scratch) + self.hold_force(scratch)
 
     def _contact_force(self, data: mujoco.MjData) -> NDArray[np.float64]:
         """Return the force of the phantom's contacts on the needle [N]."""
@@ -386,8 +386,8 @@ class Tissue:
                 force += sign * (data.contact[index].frame.reshape(3, 3).T @ wrench[:3])
         return force
 
-    def _hold_force(self, data: mujoco.MjData) -> NDArray[np.float64]:
-        """Return the force of the two holds on the needle [N]."""
+    def hold_force(self, data: mujoco.MjData) -> NDArray[np.float64]:
+        """Return the force of the two holds on the needle, (3,) [N]; `data` has its forces."""
         rows = data.efc_type[: data.nefc] == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
         held = rows & np.isin(data.efc_id[: data.nefc], self._equality)
         force: NDArray[np.float64] = data.efc_force[: data.nefc][held].reshape(-1, 3).sum(axis=0)

@@ -244,3 +244,90 @@ def test_a_pullout_draws_the_thread():
             break
     assert info["is_success"]
     assert 0.0 < monitor.thread_drawn < 0.095
+
+
+def soft(task="insert"):
+    return started(task, scene=SceneConfig(tissue="soft"))
+
+
+def drive(env, monitor, steps=None):
+    """Let the expert act and return the infos."""
+    expert = Expert(env)
+    infos = []
+    for _ in range(steps or env.config.max_steps):
+        *_, ended, _, info = env.step(expert.action())
+        monitor.update(info)
+        infos.append(info)
+        if ended:
+            break
+    return infos
+
+
+def test_the_expert_stitches_soft_tissue_at_its_marks():
+    env, monitor = soft()
+    info = drive(env, monitor)[-1]
+    assert info["is_success"] and info["paper_success"] and monitor.paper_success
+    bite = monitor.bite
+    assert 0 < bite.entry_error < 1e-3 and 0 < bite.exit_error < 1e-3
+    assert not bite.wrong_hole and monitor.tears == 0.0
+    assert bite.length == pytest.approx(env.stitch.pair.gap, abs=1e-3)
+    assert 0 < bite.depth < 2e-3
+    # It takes the force of the puncture to get in.
+    assert monitor.tissue_force > env.simulation.tissue.forces.puncture_in * 0.8
+    assert monitor.tissue_impulse > 0
+
+
+def test_what_soft_tissue_does_to_the_needle_is_what_the_plate_shows():
+    env, _ = soft()
+    plate = ForcePlate(env.model, env.simulation.tissue)
+    expert = Expert(env)
+    forces = []
+    for _ in range(env.config.max_steps):
+        ended = env.step(expert.action())[2]
+        shown = plate.force(env.data)
+        forces.append(shown)
+        assert shown == pytest.approx(
+            np.linalg.norm(env.simulation.tissue.force_on_needle()), abs=1e-9
+        )
+        if ended:
+            break
+    assert max(forces) > 1.0
+
+
+def test_a_bite_of_the_start_is_not_the_episodes():
+    env, monitor = soft("pullout")
+    assert env.simulation.tissue.bites
+    drive(env, monitor)
+    assert math.isnan(monitor.bite.entry_error) and math.isnan(monitor.bite.exit_error)
+
+
+@pytest.mark.parametrize(("shift", "success"), [(0.0019, True), (0.0021, False)])
+def test_soft_tissue_asks_for_the_marks(shift, success):
+    env, _ = soft("handoff")
+    tissue = env.simulation.tissue
+    passage = tissue._passages[-1]
+    passage.entry = env.stitch.pair.entry.centre
+    x, y, z = env.stitch.pair.exit.centre
+    passage.exit = (x, y + shift, z)
+    expert = Expert(env)
+    infos = [env.step(expert.action())[4] for _ in range(120)]
+    assert any(info["paper_success"] for info in infos)
+    assert any(info["is_success"] for info in infos) is success
+
+
+def test_torn_tissue_is_no_success():
+    env, monitor = soft()
+    env.simulation.tissue.tears = 1
+    infos = drive(env, monitor)
+    assert monitor.tears == 1.0 and monitor.paper_success
+    assert not any(info["is_success"] for info in infos)
+
+
+def test_monitoring_soft_tissue_changes_nothing():
+    (plain, _), (watched, monitor) = soft(), soft()
+    experts = Expert(plain), Expert(watched)
+    for _ in range(60):
+        plain.step(experts[0].action())
+        monitor.update(watched.step(experts[1].action())[4])
+    assert monitor.tissue_force > 0.5
+    np.testing.assert_array_equal(watched.get_state(), plain.get_state())
