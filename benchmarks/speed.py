@@ -14,6 +14,8 @@ Physics, images, resets and workers, each against the bare thing at equal settin
 * frames: `FrameRenderer.render` against `mujoco.Renderer` with shadows, multisampling and triangles
   set alike, on the same states. Both must give the same pixels. One core: llvmpipe draws in the
   calling thread.
+* crop: `env.image` of a crop against a camera that aims at the jaws, as 0.1 had it: the same size,
+  stand and field of view.
 * reset: per task [ms].
 * workers: two worker processes against one, steps of all envs a second: gymnasium's asynchronous
   vector env (`async_…`, an env a worker) and ours (`shares_…`, `--share` envs a worker), with state
@@ -28,6 +30,7 @@ too; workers and help are timed by the wall in any case.
 import argparse
 import copy
 import functools
+import math
 import os
 import subprocess
 import sys
@@ -46,14 +49,19 @@ from common import emit, median
 
 from surgicai_vision import envs
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import CAMERAS
 from surgicai_vision.core.config import SceneConfig, TaskConfig
 from surgicai_vision.core.tasks import env_id
 from surgicai_vision.demos.expert import Expert
+from surgicai_vision.scene.arm import GRASP_DEPTH
+from surgicai_vision.scene.cameras import crop_of
+from surgicai_vision.scene.compose import build_spec
 from surgicai_vision.scene.rendering import QUALITIES, FrameRenderer
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 SIZE = 224
 CAMERA = "front"
+CROP = "front_psm2"
 POSES = 16
 
 
@@ -234,6 +242,55 @@ def measure_frames(repeats: int, frames: int) -> dict[str, Any]:
     }
 
 
+def measure_crop(repeats: int, frames: int) -> dict[str, Any]:
+    """Time a crop against a camera that follows the jaws, on the same states."""
+    env, start, actions, _ = record(0)
+    spec = build_spec(env.config.scene)
+    crop = crop_of(CROP)
+    stand = CAMERAS.load(crop.camera)
+    target = spec.body(f"{crop.arm}_tip").add_body(name="target", pos=[0.0, 0.0, GRASP_DEPTH])
+    spec.worldbody.add_camera(
+        name="aimed",
+        pos=list(stand.position),
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
+        targetbody=target.name,
+        fovy=math.degrees(2.0 * math.atan(crop.span / 2.0 / crop.distance)),
+    )
+    model = spec.compile()
+    states = []
+    aimed = []
+    env.set_state_vector(start)
+    for index, action in enumerate(actions):
+        env.step(action)
+        if index % (len(actions) // POSES) == 0:
+            states.append(env.get_state())
+            data = mujoco.MjData(model)
+            data.qpos[:] = env.data.qpos
+            mujoco.mj_forward(model, data)
+            aimed.append(data)
+    follower = FrameRenderer(model, SIZE, SIZE)
+    env.image(CROP, (SIZE, SIZE))
+    turns: tuple[list[float], list[float]] = ([], [])
+    for state, data in zip(states, aimed, strict=True):
+        env.set_state_vector(state)
+        pair = in_turns(
+            lambda: [env.image(CROP, (SIZE, SIZE)) for _ in range(frames // POSES)],
+            lambda data=data: [follower.render(data, "aimed") for _ in range(frames // POSES)],
+            repeats,
+        )
+        for kept, new in zip(turns, pair, strict=True):
+            kept.extend(new)
+    follower.close()
+    env.close()
+    return {
+        "size": SIZE,
+        "view": CROP,
+        "frames_per_s": round(frames // POSES / median(turns[0], 9)),
+        "aimed_frames_per_s": round(frames // POSES / median(turns[1], 9)),
+        "of_aimed": ratio(turns[1], turns[0]),
+    }
+
+
 def _set_quality(model: mujoco.MjModel) -> None:
     """Set a model to the settings of our quality "fast"."""
     quality = QUALITIES["fast"]
@@ -312,7 +369,7 @@ def measure_help(repeats: int) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print one JSON line."""
-    parts = ("step", "tissue", "frames", "reset", "workers", "help")
+    parts = ("step", "tissue", "frames", "crop", "reset", "workers", "help")
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -334,6 +391,8 @@ def main() -> None:
         }
     if "frames" in chosen.only:
         row["frames"] = measure_frames(chosen.repeats, chosen.frames)
+    if "crop" in chosen.only:
+        row["crop"] = measure_crop(chosen.repeats, chosen.frames)
     if "reset" in chosen.only:
         row["reset_ms"] = measure_reset(chosen.repeats)
     if "help" in chosen.only:
@@ -347,7 +406,7 @@ def main() -> None:
             for kind in ("state", "pixels")
         }
     row["load_average"] = [round(value, 2) for value in os.getloadavg()]
-    emit("speed", row, render="frames" in chosen.only)
+    emit("speed", row, render=bool({"frames", "crop"} & {*chosen.only}))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ from surgicai_vision.core.config import SceneConfig, TaskConfig
 from surgicai_vision.core.errors import SurgicaiError
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.evaluation.statistics import clopper_pearson
-from surgicai_vision.scene.rendering import FrameRenderer
 
 TASKS = ("grasp", "place", "insert", "handoff")
 SIZE = 224
@@ -39,13 +38,12 @@ class Job(NamedTuple):
 def count(job: Job) -> list[list[int] | None]:
     """Return the needle's pixels per view at each episode's end, None where it failed."""
     env = envs.make(job.config)
-    with FrameRenderer(env.model, SIZE, SIZE) as renderer:
-        return [_pixels(env, seed, renderer, job.views) for seed in job.seeds]
+    counts = [_pixels(env, seed, job.views) for seed in job.seeds]
+    env.close()
+    return counts
 
 
-def _pixels(
-    env: envs.SuturingEnv, seed: int, renderer: FrameRenderer, views: tuple[str, ...]
-) -> list[int] | None:
+def _pixels(env: envs.SuturingEnv, seed: int, views: tuple[str, ...]) -> list[int] | None:
     expert = Expert(env)
     needle = names.PARTS.index("needle")
     try:
@@ -58,9 +56,8 @@ def _pixels(
         return None
     if not info["is_success"]:
         return None
-    return [
-        int((renderer.render(env.data, view, names.SEGMENTATION) == needle).sum()) for view in views
-    ]
+    size = (SIZE, SIZE)
+    return [int((env.image(view, size, names.SEGMENTATION) == needle).sum()) for view in views]
 
 
 def table(pixels: list[int]) -> dict[str, Any]:

@@ -116,7 +116,7 @@ class Verifier:
             index: self.files.tasks.get(index, f"task {index}")
             for index in columns["task_index"].tolist()
         }
-        content = digest.hexdigest(columns) if self.ours else ""
+        content = digest.hexdigest(columns, self.ours["views"]) if self.ours else ""
         return Verified(
             table, statistics, tuple(texts[index] for index in sorted(texts)), videos, content
         )

@@ -121,7 +121,6 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
                 Pacer(options.pace),
                 lambda status: _tell(console, status.message),
             )
-            views.close()
     env.close()
     count = len(recordings.seeds)
     total = f"{count} demonstrations: {out}" if count else "no demonstrations yet."

@@ -1,6 +1,7 @@
 """Cameras and views by name: ours, registered ones and those of other distributions.
 
-A view is what a policy may see of a camera: its colours, under the camera's name, or its depth.
+A view is what a policy may see of a camera: its colours, under the camera's name, or its depth. A
+crop of a camera's image is registered, named and asked for as a camera.
 """
 
 import zlib
@@ -13,12 +14,19 @@ from surgicai_vision.core.plugins import CAMERAS_GROUP, Registry
 if TYPE_CHECKING:
     from surgicai_vision.scene.cameras import Camera
 
+
+def _target(name: str) -> str:
+    """Return where one of our cameras or crops is defined, "module:attribute"."""
+    module = "crops" if name in names.CROPS else "cameras"
+    return f"surgicai_vision.scene.{module}:{name.upper()}"
+
+
 CAMERAS: Final = Registry["Camera"](
     "camera",
     CAMERAS_GROUP,
-    {name: f"surgicai_vision.scene.cameras:{name.upper()}" for name in names.CAMERAS},
+    {name: _target(name) for name in names.CAMERAS},
 )
-"""Camera name → its `scene.cameras.Camera`."""
+"""Camera name → its `scene.cameras.Camera`; a crop is one as well (`scene.cameras.Crop`)."""
 
 
 def register_camera(name: str, camera: "Camera", distribution: str = "") -> None:

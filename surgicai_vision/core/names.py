@@ -35,10 +35,14 @@ ACTIVE_ARM = MappingProxyType(
 
 FIXED_CAMERAS = ("front", "front_right", "back")
 WRIST_CAMERAS = ("wrist_psm1", "wrist_psm2")
-FOLLOWING_CAMERAS = ("front_psm1", "front_psm2", "back_psm1", "back_psm2")
-"""Crops of a fixed camera around an arm's jaws, enlarged (`scene.cameras`)."""
-CAMERAS = (*FIXED_CAMERAS, *WRIST_CAMERAS, *FOLLOWING_CAMERAS)
-"""Our cameras; `core.cameras` knows those of other distributions too, and every view."""
+CROPS = ("front_psm1", "front_psm2", "back_psm1", "back_psm2")
+"""Crops of a fixed camera's image about an arm's jaws (`scene.crops`)."""
+CAMERAS = (*FIXED_CAMERAS, *WRIST_CAMERAS, *CROPS)
+"""Our cameras and crops; `core.cameras` knows those of other distributions too, and every view.
+
+A place in this tuple is a number of the camera's own (`core.cameras.camera_number`): append new
+ones.
+"""
 RGB = "rgb"
 DEPTH = "depth"
 SEGMENTATION = "segmentation"
@@ -91,6 +95,9 @@ CLOCKED_STATE = "clocked_state"
 META_FILE = "meta/surgicai.json"
 """Our own sidecar inside a LeRobot dataset: cameras, units, renderer, hashes, versions."""
 
+CALIBRATION = "calibration."
+"""Beginning of the keys of a view's nominal K and T_world_camera, which are no policy's input."""
+
 FPS = 50
 """Control steps and frames per second of simulated time."""
 
@@ -128,3 +135,13 @@ def depth_key(view: str) -> str:
 def segmentation_key(view: str) -> str:
     """Return the LeRobot feature key of a view's segmentation image (part index)."""
     return f"observation.images.{view}_segmentation"
+
+
+def intrinsics_key(view: str) -> str:
+    """Return the key of a view's nominal camera matrix K, (9,) row by row [pixel]."""
+    return f"{CALIBRATION}{view}.K"
+
+
+def extrinsics_key(view: str) -> str:
+    """Return the key of a view's nominal T_world_camera, (16,) row by row [m]."""
+    return f"{CALIBRATION}{view}.T_world_camera"

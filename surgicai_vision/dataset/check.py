@@ -82,7 +82,7 @@ def check_dataset(path: Path, progress: Progress = silent) -> CheckReport:
     digests = []
     bounds = dataset.bounds()
     for start, stop in bounds:
-        rows = {key: columns[key][start:stop] for key in schema.COLUMNS}
+        rows = {key: columns[key][start:stop] for key in schema.columns(dataset.views)}
         digests.append(_check_episode(dataset, keys, start, stop, rows, problems))
         progress(stop, dataset.length, "frames")
     digest = schema.dataset_digest(digests)
@@ -137,13 +137,14 @@ def _check_lerobot(
     bounds = dataset.bounds()
     if (info.get("total_frames"), info.get("total_episodes")) != (dataset.length, len(bounds)):
         problems.append("meta/info.json: its counts are not those of the data.")
-    missing = [key for key in (*keys, *schema.COLUMNS) if key not in info.get("features", {})]
+    own = schema.columns(dataset.views)
+    missing = [key for key in (*keys, *own) if key not in info.get("features", {})]
     if missing:
         problems.append(f"meta/info.json: no feature {', '.join(missing)}.")
     expected = [(number, stop - start, start, stop) for number, (start, stop) in enumerate(bounds)]
     if list(zip(*(column.to_pylist() for column in table.columns), strict=True)) != expected:
         problems.append("meta/episodes: its rows are not the episodes of the data.")
-    for key in schema.COLUMNS:
+    for key in own:
         _check_statistics(key, statistics.get(key), columns[key], problems)
     problems.extend(
         f"meta/stats.json: no statistics of {key}." for key in keys if key not in statistics
@@ -185,7 +186,7 @@ def _check_episode(
             problem = watch.problem(index, frame)
             if problem:
                 problems.append(f"frame {start + index}, {key}: {problem}.")
-    return digest.hexdigest(rows)
+    return digest.hexdigest(rows, dataset.views)
 
 
 def _frames(

@@ -161,7 +161,7 @@ def write_converted(
         )
     shown = schema.image_keys(views, dataset.has_depth, dataset.has_segmentation)
     keys = [key for key, _, _ in shown]
-    features = _features(files, dataset, keys, video)
+    features = _features(files, dataset, views, keys, video)
     with whole_folder(out) as folder:
         # Where every episode is in the videos, by feature; empty without videos.
         encoded: list[dict[str, Encoded]] = []
@@ -177,7 +177,7 @@ def write_converted(
             "views": list(views),
             "cameras": {view: dataset.meta["cameras"][view] for view in views},
             "made_from": dataset.meta["digest"],
-            "digest": _digest(dataset, keys, rows, encoded, progress),
+            "digest": _digest(dataset, views, rows, encoded, progress),
             **({"video": video, "video_error": _errors(views, encoded, dataset)} if video else {}),
             **changes,
         }
@@ -185,12 +185,18 @@ def write_converted(
 
 
 def _features(
-    files: LeRobotFiles, dataset: RenderedDataset, keys: Sequence[str], video: str | None
+    files: LeRobotFiles,
+    dataset: RenderedDataset,
+    views: Sequence[str],
+    keys: Sequence[str],
+    video: str | None,
 ) -> dict[str, Table]:
     """Return the new dataset's features."""
     features: dict[str, Table] = {key: files.features[key] for key in keys}
+    left_out = {*schema.calibration_keys(dataset.views)} - {*schema.calibration_keys(views)}
     for key, row in files.features.items():
-        if row["dtype"] not in ("image", "video") and key not in INDEX_FEATURES:
+        is_image = row["dtype"] in ("image", "video")
+        if not is_image and key not in INDEX_FEATURES and key not in left_out:
             features[key] = row
     if video:
         info = {
@@ -246,13 +252,15 @@ def _copy_videos(files: LeRobotFiles, folder: Path, keys: Sequence[str]) -> list
 
 def _digest(
     dataset: RenderedDataset,
-    keys: Sequence[str],
+    views: Sequence[str],
     rows: Sequence[EpisodeMetadata],
     encoded: Sequence[Mapping[str, Encoded]],
     progress: Progress,
 ) -> str:
     """Return the digest of the new dataset's content."""
     columns = dataset.columns()
+    shown = schema.image_keys(views, dataset.has_depth, dataset.has_segmentation)
+    keys = [key for key, _, _ in shown]
     digests = []
     for number, row in enumerate(rows):
         digest = schema.EpisodeDigest(keys)
@@ -262,8 +270,8 @@ def _digest(
                 continue
             for frame in dataset.decoded(key, row.start, row.stop):
                 digest.add(key, frame)
-        episode = {key: columns[key][row.start : row.stop] for key in schema.COLUMNS}
-        digests.append(digest.hexdigest(episode))
+        episode = {key: columns[key][row.start : row.stop] for key in schema.columns(views)}
+        digests.append(digest.hexdigest(episode, views))
         if not encoded:
             progress(row.stop, dataset.length, "frames")
     return schema.dataset_digest(digests)

@@ -4,6 +4,8 @@
     dataset.length, dataset.views, dataset.episode_index, dataset.columns()
     dataset.frames("front", 0, 64)          # (64, 224, 224, 3) uint8 RGB
     dataset.depth("front", 0, 64)           # (64, 224, 224, 1) float32 [m]
+    dataset.intrinsics("front_psm2")        # (N, 3, 3) K, of a crop with its window
+    dataset.extrinsics("front_psm2")        # (N, 4, 4) T_world_camera
 
 Frames are numbered over the whole dataset, as LeRobot's `index` column. Reading in order keeps one
 row group (one episode) of one column in memory.
@@ -134,7 +136,7 @@ class RenderedDataset:
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
         """Return every column that is no image, (N,) or (N, n), by its key."""
-        keys = (*schema.COLUMNS, "frame_index", "timestamp", "index")
+        keys = (*schema.columns(self.views), "frame_index", "timestamp", "index")
         return {key: self._column(key) for key in keys}
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
@@ -153,6 +155,19 @@ class RenderedDataset:
         self._check("segmentation", self.has_segmentation)
         key = names.segmentation_key(self._view(view))
         return self._images(key, start, stop, np.uint8)[..., :1]
+
+    def intrinsics(self, view: str) -> NDArray[np.float32]:
+        """Return a view's nominal camera matrix K of every frame, (N, 3, 3) [pixel].
+
+        Of a crop the principal point tells where its window lies in its camera's image.
+        """
+        key = names.intrinsics_key(self._view(view))
+        return self._column(key).astype(np.float32, copy=False).reshape(-1, 3, 3)
+
+    def extrinsics(self, view: str) -> NDArray[np.float32]:
+        """Return a view's nominal T_world_camera of every frame, OpenCV's axes, (N, 4, 4) [m]."""
+        key = names.extrinsics_key(self._view(view))
+        return self._column(key).astype(np.float32, copy=False).reshape(-1, 4, 4)
 
     def decoded(self, key: str, start: int, stop: int) -> Iterator[NDArray[np.uint8 | np.float32]]:
         """Yield the images start … stop - 1 of a column as they decode, whatever their size."""

@@ -25,7 +25,7 @@ from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
 from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, column_array, compression
 from surgicai_vision.demos.store import Demo, read_demo
-from surgicai_vision.scene.cameras import extrinsics, intrinsics
+from surgicai_vision.scene.cameras import crop_of
 from surgicai_vision.scene.rendering import renderer_string
 
 MEASURED: Mapping[str, Callable[[envs.SuturingEnv], NDArray[np.float32]]] = {
@@ -35,6 +35,15 @@ MEASURED: Mapping[str, Callable[[envs.SuturingEnv], NDArray[np.float32]]] = {
     names.PRIVILEGED_STATE: lambda env: env.state_vector(),
 }
 """Column → what the env measures in the state that was set."""
+
+
+def _calibration(env: envs.SuturingEnv, view: str, size: int) -> dict[str, NDArray[np.float32]]:
+    """Return a view's nominal K (9,) and T_world_camera (16,) in the state that was set."""
+    known = env.calibration
+    return {
+        names.intrinsics_key(view): known.intrinsics(view, (size, size)).astype(np.float32).ravel(),
+        names.extrinsics_key(view): known.extrinsics(view).astype(np.float32).ravel(),
+    }
 
 
 @functools.lru_cache(maxsize=1)
@@ -76,7 +85,9 @@ def render_episode(
     content: dict[str, list[bytes]] = {key: [] for key, _, _ in keys}
     statistics = {key: ImageStatistics() for key in content}
     digest = schema.EpisodeDigest(content)
-    measured: dict[str, list[NDArray[np.float32]]] = {key: [] for key in MEASURED}
+    measured: dict[str, list[NDArray[np.float32]]] = {
+        key: [] for key in (*MEASURED, *schema.calibration_keys(views))
+    }
     for state in episode.state[:-1:frame_stride]:
         env.set_state_vector(state)
         observation = env.observe()
@@ -90,19 +101,23 @@ def render_episode(
             digest.add(key, frame)
         for key, measure in MEASURED.items():
             measured[key].append(measure(env))
+        for view in views:
+            for key, matrix in _calibration(env, view, size).items():
+                measured[key].append(matrix)
     # The columns, and everything in one file and its summary.
-    columns = _columns(episode, frame_stride, measured)
+    unordered = _columns(episode, frame_stride, measured)
+    columns = {key: unordered[key] for key in schema.columns(views)}
     depth_keys = [key for key, _, modality in keys if modality == names.DEPTH]
     _write_episode(folder, content, columns, depth_keys)
     summary = {
         "frames": len(columns[names.DONE]),
-        "digest": digest.hexdigest(columns),
+        "digest": digest.hexdigest(columns, views),
         "statistics": {
             **{key: statistics[key].result() for key in content},
-            **{key: column_statistics(columns[key]) for key in schema.COLUMNS},
+            **{key: column_statistics(values) for key, values in columns.items()},
         },
         "renderer": _renderer(),
-        "cameras": {view: _camera(env, view, size, episode.state) for view in views},
+        "cameras": {view: _camera(view) for view in views},
     }
     write_json(folder / SUMMARY_FILE, summary)
 
@@ -110,7 +125,7 @@ def render_episode(
 def _columns(
     demo: Demo, frame_stride: int, measured: Mapping[str, Sequence[NDArray[np.float32]]]
 ) -> dict[str, NDArray[np.generic]]:
-    """Return every column of `schema.COLUMNS`, (T,) or (T, n), for the T frames rendered."""
+    """Return every column of `schema.columns`, (T,) or (T, n), for the T frames rendered."""
     frames = len(measured[names.STATE])
     return {
         **{key: np.stack(rows).astype(np.float32) for key, rows in measured.items()},
@@ -149,18 +164,15 @@ def _renderer() -> str:
     return renderer_string()
 
 
-def _camera(env: envs.SuturingEnv, view: str, size: int, states: NDArray[np.float64]) -> Table:
-    """Return a camera's geometry.
+def _camera(view: str) -> Table:
+    """Return what a view is: the camera that takes it, and of a crop about which arm it lies.
 
-    Returns:
-        `intrinsics` (3, 3) and `T_world_camera` (4, 4) with OpenCV's axes [m], None if it moves.
+    Where it stands and what it sees is in the dataset's calibration columns.
     """
-    poses = []
-    for state in (states[0], states[-1]):
-        env.set_state_vector(state)
-        poses.append(extrinsics(env.model, env.data, view))
-    still = np.array_equal(poses[0], poses[1])
+    crop = crop_of(view)
+    if crop is None:
+        return {"camera": view, "crop": None}
     return {
-        "intrinsics": intrinsics(env.model, view, size, size).tolist(),
-        "T_world_camera": poses[0].tolist() if still else None,
+        "camera": crop.camera,
+        "crop": {"arm": crop.arm, "distance": crop.distance, "span": crop.span},
     }

@@ -45,9 +45,28 @@ SCALARS: Mapping[str, str] = MappingProxyType(
 """One-element columns → dtype; reward, done, success and contact are those after the action."""
 
 COLUMNS = (*VECTORS, *SCALARS)
-"""Every column of ours that is no image, in the order of the digest."""
+"""The columns of every dataset that are no images, in the order of the digest."""
 
 IMAGE_AXES = ("height", "width", "channels")
+
+
+def calibration_keys(views: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """Return the key of every calibration column → the shape of its matrix."""
+    keys: dict[str, tuple[int, int]] = {}
+    for view in views:
+        keys[names.intrinsics_key(view)] = (3, 3)
+        keys[names.extrinsics_key(view)] = (4, 4)
+    return keys
+
+
+def is_calibration(key: str) -> bool:
+    """Return True for a calibration column."""
+    return key.startswith(names.CALIBRATION)
+
+
+def columns(views: Sequence[str]) -> tuple[str, ...]:
+    """Return every column of a dataset that is no image, in the order of the digest."""
+    return (*COLUMNS, *calibration_keys(views))
 
 
 def image_keys(views: Sequence[str], depth: bool, segmentation: bool) -> list[tuple[str, str, str]]:
@@ -76,12 +95,15 @@ def features(views: Sequence[str], size: int, depth: bool, segmentation: bool) -
         table[key] = {"dtype": "float32", "shape": (len(elements),), "names": list(elements)}
     for key, dtype in SCALARS.items():
         table[key] = {"dtype": dtype, "shape": (1,), "names": None}
+    for key, (rows, width) in calibration_keys(views).items():
+        places = [f"{row}{column}" for row in range(rows) for column in range(width)]
+        table[key] = {"dtype": "float32", "shape": (rows * width,), "names": places}
     return table
 
 
 def column_bytes(key: str, values: NDArray[np.generic]) -> bytes:
     """Return the bytes of a column as they enter the digest."""
-    dtype = "float32" if key in VECTORS else SCALARS[key]
+    dtype = SCALARS.get(key, "float32")
     return np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
 
 
@@ -102,7 +124,7 @@ class ImageDigest:
 
 
 class EpisodeDigest:
-    """sha256 over one episode: its columns in the order of `COLUMNS`, then each image column."""
+    """sha256 over one episode: its columns in the order of `columns`, then each image column."""
 
     def __init__(self, keys: Iterable[str]):
         self._images = {key: ImageDigest() for key in keys}
@@ -116,11 +138,11 @@ class EpisodeDigest:
         """Take an image column's `ImageDigest` in the place of its frames."""
         self._known[key] = digest
 
-    def hexdigest(self, columns: Mapping[str, NDArray[np.generic]]) -> str:
-        """Return the episode's digest."""
+    def hexdigest(self, rows: Mapping[str, NDArray[np.generic]], views: Sequence[str] = ()) -> str:
+        """Return the episode's digest; `rows` are its columns, `views` those of the dataset."""
         total = hashlib.sha256()
-        for key in COLUMNS:
-            total.update(key.encode() + b"\0" + column_bytes(key, columns[key]))
+        for key in columns(views):
+            total.update(key.encode() + b"\0" + column_bytes(key, rows[key]))
         for key, image in self._images.items():
             total.update(
                 key.encode() + b"\0" + bytes.fromhex(self._known.get(key) or image.hexdigest())

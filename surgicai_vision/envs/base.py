@@ -27,6 +27,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError, check_name
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.envs import hole_crossing, observation, poses, randomisation
+from surgicai_vision.envs.calibration import Calibration
 from surgicai_vision.envs.camera_rig import Images
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.envs.feasibility import refuse_impossible
@@ -91,7 +92,10 @@ class SuturingEnv(gymnasium.Env):
         self._subtasks = subtasks
         self.simulation.task_state.phase = subtasks[0].phase
         self._step_size = StepSize.of(config.step)
-        self._images = Images(self.simulation.model)
+        self.calibration = Calibration(self.simulation)
+        for camera in view.cameras if view.visual else ():
+            self.calibration.window(camera, view.image_size)  # a crop that does not fit is refused
+        self._images = Images(self.simulation, self.calibration)
 
     # -- gymnasium ---------------------------------------------------------------------------------
 
@@ -150,8 +154,27 @@ class SuturingEnv(gymnasium.Env):
         """Return the front camera's image, (480, 640, 3) uint8, in render mode "rgb_array"."""
         if self.render_mode is None:
             return None
-        image = self._images.image(self.data, RENDER_CAMERA, RENDER_SIZE)
-        return image.astype(np.uint8, copy=False)
+        return self.image(RENDER_CAMERA, RENDER_SIZE).astype(np.uint8, copy=False)
+
+    def image(
+        self,
+        view: str,
+        size: tuple[int, int],
+        modality: str = names.RGB,
+        quality: str = "fast",
+    ) -> Frame:
+        """Return an image of any view at the present state, whatever the env observes.
+
+        Args:
+            view: name of a camera or a crop.
+            size: height and width [pixel].
+            modality: one of `names.MODALITIES`.
+            quality: "fast", as observations are, or "high".
+
+        Returns:
+            (height, width, channels) as `scene.rendering.FrameRenderer.render` has it.
+        """
+        return self._images.frames(view, size, (modality,), quality)[modality]
 
     def close(self) -> None:
         """Free the renderer."""
@@ -291,7 +314,7 @@ class SuturingEnv(gymnasium.Env):
     def _observe(self, target: Target) -> Observation:
         if self.view.obs_type == "state":
             return self._state_vector(target)
-        seen = self._images.look(self.data, self.view)
+        seen = self._images.look(self.view)
         if self.view.obs_type == "pixels_agent_pos":
             seen["agent_pos"] = self.agent_pos()
         return seen

@@ -1,34 +1,54 @@
-"""Camera rig: what an env's cameras see.
+"""Camera rig: what an env's cameras see, and the crops of their images.
 
 There is one renderer at a time; it is made on first use, hence in the worker that uses it.
 """
 
-import mujoco
+from collections.abc import Iterable
 
 from surgicai_vision.core import names
+from surgicai_vision.envs.calibration import Calibration
 from surgicai_vision.envs.observation import ObservationConfig
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.scene.cameras import stand
 from surgicai_vision.scene.rendering import Frame, FrameRenderer
 
 
 class Images:
-    """What the cameras of one env see."""
+    """What the views of one env show at its present state.
 
-    def __init__(self, model: mujoco.MjModel):
-        self._model = model
+    Args:
+        simulation: the env's.
+        calibration: its nominal calibration, which says where crops lie.
+    """
+
+    def __init__(self, simulation: Simulation, calibration: Calibration):
+        self._simulation = simulation
+        self._calibration = calibration
         self._renderer: FrameRenderer | None = None
+        self._stands: dict[str, str] = {}
 
-    def look(self, data: mujoco.MjData, view: ObservationConfig) -> dict[str, Frame]:
+    def look(self, view: ObservationConfig) -> dict[str, Frame]:
         """Return the frames of an observation by `names.frame_key`."""
-        renderer = self._sized(view.image_size)
         frames: dict[str, Frame] = {}
         for camera in view.cameras:
-            for modality, frame in renderer.render_all(data, camera, view.modalities).items():
+            for modality, frame in self.frames(camera, view.image_size, view.modalities).items():
                 frames[names.frame_key(camera, modality)] = frame
         return frames
 
-    def image(self, data: mujoco.MjData, camera: str, size: tuple[int, int]) -> Frame:
-        """Return one RGB image, (height, width, 3) uint8."""
-        return self._sized(size).render(data, camera, names.RGB)
+    def frames(
+        self,
+        view: str,
+        size: tuple[int, int],
+        modalities: Iterable[str],
+        quality: str = "fast",
+    ) -> dict[str, Frame]:
+        """Return several modalities of a view, images of `size`: height and width [pixel]."""
+        renderer = self._sized(size, quality)
+        if view not in self._stands:
+            self._stands[view] = stand(view)
+        camera = self._stands[view]
+        window = self._calibration.window(view, size) if camera != view else None
+        return renderer.render_all(self._simulation.data, camera, modalities, window)
 
     def close(self) -> None:
         """Free the renderer; the next image makes a new one."""
@@ -36,8 +56,13 @@ class Images:
             self._renderer.close()
             self._renderer = None
 
-    def _sized(self, size: tuple[int, int]) -> FrameRenderer:
-        if self._renderer is None or (self._renderer.height, self._renderer.width) != size:
+    def _sized(self, size: tuple[int, int], quality: str) -> FrameRenderer:
+        """Return the renderer of images of `size` in `quality`."""
+        renderer = self._renderer
+        if renderer is None or (renderer.height, renderer.width, renderer.quality) != (
+            *size,
+            quality,
+        ):
             self.close()
-            self._renderer = FrameRenderer(self._model, *size)
-        return self._renderer
+            renderer = self._renderer = FrameRenderer(self._simulation.model, *size, quality)
+        return renderer

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.envs import make
-from surgicai_vision.scene.rendering import Frame, FrameRenderer
+from surgicai_vision.scene.rendering import Frame
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,16 +46,14 @@ def state_renderer(config: TaskConfig, size: int, quality: str = "high") -> Iter
     """Yield what draws states of a task's env."""
     env = make(config, obs_type="state")
     env.reset(seed=0)
-    renderer = FrameRenderer(env.model, size, size, quality=quality)
 
     def image(state: NDArray[np.float64], view: str, modality: str = names.RGB) -> Image:
         env.set_state_vector(state)
-        return coloured(renderer.render(env.data, view, modality), modality)
+        return coloured(env.image(view, (size, size), modality, quality), modality)
 
     try:
         yield image
     finally:
-        renderer.close()
         env.close()
 
 

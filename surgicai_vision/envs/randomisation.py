@@ -18,6 +18,7 @@ from surgicai_vision.core.cameras import other_cameras
 from surgicai_vision.core.config import ANY, NEEDLE_ARCS, RandomisationConfig
 from surgicai_vision.envs.placement import SLIDE, Placement
 from surgicai_vision.scene import Scene, needle
+from surgicai_vision.scene.cameras import crop_of
 from surgicai_vision.scene.holes import PAIRS
 from surgicai_vision.scene.needle import NeedleShape
 from surgicai_vision.scene.reshape import reshape_needle
@@ -31,13 +32,14 @@ Array = NDArray[np.float64]
 Draws = tuple[float, ...]
 
 RIGS = (
-    ("front", "front_right", "front_psm1", "front_psm2"),
-    ("back", "back_psm1", "back_psm2"),
+    ("front", "front_right"),
+    ("back",),
     ("wrist_psm1",),
     ("wrist_psm2",),
 )
-"""Cameras that move as one, about the first; those that follow the jaws are shifted with them, and
-see them still. A camera of another distribution takes the draw of "front", about its own place.
+"""Cameras that move as one, about the first. A camera of another distribution takes the draw of
+"front", about its own place. A crop is cut from what its camera sees, at the place that the nominal
+calibration tells: the move is not known to it.
 """
 TISSUE = ("tissue", "flesh")
 """Materials of one tint."""
@@ -154,7 +156,7 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
     turns = numbers["camera_turn"].reshape(-1, 3)
     for cameras, shift, turn, fovy in zip(RIGS, shifts, turns, numbers["camera_fovy"], strict=True):
         _aim(source, model, cameras, shift, turn, fovy)
-    for name in other_cameras():
+    for name in filter(_stands, other_cameras()):
         _aim(source, model, (name,), shifts[0], turns[0], numbers["camera_fovy"][0])
     model.geom_friction[:] = source.geom_friction * (1.0 + float(numbers["friction"][0]))
     _place_phantom(scene, model, placement(scene, draws))
@@ -179,6 +181,11 @@ def _place_phantom(scene: Scene, model: mujoco.MjModel, where: Placement) -> Non
         body = source.body(name).id
         model.body_pos[body] = source.body_pos[body] + pose[:3, 3]
         model.body_quat[body] = turn
+
+
+def _stands(name: str) -> bool:
+    """Return True for a camera of the scene, False for a crop."""
+    return crop_of(name) is None
 
 
 def _light(source: mujoco.MjModel, model: mujoco.MjModel, factors: Array) -> None:

@@ -354,10 +354,12 @@ class Simulation:
         """Return T_base_tip as the arm reports it, which does not know of its joints' error."""
         if not self.offsets:
             return self.to_base(arm, self.tip(arm))
-        joints = tuple(self.data.qpos[self.scene.arms[arm].qpos].tolist())
-        return kinematics.forward_flat(
-            self._without_error(arm, joints), self.scene.config.instrument
-        )
+        return kinematics.forward_flat(self.reported_joints(arm), self.scene.config.instrument)
+
+    def reported_joints(self, arm: str) -> kinematics.Joints:
+        """Return an arm's six joints [rad, m] as it reports them, without knowing their error."""
+        joints: kinematics.Joints = tuple(self.data.qpos[self.scene.arms[arm].qpos].tolist())
+        return self._without_error(arm, joints) if self.offsets else joints
 
     def true_pose(self, arm: str, command: Command) -> Pose:
         """Return where a command really brings the tip, in the arm's base."""

@@ -109,7 +109,6 @@ def add_arm(
     )
     tip.add_site(name=f"{arm}_tip", size=[0.0005] * 3, group=4)
     tip.add_site(name=f"{arm}_grasp", pos=[0, 0, GRASP_DEPTH], size=[0.0005] * 3, group=4)
-    tip.add_body(name=f"{arm}_grasp", pos=[0, 0, GRASP_DEPTH])  # what cameras follow
     for side, sign in (("left", 1.0), ("right", -1.0)):
         _add_finger(tip, f"{arm}_{side}", sign, bits)
     _couple_fingers(spec, arm)

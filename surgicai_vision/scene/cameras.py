@@ -10,22 +10,23 @@ the right one; "back" the camera opposite to them. The surgical robotics challen
 camera on each insertion link; there it looks along the shaft and sees little else, so ours stand
 off it and aim at the jaws.
 
-"front_psm2" and its like follow an arm's jaws from where "front" or "back" stands: a crop of an
-image of higher resolution about the jaws, whose place is known from the arm's joints.
+A crop ("front_psm2" and its like, `scene.crops`) is no camera of the scene: it is a window of the
+image that its camera takes at a higher resolution. It has its camera's pose, and that camera's K
+with the principal point moved by the window's corner.
 """
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.cameras import CAMERAS
-from surgicai_vision.core.errors import UnknownName
+from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.rotations import matrix_to_quaternion
@@ -39,6 +40,22 @@ class Camera(Protocol):
 
     def add_to(self, spec: mujoco.MjSpec, name: str, instrument: str) -> None:
         """Add it to a scene with both arms, whose PSMs carry `instrument`."""
+
+
+class Window(NamedTuple):
+    """Where a crop lies in its camera's whole image [pixel]; the crop's own size is the image's.
+
+    Attributes:
+        left: column of the whole in which the crop begins.
+        top: row of the whole in which it begins.
+        height: of the whole image.
+        width: of the whole image.
+    """
+
+    left: int
+    top: int
+    height: int
+    width: int
 
 
 @dataclass(frozen=True)
@@ -89,26 +106,28 @@ class WristCamera:
 
 
 @dataclass(frozen=True)
-class FollowingCamera:
-    """A camera that follows an arm's jaws from where another one stands.
+class Crop:
+    """A window of a camera's image about the place where an arm reports its jaws.
+
+    The place is known from the arm's reported joints and the camera's nominal calibration
+    (`envs.calibration`), never from the scene.
 
     Attributes:
-        stand: the camera in whose place it is.
+        camera: name of the camera whose image is cropped.
         arm: one of `names.ARMS`.
+        distance: from the camera, along its axis, at which `span` holds [m].
+        span: height of what the crop shows there [m].
+        aspect: width of the whole image over its height, by default that of 640 × 480 (SurgicAI).
     """
 
-    stand: CameraPose
+    camera: str
     arm: str
+    distance: float
+    span: float
+    aspect: float = 4.0 / 3.0
 
     def add_to(self, spec: mujoco.MjSpec, name: str, instrument: str) -> None:
-        """Add the camera to the world; the body `{arm}_grasp` must be there."""
-        spec.worldbody.add_camera(
-            name=name,
-            pos=list(self.stand.position),
-            mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
-            targetbody=f"{self.arm}_grasp",
-            fovy=math.degrees(following_fovy(self.stand)),
-        )
+        """Add nothing: the camera whose image is cropped stands in the scene."""
 
 
 ENDOSCOPE = (-0.008, 0.100, 0.160)
@@ -151,10 +170,6 @@ BACK = CameraPose((0.0, -0.0359, 0.1659), (0.0, 0.707, -0.707), (0.0, 0.707, 0.7
 """Poses in world; "back" stands where SurgicAI's does."""
 WRIST_PSM1 = WristCamera(PSM1)
 WRIST_PSM2 = WristCamera(PSM2)
-FRONT_PSM1 = FollowingCamera(FRONT, PSM1)
-FRONT_PSM2 = FollowingCamera(FRONT, PSM2)
-BACK_PSM1 = FollowingCamera(BACK, PSM1)
-BACK_PSM2 = FollowingCamera(BACK, PSM2)
 
 WRIST_ASIDE = 0.030
 """Distance of the wrist camera from the shaft [m]."""
@@ -188,19 +203,6 @@ def wrist_camera(arm: str, instrument: str) -> CameraPose:
     )
 
 
-FOLLOWING_SPAN = 0.050
-"""Height of what a following camera sees at the holes [m]: at 224 × 224 pixels 0.22 mm a pixel,
-where "front" and "back" have 0.43 and 0.47; two and a half needles, and the jaws at their
-middle."""
-FOLLOWED = (0.0, 0.050, 0.075)
-"""Point in world [m] at whose distance that holds: between the holes and the needle's home."""
-
-
-def following_fovy(stand: CameraPose) -> float:
-    """Return the vertical field of view [rad] of cameras that follow the jaws from `stand`."""
-    return 2.0 * math.atan(FOLLOWING_SPAN / 2.0 / math.dist(stand.position, FOLLOWED))
-
-
 def add_cameras(spec: mujoco.MjSpec, names: Iterable[str], instrument: str) -> None:
     """Add the cameras called `names` to a scene with both arms."""
     for name in names:
@@ -219,20 +221,41 @@ def look_at(direction: Vector, up: Vector) -> Array:
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
-def intrinsics(model: mujoco.MjModel, camera: str, height: int, width: int) -> Array:
+def intrinsics(
+    model: mujoco.MjModel, camera: str, height: int, width: int, window: Window | None = None
+) -> Array:
     """Return the camera matrix K (3, 3) [pixel] of an image of `height` × `width`.
+
+    Args:
+        model: the scene's model, or an env's own, whose cameras may have been moved.
+        camera: name of a camera, or of a crop.
+        height: of the image [pixel].
+        width: of the image [pixel].
+        window: where the image lies in the camera's whole one; a crop needs it.
 
     Raises:
         UnknownName: no such camera in the model.
+        InputError: a crop without its window.
     """
-    focal = height / 2 / math.tan(math.radians(float(model.cam_fovy[camera_id(model, camera)])) / 2)
+    index = camera_id(model, camera)
+    if window is None and stand(camera) != camera:
+        raise InputError(
+            f"The place of the crop '{camera}' differs from frame to frame; give its window, or "
+            "ask the env: env.calibration.intrinsics(view)."
+        )
+    left, top, height, width = window or Window(0, 0, height, width)
+    focal = height / 2 / math.tan(math.radians(float(model.cam_fovy[index])) / 2)
     return np.array(
-        [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
+        [
+            [focal, 0.0, (width - 1) / 2 - left],
+            [0.0, focal, (height - 1) / 2 - top],
+            [0.0, 0.0, 1.0],
+        ]
     )
 
 
 def extrinsics(model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> Array:
-    """Return T_world_camera (4, 4) at the state of `data`, after `mj_forward`.
+    """Return T_world_camera (4, 4) at the state of `data`, after `mj_forward`; a crop's camera's.
 
     Raises:
         UnknownName: no such camera in the model.
@@ -244,13 +267,26 @@ def extrinsics(model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> Array
     return pose
 
 
+def crop_of(view: str) -> Crop | None:
+    """Return the crop called `view`, None if that is a camera of the scene or no name of ours."""
+    part = CAMERAS.load(view) if view in CAMERAS.names() else None
+    return part if isinstance(part, Crop) else None
+
+
+def stand(view: str) -> str:
+    """Return the name of the camera that takes a view: a crop's camera, or `view` itself."""
+    crop = crop_of(view)
+    return view if crop is None else crop.camera
+
+
 def camera_id(model: mujoco.MjModel, camera: str) -> int:
-    """Return the index of a camera by its name.
+    """Return the index of a camera by its name, of a crop that of its camera.
 
     Raises:
         UnknownName: listing the model's cameras.
     """
-    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+    name = stand(camera)
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name)
     if index < 0:
-        raise UnknownName("camera", camera, [model.camera(i).name for i in range(model.ncam)])
+        raise UnknownName("camera", name, [model.camera(i).name for i in range(model.ncam)])
     return int(index)

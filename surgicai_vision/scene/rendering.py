@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.names import DEPTH, MODALITIES, PARTS, RGB, SEGMENTATION
 from surgicai_vision.scene import opengl
-from surgicai_vision.scene.cameras import camera_id
+from surgicai_vision.scene.cameras import Window, camera_id, crop_of
 from surgicai_vision.scene.opengl import renderer_string
 from surgicai_vision.scene.visual import appearance
 
@@ -78,35 +78,58 @@ class FrameRenderer:
         self._cameras: dict[str, mujoco.MjvCamera] = {}
         self._target: _Target | None = _acquire(model, self.height, self.width, quality)
 
-    def render(self, data: mujoco.MjData, camera: str, modality: str = RGB) -> Frame:
+    def render(
+        self, data: mujoco.MjData, camera: str, modality: str = RGB, window: Window | None = None
+    ) -> Frame:
         """Return one image of the state `data`, an array of its own.
 
         Args:
             data: a state that has been through `mj_forward`.
-            camera: name of a camera of the model.
+            camera: name of a camera of the model; the image of a crop is that of its camera in a
+                window.
             modality: "rgb" → (H, W, 3) uint8; "depth" → (H, W, 1) float32 [m] along the camera's
                 axis, the far plane where nothing stands; "segmentation" → (H, W, 1) uint8, an index
                 of `names.PARTS`.
+            window: where the image lies in a larger one of which only this part is drawn.
 
         Raises:
             UnknownName: another camera or modality; the message lists what exists.
+            InputError: a crop, or a window that is not within its whole image.
         """
-        return self.render_all(data, camera, (modality,))[modality]
+        return self.render_all(data, camera, (modality,), window)[modality]
 
     def render_all(
-        self, data: mujoco.MjData, camera: str, modalities: Iterable[str]
+        self,
+        data: mujoco.MjData,
+        camera: str,
+        modalities: Iterable[str],
+        window: Window | None = None,
     ) -> dict[str, Frame]:
         """Return several modalities of one view; depth and segmentation share one pass."""
         wanted = tuple(modalities)
         for modality in wanted:
             check_name("modality", modality, MODALITIES)
+        area = self._area(window)
         target = self._target
         if target is None:
             raise InputError("This FrameRenderer is closed; make a new one.")
         if target.lost:  # a forked child of the process that made it
             target = self._target = _acquire(self.model, self.height, self.width, self.quality)
         view = self._cameras.get(camera) or self._view(camera)
-        return target.draw(data, view, wanted)
+        return target.draw(data, view, wanted, area)
+
+    def _area(self, window: Window | None) -> mujoco.MjrRect:
+        """Return where the whole image lies about what is drawn, OpenGL's rows going up."""
+        if window is None:
+            return mujoco.MjrRect(0, 0, self.width, self.height)
+        right = window.left + self.width
+        lower = window.height - window.top - self.height
+        if min(window.left, window.top, window.width - right, lower) < 0:
+            raise InputError(
+                f"An image of {self.height} × {self.width} pixels at row {window.top}, column "
+                f"{window.left} is not within {window.height} × {window.width}."
+            )
+        return mujoco.MjrRect(-window.left, -lower, window.width, window.height)
 
     def close(self) -> None:
         """Free what no other renderer uses. A second call does nothing."""
@@ -126,6 +149,11 @@ class FrameRenderer:
 
     def _view(self, camera: str) -> mujoco.MjvCamera:
         """Return MuJoCo's handle of a camera and keep it."""
+        if crop_of(camera) is not None:
+            raise InputError(
+                f"'{camera}' is a crop, whose place depends on the arm's reported joints; take its "
+                "image from an env's rig: envs.camera_rig.Images(env.simulation)."
+            )
         view = mujoco.MjvCamera()
         view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         view.fixedcamid = camera_id(self.model, camera)
@@ -158,9 +186,17 @@ class _Target:
         self.painted = [0.0] * len(self.look)
 
     def draw(
-        self, data: mujoco.MjData, view: mujoco.MjvCamera, wanted: tuple[str, ...]
+        self,
+        data: mujoco.MjData,
+        view: mujoco.MjvCamera,
+        wanted: tuple[str, ...],
+        area: mujoco.MjrRect,
     ) -> dict[str, Frame]:
-        """Return the wanted modalities from at most two passes."""
+        """Return the wanted modalities from at most two passes.
+
+        `area` is the viewport. One larger than the framebuffer is a crop: projection and pixels
+        are those of the whole, and what falls outside the framebuffer is not drawn.
+        """
         opengl.make_current()
         numbers = self.look.tolist()
         if numbers != self.painted:
@@ -173,23 +209,23 @@ class _Target:
         mujoco.mjv_updateScene(self.model, data, self.option, None, view, everything, self.scene)
         images: dict[str, Frame] = {}
         if RGB in wanted:
-            mujoco.mjr_render(self.area, self.scene, self.context)
+            mujoco.mjr_render(area, self.scene, self.context)
             mujoco.mjr_readPixels(self.colours, None, self.area, self.context)
             images[RGB] = self.colours[::-1].copy()  # OpenGL's first row is the lowest
         if DEPTH in wanted or SEGMENTATION in wanted:
-            self._draw_ids()
+            self._draw_ids(area)
             if DEPTH in wanted:
                 images[DEPTH] = self._depth()
             if SEGMENTATION in wanted:
                 images[SEGMENTATION] = self._segmentation()
         return images
 
-    def _draw_ids(self) -> None:
+    def _draw_ids(self, area: mujoco.MjrRect) -> None:
         """Draw each geom in the colour of its number; such a pass has the exact depth as well."""
         flags = self.scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
         try:
-            mujoco.mjr_render(self.area, self.scene, self.context)
+            mujoco.mjr_render(area, self.scene, self.context)
         finally:
             flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
         mujoco.mjr_readPixels(self.colours, self.depths, self.area, self.context)

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.envs.base import SuturingEnv
-from surgicai_vision.scene.rendering import FrameRenderer
 from surgicai_vision.teleoperation.inputs import Device
 from surgicai_vision.teleoperation.pacer import Pacer
 from surgicai_vision.teleoperation.session import Session, Status
@@ -45,24 +44,14 @@ class EnvViews:
     def __init__(self, env: SuturingEnv, cameras: tuple[str, ...], size: int):
         self._env = env
         self._cameras = cameras
-        self._size = size
-        self._renderer = FrameRenderer(env.model, size, size)
-        self._draws = env.simulation.draws
+        self._size = (size, size)
 
     def render(self) -> Images:
         """Return the present image of every view."""
-        if self._env.simulation.draws is not self._draws:  # the needle may have another shape now
-            self.close()
-            self._renderer = FrameRenderer(self._env.model, self._size, self._size)
-            self._draws = self._env.simulation.draws
         return {
-            camera: self._renderer.render(self._env.data, camera).astype(np.uint8, copy=False)
+            camera: self._env.image(camera, self._size).astype(np.uint8, copy=False)
             for camera in self._cameras
         }
-
-    def close(self) -> None:
-        """Free the renderer."""
-        self._renderer.close()
 
 
 def run_session(

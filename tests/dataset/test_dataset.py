@@ -13,6 +13,7 @@ from fake_demos import write_demos
 from fake_env import FakeEnv
 from shown import showing
 
+from surgicai_vision import envs
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
@@ -46,9 +47,6 @@ def fake(monkeypatch):
 
     monkeypatch.setattr(render_jobs, "_env", env)
     monkeypatch.setattr(render_jobs, "_renderer", lambda: "none")
-    monkeypatch.setattr(
-        render_jobs, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()}
-    )
 
 
 @pytest.fixture
@@ -109,7 +107,7 @@ def test_every_fifth_frame_is_one_of_all(tmp_path, fake, demos, monkeypatch):
     assert (few.fps, whole.fps) == (10, 50)
     np.testing.assert_array_equal(few.frames("back"), whole.frames("back")[rows])
     np.testing.assert_array_equal(few.depth("front"), whole.depth("front")[rows])
-    for key in schema.COLUMNS:
+    for key in schema.columns(whole.views):
         if key != names.DONE:
             np.testing.assert_array_equal(few.columns()[key], whole.columns()[key][rows])
     np.testing.assert_allclose(
@@ -156,7 +154,8 @@ def test_digest_is_that_of_the_decoded_content(tmp_path, fake, demos):
         for key in keys:
             for row in rows:
                 digest.add(key, decoded[key][row])
-        digests.append(digest.hexdigest({key: columns[key][rows] for key in schema.COLUMNS}))
+        episode = {key: columns[key][rows] for key in schema.columns(dataset.views)}
+        digests.append(digest.hexdigest(episode, dataset.views))
     assert schema.dataset_digest(digests) == summary.digest == dataset.meta["digest"]
 
 
@@ -548,20 +547,42 @@ def test_rendering_does_not_depend_on_the_workers_and_equals_what_was_seen_live(
     env.close()
 
 
-def test_cameras_stand_in_the_metadata(tmp_path, recorded):
-    render_demos(
-        recorded, tmp_path / "set", views=("back", "wrist_psm2"), size=32, context=RunContext(0)
-    )
+def test_a_dataset_has_the_calibration_of_every_view(tmp_path, recorded):
+    views = ("back", "wrist_psm2", "back_psm2")
+    render_demos(recorded, tmp_path / "set", views=views, size=32, context=RunContext(0))
     dataset = open_dataset(tmp_path / "set")
-    cameras = dataset.meta["cameras"]
-    assert list(cameras) == ["back", "wrist_psm2"] == list(dataset.views)
+    assert set(dataset.meta["cameras"]) == set(dataset.views) == set(views)
+    assert dataset.meta["cameras"]["back_psm2"]["camera"] == "back"
     # Vertical field of view 0.8 rad on 32 pixels.
-    np.testing.assert_allclose(cameras["back"]["intrinsics"][1][1], 16 / np.tan(0.4), rtol=1e-3)
-    np.testing.assert_allclose(
-        np.array(cameras["back"]["T_world_camera"])[:3, 3], [0, -0.0359, 0.1659], atol=1e-6
-    )
-    assert cameras["wrist_psm2"]["T_world_camera"] is None, "it moves with the arm"
+    whole = dataset.intrinsics("back")
+    np.testing.assert_allclose(whole[0, 1, 1], 16 / np.tan(0.4), rtol=1e-3)
+    assert (whole == whole[0]).all()
+    stands = dataset.extrinsics("back")
+    np.testing.assert_allclose(stands[0, :3, 3], [0, -0.0359, 0.1659], atol=1e-6)
+    assert (stands == stands[0]).all()
+    assert (dataset.extrinsics("back_psm2") == stands).all(), "a crop stands where its camera does"
+    moving = dataset.extrinsics("wrist_psm2")
+    assert not np.array_equal(moving[0], moving[-1]), "it moves with the arm"
+    window = dataset.intrinsics("back_psm2")
+    assert (window[:, :2, 2] != window[0, :2, 2]).any(), "the window follows the arm"
     assert dataset.meta["renderers"][0]
+
+
+def test_the_calibration_of_a_frame_is_that_of_its_state(tmp_path, recorded):
+    views = ("front_psm2", "wrist_psm2")
+    render_demos(recorded, tmp_path / "set", views=views, size=32, context=RunContext(0))
+    dataset = open_dataset(tmp_path / "set")
+    demo = read_demo(list_demos(recorded)[0])
+    env = envs.make(demo.config)
+    for frame in (0, len(demo) - 1):
+        env.set_state_vector(demo.state[frame])
+        for view in views:
+            K = env.calibration.intrinsics(view, (32, 32)).astype(np.float32)
+            np.testing.assert_array_equal(dataset.intrinsics(view)[frame], K)
+            pose = env.calibration.extrinsics(view).astype(np.float32)
+            np.testing.assert_array_equal(dataset.extrinsics(view)[frame], pose)
+    with pytest.raises(UnknownName, match="view of this dataset"):
+        dataset.intrinsics("back")
 
 
 KILLED = """

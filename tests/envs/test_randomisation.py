@@ -346,7 +346,7 @@ def test_a_camera_of_another_distribution_moves_as_front_does() -> None:
         moved = env.model.camera("front").pos - build_scene().model.camera("front").pos
         np.testing.assert_allclose(env.model.camera("side").pos, pose.position + moved, atol=1e-12)
         assert env.model.camera("side").fovy != build_scene().model.camera("side").fovy
-        for name in names.CAMERAS:
+        for name in (name for name in names.CAMERAS if name not in names.CROPS):
             for key in ("pos", "quat", "fovy"):
                 ours, before = (getattr(each.model.camera(name), key) for each in (env, without))
                 np.testing.assert_array_equal(ours, before)

@@ -1,6 +1,5 @@
 """Demonstrations of the stand-in environment on disk, and rendering with it in this process."""
 
-import numpy as np
 from fake_env import FakeEnv, FakeExpert
 
 from surgicai_vision.dataset import render_jobs
@@ -12,9 +11,6 @@ def render_with_fake_env(monkeypatch, config):
     """Let `render_demos` see the stand-in environment, without GL."""
     monkeypatch.setattr(render_jobs, "_env", lambda _, *rest: FakeEnv(config, *rest))
     monkeypatch.setattr(render_jobs, "_renderer", lambda: "none")
-    monkeypatch.setattr(
-        render_jobs, "_camera", lambda env, view, size, states: {"intrinsics": np.eye(3).tolist()}
-    )
 
 
 def write_demos(folder, config, seeds):

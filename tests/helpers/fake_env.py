@@ -12,6 +12,21 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.demonstrator import Demonstrator
 
 
+class FakeCalibration:
+    """What the fake knows of its cameras: a window that moves with the position."""
+
+    def __init__(self, env):
+        self._env = env
+
+    def intrinsics(self, view, size):
+        matrix = np.diag([300.0, 300.0, 1.0])
+        matrix[:2, 2] = (size[1] - 1) / 2 - self._env.state[1]
+        return matrix
+
+    def extrinsics(self, view):
+        return np.eye(4)
+
+
 class FakeEnv:
     def __init__(
         self,
@@ -31,6 +46,7 @@ class FakeEnv:
         )
         self.scene = SimpleNamespace(hash="f" * 64)
         self.model = self.data = None
+        self.calibration = FakeCalibration(self)
         self.phase = 0
         self.state = np.zeros(4)
 

@@ -76,10 +76,11 @@ def test_it_is_recorded_rendered_trained_evaluated_and_swept(run: Run, tmp_path:
         return json.loads(done.stdout.splitlines()[-1])
 
     one = ("--workers", "1", "--out")
+    both = ("--view", "side,side_psm2")
     task = ("--task", "touch_point")
     assert verb("record-demos", *task, "--episodes", "2", *one, "demos")["share"] == 1.0
-    data = verb("render-demos", "--demos", "demos", "--view", "side", "--size", "32", *one, "data")
-    assert data["views"] == ["side"]
+    data = verb("render-demos", "--demos", "demos", *both, "--size", "32", *one, "data")
+    assert data["views"] == ["side", "side_psm2"]
     learner = ("--encoder", "colour-grid", "--policy", "linear", "--epochs", "1")
     verb("train", *task, "--dataset", "data", "--view", "side", *learner, "--out", "policy")
     row = verb("evaluate", "--policy", "policy", "--episodes", "1", *one, "eval")

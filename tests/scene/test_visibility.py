@@ -6,7 +6,6 @@ from surgicai_vision import envs
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.names import PARTS
 from surgicai_vision.demos.expert import Expert
-from surgicai_vision.scene.rendering import FrameRenderer
 
 SEEDS = range(8)
 PIXELS = 25
@@ -17,16 +16,16 @@ PIXELS = 25
 def test_the_needle_is_seen_at_the_end(task):
     env = envs.make(TaskConfig(task=task))
     counts = {"front": [], "back": []}
-    with FrameRenderer(env.model, 224, 224) as renderer:
-        for seed in SEEDS:
-            env.reset(seed=seed)
-            expert, info, ended = Expert(env), {}, False
-            while not ended:
-                _, _, terminated, truncated, info = env.step(expert.action())
-                ended = terminated or truncated
-            assert info["is_success"]
-            for camera, seen in counts.items():
-                image = renderer.render(env.data, camera, "segmentation")
-                seen.append(int((image == PARTS.index("needle")).sum()))
+    for seed in SEEDS:
+        env.reset(seed=seed)
+        expert, info, ended = Expert(env), {}, False
+        while not ended:
+            _, _, terminated, truncated, info = env.step(expert.action())
+            ended = terminated or truncated
+        assert info["is_success"]
+        for camera, seen in counts.items():
+            image = env.image(camera, (224, 224), "segmentation")
+            seen.append(int((image == PARTS.index("needle")).sum()))
+    env.close()
     for camera, seen in counts.items():
         assert min(seen) >= PIXELS, (camera, seen)

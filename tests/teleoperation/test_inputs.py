@@ -93,7 +93,7 @@ def grasp():
     env.close()
 
 
-@pytest.mark.parametrize("view", ["front", "back", "wrist_psm2"])
+@pytest.mark.parametrize("view", ["front", "back", "wrist_psm2", "front_psm2"])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_key_moves_the_tool_along_its_cameras_axis(grasp, view, axis):
     grasp.reset(seed=0)

@@ -1,0 +1,88 @@
+"""Calibration: what an env's robot knows of its cameras, and where its crops lie.
+
+* `intrinsics(view, size)`: K (3, 3) [pixel] of a view's image;
+* `extrinsics(view)`: T_world_camera (4, 4) [m];
+* `window(view, size)`: where a crop lies in its camera's whole image, None for a camera.
+
+All of it is nominal: the cameras stand and see as in the scene without randomisation, and an arm
+is where its joints report it, kinematic error included. A camera that was moved is not followed:
+it takes the image, and the window stays where the nominal calibration puts it.
+"""
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import names
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.scene import cameras
+from surgicai_vision.scene.arm import GRASP_DEPTH
+from surgicai_vision.scene.cameras import Window
+from surgicai_vision.scene.crops import window_about
+from surgicai_vision.scene.kinematics import Pose
+
+Array = NDArray[np.float64]
+
+
+class Calibration:
+    """The nominal calibration of one env's views; see the module's docstring."""
+
+    def __init__(self, simulation: Simulation):
+        self._simulation = simulation
+        self._model = simulation.scene.model
+        self._nominal = mujoco.MjData(self._model)
+        self._standing: dict[str, Pose] = {}
+
+    def intrinsics(self, view: str, size: tuple[int, int]) -> Array:
+        """Return K (3, 3) [pixel] of a view's image of `size`, its height and width."""
+        return cameras.intrinsics(self._model, view, *size, self.window(view, size))
+
+    def extrinsics(self, view: str) -> Array:
+        """Return T_world_camera (4, 4) of a view, OpenCV's axes [m]."""
+        return poses.square(self._pose(cameras.stand(view)))
+
+    def window(self, view: str, size: tuple[int, int]) -> Window | None:
+        """Return where a crop of `size` lies in its camera's image; None for a camera.
+
+        Raises:
+            InputError: a crop that is larger than the image it is cut from.
+        """
+        crop = cameras.crop_of(view)
+        if crop is None:
+            return None
+        grasp = poses.position(self.reported_grasp(crop.arm))
+        in_camera = poses.transform(poses.invert(self._pose(crop.camera)), grasp)
+        return window_about(crop, in_camera, self._fovy(crop.camera), *size)
+
+    def reported_grasp(self, arm: str) -> Pose:
+        """Return T_world_grasp of an arm as its reported joints and its nominal base tell it."""
+        simulation = self._simulation
+        tip = poses.compose(simulation.bases[arm], simulation.tip_in_base(arm))
+        return poses.shifted_along_z(tip, GRASP_DEPTH)
+
+    def _fovy(self, camera: str) -> float:
+        """Return a camera's vertical field of view [rad]."""
+        return math.radians(float(self._model.cam_fovy[cameras.camera_id(self._model, camera)]))
+
+    def _pose(self, camera: str) -> Pose:
+        """Return a camera's pose in world, of one that stands still without computing it anew."""
+        if camera in self._standing:
+            return self._standing[camera]
+        self._put_nominal()
+        pose = poses.flat(cameras.extrinsics(self._model, self._nominal, camera))
+        if self._model.cam_bodyid[cameras.camera_id(self._model, camera)] == 0:
+            self._standing[camera] = pose
+        return pose
+
+    def _put_nominal(self) -> None:
+        """Put the nominal scene's bodies where the reported joints say."""
+        simulation = self._simulation
+        self._nominal.qpos[:] = simulation.data.qpos
+        for arm in names.ARMS:
+            self._nominal.qpos[simulation.scene.arms[arm].qpos] = simulation.reported_joints(arm)
+        mujoco.mj_kinematics(self._model, self._nominal)
+        mujoco.mj_comPos(self._model, self._nominal)
+        mujoco.mj_camlight(self._model, self._nominal)

@@ -1,0 +1,86 @@
+"""Crops: windows of a camera's image about an arm's jaws, and where they lie in it.
+
+    whole = whole_size(crop, fovy, 224, 224)          # height and width of the whole image [pixel]
+    window = window_about(crop, point_in_camera, fovy, 224, 224)
+    renderer.render(data, crop.camera, "rgb", window)
+
+The whole image has so many pixels that `crop.span` at `crop.distance` covers the crop's height. The
+window is centred on the projection of a point, rounded to whole pixels, and kept inside the image:
+where the point is near the border, or outside, the crop shows the border's part of the image.
+
+A crop is thus what the camera sees, cut out: it does not turn to the jaws, and what is farther from
+the camera's axis is drawn as obliquely as in the whole.
+"""
+
+import math
+
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.names import PSM1, PSM2
+from surgicai_vision.scene.cameras import BACK, FRONT, CameraPose, Crop, Vector, Window
+
+SPAN = 0.050
+"""Height of what a crop shows at the holes [m]: at 224 × 224 pixels 0.22 mm a pixel, where "front"
+and "back" have 0.43 and 0.47; two and a half needles, and the jaws at their middle."""
+CROPPED = (0.0, 0.050, 0.075)
+"""Point in world [m] at whose distance that holds: between the holes and the needle's home."""
+NEAREST = 0.001
+"""Distance along the camera's axis [m] that a point has at least: none lies behind the lens."""
+
+
+def _crop(camera: str, pose: CameraPose, arm: str) -> Crop:
+    """Return the crop of one of our cameras about an arm's jaws."""
+    return Crop(camera, arm, math.dist(pose.position, CROPPED), SPAN)
+
+
+FRONT_PSM1 = _crop("front", FRONT, PSM1)
+FRONT_PSM2 = _crop("front", FRONT, PSM2)
+BACK_PSM1 = _crop("back", BACK, PSM1)
+BACK_PSM2 = _crop("back", BACK, PSM2)
+
+
+def whole_size(crop: Crop, fovy: float, height: int, width: int) -> tuple[int, int]:
+    """Return the height and width [pixel] of the whole image of which a crop is a part.
+
+    Args:
+        crop: the crop.
+        fovy: the camera's vertical field of view [rad].
+        height: of the crop [pixel].
+        width: of the crop [pixel].
+
+    Raises:
+        InputError: the crop is larger than the image it is cut from.
+    """
+    seen = 2.0 * crop.distance * math.tan(fovy / 2.0)
+    whole = round(height * seen / crop.span)
+    across = round(whole * crop.aspect)
+    if whole < height or across < width:
+        raise InputError(
+            f"A crop of {height} × {width} pixels that spans {crop.span * 1e3:.0f} mm does not fit "
+            f"into the image of '{crop.camera}', which is {whole} × {across} at that resolution; "
+            "take a smaller span or a narrower image."
+        )
+    return whole, across
+
+
+def window_about(crop: Crop, point: Vector, fovy: float, height: int, width: int) -> Window:
+    """Return the window of a crop about a point.
+
+    Args:
+        crop: the crop.
+        point: in the frame of the camera, OpenCV's axes [m].
+        fovy: the camera's vertical field of view [rad].
+        height: of the crop [pixel].
+        width: of the crop [pixel].
+
+    Raises:
+        InputError: the crop is larger than the image it is cut from.
+    """
+    whole, across = whole_size(crop, fovy, height, width)
+    focal = whole / 2.0 / math.tan(fovy / 2.0)
+    x, y, z = point
+    scale = focal / max(z, NEAREST)
+    left = round(scale * x + (across - width) / 2.0)
+    top = round(scale * y + (whole - height) / 2.0)
+    return Window(
+        min(max(left, 0), across - width), min(max(top, 0), whole - height), whole, across
+    )
