@@ -40,7 +40,7 @@ class Axis:
         text: what it is, for people.
         world: field of `config.RandomisationConfig` → what is added to it.
         images: keys of `corruption.CORRUPTIONS`, in the order in which they spoil an image.
-        seen: whether it changes images only, so that a policy without them cannot notice.
+        seen: whether it changes images only, so that a policy without them cannot notice it.
     """
 
     text: str
@@ -76,6 +76,14 @@ _SINGLE: Mapping[str, Axis] = MappingProxyType(
             "first three joints off by ±5°, ±5°, ±5 mm, unknown to the arm",
             {"kinematic_error": 1.0},
             seen=False,
+        ),
+        "needle": Axis(
+            "radius of the needle's arc off by ±20 %, its thickness by ±30 %",
+            {"needle_size": 0.2, "needle_thickness": 0.3},
+            seen=False,
+        ),
+        "robot_start": Axis(
+            "both arms' tips start off by ±15 mm along each axis", {"robot_start": 15.0}, seen=False
         ),
     }
 )
