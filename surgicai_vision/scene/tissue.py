@@ -30,6 +30,10 @@ from surgicai_vision.scene.holes import PAIRS
 THICKNESS = 0.0025
 """Thickness of the skin's boxes [m]: a box pushes a needle out of its nearest face, so it must be
 thicker than the dent at which the skin is pierced."""
+STIFFENING = 10.0
+"""How much stiffer the skin is when it is dented by all of its thickness."""
+STIFFENING_POWER = 6.0
+"""How late it stiffens: `skin_spring`."""
 RESPONSE = 62500.0
 """Stiffness of the reference acceleration of skin and holds [1/s²]: the 4 ms of the scene's other
 contacts. Anything light diverges above 1/dt² = 250,000."""
@@ -46,6 +50,8 @@ THREAD_HOLDS = 4
 """Places that can hold the thread: entry and exit of the last two bites."""
 HIDDEN = (0.0, 0.0, -0.1)
 """Where anchors stay that hold nothing [m, world]."""
+Spring = tuple[tuple[float, float], tuple[float, float, float, float, float]]
+"""solref and solimp of a constraint."""
 SOFT_DATA = 520
 """Numbers that `envs.tissue` keeps inside MuJoCo's state."""
 
@@ -99,6 +105,29 @@ class TissueForces:
         """Return how far the tip lifts the skin from inside before it goes through [m]."""
         return self.puncture_out / self.skin_stiffness
 
+    def give_way(self, distance: float, yielded: float) -> tuple[float, float, bool]:
+        """Return how an anchor gives way to what it holds, across shaft or thread.
+
+        Elastic up to the yield force, then isotropic hardening, then a tear: the anchor follows
+        until the yield force is left, in tissue that has not yielded yet.
+
+        Args:
+            distance: of what is held from its anchor [m].
+            yielded: displacement of the anchor that stayed so far [m].
+
+        Returns:
+            The share of `distance` by which the anchor moves, the displacement that has stayed then
+            [m], and whether the tissue tore.
+        """
+        force = self.lateral_stiffness * distance
+        excess = force - self.yield_force - self.hardening * yielded
+        if excess <= 0.0:
+            return 0.0, yielded, False
+        if force > self.tear_force:
+            return 1.0 - self.yield_force / force, 0.0, True
+        way = excess / (self.lateral_stiffness + self.hardening)
+        return way / distance, yielded + way, False
+
 
 FORCES = MappingProxyType(
     {
@@ -129,7 +158,7 @@ FORCES = MappingProxyType(
             thread_friction=25.0,
         ),
         "liver": TissueForces(
-            skin_stiffness=400.0,
+            skin_stiffness=600.0,
             skin_friction=0.2,
             puncture_in=0.6,
             puncture_out=0.4,
@@ -234,7 +263,7 @@ def _add_hold(spec: mujoco.MjSpec, name: str, kind: mujoco.mjtObj, held: str) ->
     equality.active = False
 
 
-def spring(stiffness: float, inverse_mass: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def spring(stiffness: float, inverse_mass: float) -> Spring:
     """Return solref and solimp of a constraint that is a spring of `stiffness` [N/m] at rest.
 
     MuJoCo's force at rest is K' d² r / ((1 - d) A) with the impedance d, the reference stiffness K'
@@ -249,3 +278,20 @@ def spring(stiffness: float, inverse_mass: float) -> tuple[tuple[float, ...], tu
     reference = RESPONSE * impedance
     damping = 2.0 * math.sqrt(RESPONSE) * impedance
     return (-reference, -damping), (impedance, impedance, 0.001, 0.5, 2.0)
+
+
+def skin_spring(stiffness: float, inverse_mass: float) -> Spring:
+    """Return solref and solimp of skin, which stiffens towards its thickness.
+
+    Up to half of `THICKNESS` its stiffness is as asked for; at all of it ten times that, more than
+    the arms can press: nothing but a tip that pierces gets through.
+
+    Args:
+        stiffness: static stiffness of a shallow dent [N/m].
+        inverse_mass: as for `spring`.
+    """
+    _, (shallow, *_) = spring(stiffness, inverse_mass)
+    _, (deep, *_) = spring(STIFFENING * stiffness, inverse_mass)
+    reference = RESPONSE * deep**2 / shallow
+    damping = 2.0 * math.sqrt(RESPONSE) * deep
+    return (-reference, -damping), (shallow, deep, THICKNESS, 0.5, STIFFENING_POWER)

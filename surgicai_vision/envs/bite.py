@@ -1,0 +1,93 @@
+"""Bite: one passage of the needle through soft tissue, as others read it and as it is kept."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from surgicai_vision.scene.holes import Point
+from surgicai_vision.scene.tissue import HIDDEN
+
+NO_FLANK = -1
+"""The exit's flank of a bite that has none."""
+SIDES = ("entry", "exit")
+"""The two flanks of the ridge, by the holes that the layouts have there."""
+
+
+@dataclass(frozen=True)
+class Bite:
+    """One passage of the needle through the tissue, in world, at the present place of the phantom.
+
+    Attributes:
+        entry: where it went in, on the undeformed skin [m].
+        exit: where it came out [m]; None before, and of a needle that was drawn back.
+        entry_side: the flank it went in through, "entry" or "exit".
+        exit_side: the flank it came out through; "" before.
+        entry_piece: piece of the ridge at the entry, 1 to 4: that of the hole pair there.
+        exit_piece: the same of the exit; 0 before.
+        depth: deepest place of the tip under the nearer flank so far [m].
+        length: length of the needle's arc in the tissue when the tip was furthest [m].
+        tears: how often the tissue tore in it.
+        is_done: the needle has left it.
+        path: points of the tip's way through the tissue [m]; of the present passage alone.
+    """
+
+    entry: Point
+    exit: Point | None
+    entry_side: str
+    exit_side: str
+    entry_piece: int
+    exit_piece: int
+    depth: float
+    length: float
+    tears: int
+    is_done: bool
+    path: tuple[Point, ...] = ()
+
+
+@dataclass
+class Passage:
+    """A bite as `Tissue` keeps it: in the phantom's frame, flanks by their index in `Ridge`."""
+
+    entry: Point
+    entry_flank: int
+    exit: Point = HIDDEN
+    exit_flank: int = NO_FLANK
+    depth: float = 0.0
+    length: float = 0.0
+    tears: int = 0
+    is_done: bool = False
+
+    SIZE: ClassVar[int] = 12
+    """Numbers of a packed passage."""
+
+    @property
+    def is_out(self) -> bool:
+        """Return True if the tip came out of the tissue again."""
+        return self.exit_flank != NO_FLANK
+
+    def pack(self) -> list[float]:
+        """Return the passage as `SIZE` numbers."""
+        return [
+            *self.entry,
+            self.entry_flank,
+            *self.exit,
+            self.exit_flank,
+            self.depth,
+            self.length,
+            self.tears,
+            self.is_done,
+        ]
+
+    @classmethod
+    def unpack(cls, values: Sequence[float]) -> "Passage":
+        """Return the passage of `SIZE` numbers."""
+        return cls(
+            entry=(values[0], values[1], values[2]),
+            entry_flank=int(values[3]),
+            exit=(values[4], values[5], values[6]),
+            exit_flank=int(values[7]),
+            depth=values[8],
+            length=values[9],
+            tears=int(values[10]),
+            is_done=bool(values[11]),
+        )
