@@ -99,6 +99,7 @@ RANDOMISATION_LIMITS: Mapping[str, float] = types.MappingProxyType(
         "latency": LATENCY_LIMIT,
         "phantom_turn": 15.0,
         "robot_start": 15.0,
+        "distractors": 5,
     }
 )
 """Axis → largest magnitude: beyond it the scene is out of view or the procedure impossible."""
@@ -107,7 +108,11 @@ ANY = "any"
 NEEDLE_ARCS = ("1/3", "3/8", "1/2")
 """Arcs of surgical needles, as parts of a circle; the scene's own is the first."""
 RANDOMISATION_CHOICES: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
-    {"pair": ("", ANY), "needle_arc": ("", ANY, *NEEDLE_ARCS)}
+    {
+        "pair": ("", ANY),
+        "needle_arc": ("", ANY, *NEEDLE_ARCS),
+        "appearance": ("", names.TRAIN, names.HELDOUT, *names.APPEARANCES),
+    }
 )
 """Axis that is a choice → what it may be; "" is off."""
 
@@ -138,6 +143,11 @@ class RandomisationConfig:
         pair: "any" draws the pair of holes to be sewn from all four; "" takes the scene's.
         needle_arc: how much of a circle the needle is: one of `NEEDLE_ARCS`, or "any" of them; ""
             takes the scene's, a third.
+        appearance: "train" draws one of the five families of looks for training, "heldout" one of
+            those kept for tests, a family's name takes that one; within it every episode has its
+            own look. "" takes the plain look. See docs/looks.md.
+        distractors: most things that lie about, 0 to 5: a second needle, gauze, a clip, cut thread,
+            blood. An episode draws how many. They are only seen.
     """
 
     light: float = 0.0
@@ -155,6 +165,8 @@ class RandomisationConfig:
     robot_start: float = 0.0
     pair: str = ""
     needle_arc: str = ""
+    appearance: str = ""
+    distractors: int = 0
 
     def __post_init__(self) -> None:
         for axis, limit in RANDOMISATION_LIMITS.items():

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import other_cameras
 from surgicai_vision.core.config import ANY, NEEDLE_ARCS, RandomisationConfig
+from surgicai_vision.envs import looks
 from surgicai_vision.envs.placement import SLIDE, Placement
 from surgicai_vision.scene import Scene, needle
 from surgicai_vision.scene.cameras import crop_of
@@ -27,6 +28,9 @@ from surgicai_vision.scene.rotations import (
     quaternion_to_matrix,
     rotvec_to_matrix,
 )
+from surgicai_vision.scene.visual import appearance, distractors
+from surgicai_vision.scene.visual.appearance import Appearance
+from surgicai_vision.scene.visual.distractors import Litter
 
 Array = NDArray[np.float64]
 Draws = tuple[float, ...]
@@ -74,11 +78,17 @@ TIP_ANGLES = MappingProxyType(
 CHOICES = ("pair", "needle_arc")
 """Axes that are a choice, one number each: the pair that is sewn, 1 to 4, or 0 for the scene's own;
 the angle of the needle's tip beyond the own one's [rad]."""
+LOOKS = ("appearance", "distractors")
+"""Axes that are only seen, two numbers each: family and seed, count and seed."""
 STAND = ("phantom", "tray")
 """Bodies that the phantom's placement moves; in the scene's own model they are at the origin."""
 DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0")
 """What MuJoCo derives from masses and places."""
-_SIZES = {axis: len(unit) for axis, unit in UNITS.items()} | dict.fromkeys(CHOICES, 1)
+_SIZES = {
+    **{axis: len(unit) for axis, unit in UNITS.items()},
+    **dict.fromkeys(CHOICES, 1),
+    **dict.fromkeys(LOOKS, 2),
+}
 _EDGES = tuple(accumulate(_SIZES.values(), initial=0))
 _PLACES = {
     axis: slice(start, end) for axis, (start, end) in zip(_SIZES, pairwise(_EDGES), strict=True)
@@ -98,6 +108,8 @@ def draw(config: RandomisationConfig, rng: np.random.Generator) -> Draws:
     if config.needle_arc != ANY:
         arc = config.needle_arc or NEEDLE_ARCS[0]
     values += [pair if config.pair == ANY else 0, TIP_ANGLES[arc] - TIP_ANGLES[NEEDLE_ARCS[0]]]
+    values += looks.draw_appearance(config, rng).numbers
+    values += looks.draw_litter(config, rng).numbers
     return tuple(value + 0.0 for value in values)  # no -0.0
 
 
@@ -150,14 +162,17 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
     """Write one episode's numbers into `model`, a copy of the scene's own, which is only read."""
     source = scene.model
     numbers = {axis: np.array(draws[place]) for axis, place in _PLACES.items()}
-    _light(source, model, 1.0 + numbers["light"])
-    _tint(source, model, 1.0 + numbers["colour"].reshape(2, 3))
+    appearance.apply(source, model, Appearance.of_numbers(*numbers["appearance"]))
+    _light(model, 1.0 + numbers["light"])
+    _tint(model, 1.0 + numbers["colour"].reshape(2, 3))
+    distractors.scatter(source, model, Litter.of_numbers(*numbers["distractors"]))
     shifts = numbers["camera_shift"].reshape(-1, 3)
     turns = numbers["camera_turn"].reshape(-1, 3)
     for cameras, shift, turn, fovy in zip(RIGS, shifts, turns, numbers["camera_fovy"], strict=True):
         _aim(source, model, cameras, shift, turn, fovy)
     for name in filter(_stands, other_cameras()):
         _aim(source, model, (name,), shifts[0], turns[0], numbers["camera_fovy"][0])
+    appearance.carry_spot(model)
     model.geom_friction[:] = source.geom_friction * (1.0 + float(numbers["friction"][0]))
     _place_phantom(scene, model, placement(scene, draws))
     shape = needle_shape(draws)
@@ -173,14 +188,13 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
 
 
 def _place_phantom(scene: Scene, model: mujoco.MjModel, where: Placement) -> None:
-    """Move the phantom, and the tray it stands in."""
+    """Move the phantom and the tray it stands in, and what lies about."""
     source = scene.model
-    pose = where.T_world_phantom
-    turn = matrix_to_quaternion(pose[:3, :3])
-    for name in STAND:
+    poses = dict.fromkeys(STAND, where.T_world_phantom) | {distractors.BODY: where.T_world_bed}
+    for name, pose in poses.items():
         body = source.body(name).id
         model.body_pos[body] = source.body_pos[body] + pose[:3, 3]
-        model.body_quat[body] = turn
+        model.body_quat[body] = matrix_to_quaternion(pose[:3, :3])
 
 
 def _stands(name: str) -> bool:
@@ -188,20 +202,20 @@ def _stands(name: str) -> bool:
     return crop_of(name) is None
 
 
-def _light(source: mujoco.MjModel, model: mujoco.MjModel, factors: Array) -> None:
-    """Scale the head light, with the endoscope's own, and the two lamps."""
+def _light(model: mujoco.MjModel, factors: Array) -> None:
+    """Scale an appearance's head light, with the endoscope's own, and its two lamps."""
     lamps = np.append(factors[1:], factors[0])[:, None]
     for kind in ("ambient", "diffuse", "specular"):
-        getattr(model.vis.headlight, kind)[:] = getattr(source.vis.headlight, kind) * factors[0]
-        getattr(model, f"light_{kind}")[:] = getattr(source, f"light_{kind}") * lamps
+        getattr(model.vis.headlight, kind)[:] *= factors[0]
+        getattr(model, f"light_{kind}")[:] *= lamps
 
 
-def _tint(source: mujoco.MjModel, model: mujoco.MjModel, factors: Array) -> None:
-    """Scale the colours of the tissue and of its surroundings."""
+def _tint(model: mujoco.MjModel, factors: Array) -> None:
+    """Scale an appearance's colours of the tissue and of its surroundings."""
     for materials, factor in zip((TISSUE, SURROUNDINGS), factors, strict=True):
         for name in materials:
-            index = source.material(name).id
-            model.mat_rgba[index, :3] = np.clip(source.mat_rgba[index, :3] * factor, 0.0, 1.0)
+            colour = model.material(name).rgba
+            colour[:3] = np.clip(colour[:3] * factor, 0.0, 1.0)
 
 
 def _aim(

@@ -43,6 +43,7 @@ SPOT_DISTANCE = 0.14
 """Distance from the endoscope at which its spot has its strength [m]: about the holes."""
 SPOT_CAMERAS = ("endo_left", "front")
 """The first of these that a scene has carries the spot."""
+LIGHT_FIELDS = ("active", "ambient", "diffuse", "specular", "dir", "cutoff", "exponent")
 
 SIZES: Mapping[str, Size] = {
     "tissue": tissues.TISSUE_SIZE,
@@ -167,7 +168,7 @@ def apply(source: mujoco.MjModel, model: mujoco.MjModel, appearance: Appearance)
     """Write an appearance into `model`, a copy of the compiled `source`, which is only read."""
     for field in ("mat_rgba", "mat_specular", "mat_shininess", "mat_texid"):
         getattr(model, field)[:] = getattr(source, field)
-    for field in ("active", "diffuse", "specular", "dir", "cutoff", "exponent"):
+    for field in LIGHT_FIELDS:
         getattr(model, f"light_{field}")[:] = getattr(source, f"light_{field}")
     for kind in ("ambient", "diffuse", "specular"):
         getattr(model.vis.headlight, kind)[:] = getattr(source.vis.headlight, kind)

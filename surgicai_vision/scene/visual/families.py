@@ -144,7 +144,7 @@ ENDOSCOPE = Lamps(
     lean=0.3,
     fill=(0.0, 0.10),
     spot=(0.55, 0.78),
-    glare=(0.6, 1.0),
+    glare=(0.3, 0.6),
 )
 NARROW = Lamps(
     (236.0, 246.0, 255.0),

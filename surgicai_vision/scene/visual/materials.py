@@ -15,7 +15,7 @@ from surgicai_vision.core.names import ARMS, PSM1, PSM2
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.phantom import ORIGIN, SIZE, TABLE
-from surgicai_vision.scene.visual import appearance, shapes, skin, textures, tool
+from surgicai_vision.scene.visual import appearance, distractors, shapes, skin, textures, tool
 from surgicai_vision.scene.visual.shapes import hide, show
 
 DRAPE_X = (0.04, 0.08, 0.13, 0.19, 0.27, 0.40, 0.60, 0.90)
@@ -93,7 +93,7 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
         type=mujoco.mjtLightType.mjLIGHT_SPOT,
         active=False,
         attenuation=[SPOT_NEAR, 0.0, falloff],
-        castshadow=False,
+        castshadow=True,
     )
     # Times the extent: a smaller shadow map shows stripes towards its edge.
     spec.visual.map.shadowclip = 9.0
@@ -108,6 +108,7 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
     )
     _drape().add_to(spec, "drape")
     show(world, Shape, "drape", meshname="drape")
+    distractors.add_distractors(spec)
 
 
 def dress(spec: mujoco.MjSpec, layout: str = "simple", instrument: str = "400006") -> None:

@@ -1,0 +1,33 @@
+"""Looks: an episode's appearance and what lies about in it, as numbers of its randomisation.
+
+Both are drawn whichever is on, and both are an identity with a seed, of which everything seen
+follows (`scene.visual.appearance`, `scene.visual.distractors`).
+"""
+
+import numpy as np
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig
+from surgicai_vision.scene.visual.appearance import SEEDS, Appearance
+from surgicai_vision.scene.visual.distractors import MOST, Litter
+
+FAMILIES = {names.TRAIN: names.TRAIN_APPEARANCES, names.HELDOUT: names.HELDOUT_APPEARANCES}
+"""Set of looks → its families."""
+
+
+def draw_appearance(config: RandomisationConfig, rng: np.random.Generator) -> Appearance:
+    """Draw one episode's appearance; it takes as many numbers whatever `config` says."""
+    share = float(rng.uniform())
+    seed = int(rng.integers(SEEDS))
+    if not config.appearance:
+        return Appearance()
+    families = FAMILIES.get(config.appearance, (config.appearance,))
+    return Appearance(families[int(share * len(families))], seed)
+
+
+def draw_litter(config: RandomisationConfig, rng: np.random.Generator) -> Litter:
+    """Draw what lies about in one episode: up to `config.distractors` things."""
+    share = float(rng.uniform())
+    seed = int(rng.integers(SEEDS))
+    count = min(int(share * (config.distractors + 1)), MOST)
+    return Litter(count, seed if count else 0)
