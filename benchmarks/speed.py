@@ -244,7 +244,7 @@ def measure_frames(repeats: int, frames: int) -> dict[str, Any]:
 
 def measure_crop(repeats: int, frames: int) -> dict[str, Any]:
     """Time a crop against a camera that follows the jaws, on the same states."""
-    env, start, actions, _ = record(0)
+    env, start, actions, _ = record(SceneConfig())
     spec = build_spec(env.config.scene)
     crop = crop_of(CROP)
     stand = CAMERAS.load(crop.camera)

@@ -52,7 +52,7 @@ class TouchPoint(Subtask):
 
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the needle that still lies on the tissue."""
-        needle_pose = lying_needle(rng)
+        needle_pose = lying_needle(simulation, stitch, rng)
         tip = draw_psm2_grasp(rng, needle_pose, stitch)
         return hold_needle(simulation, PSM2, needle_pose, tip)
 
