@@ -1,0 +1,93 @@
+"""Video: images become an MP4 that browsers play, written whole or not at all.
+
+    write_video(path, frames, fps=25)   # frames: any iterable of (height, width, 3) uint8 RGB
+    read_video(path)                    # (n, height, width, 3)
+
+H.264 by PyAV, in one thread and with no date inside: the same frames give the same bytes. (A
+dataset's videos are another matter: `dataset.video` reads them at random.)
+"""
+
+import itertools
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import files
+from surgicai_vision.core.errors import BadFile, InputError, first_line
+
+Image = NDArray[np.uint8]
+"""RGB, (height, width, 3)."""
+
+SUFFIX: Final = ".mp4"
+PIXELS: Final = "yuv420p"
+"""The only pixel format of H.264 that every browser plays; it needs even sides."""
+OPTIONS: Final = {"crf": "20", "preset": "veryfast", "threads": "1", "g": "50"}
+"""x264's: visually clean, and a key frame every 50 frames to jump to."""
+CONTAINER: Final = {"movflags": "+faststart", "fflags": "+bitexact"}
+"""The index stands before the images, so that a page plays while it loads; no date, no version."""
+
+
+def write_video(path: Path, frames: Iterable[Image], fps: float) -> int:
+    """Write frames as a video and return how many they were.
+
+    Args:
+        path: the file, `*.mp4`; its folder is made where it is missing, an earlier file replaced.
+        frames: RGB images (height, width, 3) uint8 of one size with even sides.
+        fps: frames a second.
+
+    Raises:
+        InputError: no frames, sides that are odd or differ, or a path that is no `.mp4`.
+    """
+    import av
+
+    if path.suffix != SUFFIX:
+        raise InputError(f"{path} is no {SUFFIX} file; videos are written as MP4.")
+    rest = iter(frames)
+    first = next(rest, None)
+    if first is None:
+        raise InputError(f"{path}: there are no frames to write.")
+    height, width, _ = first.shape
+    if height % 2 or width % 2:
+        raise InputError(f"{path}: frames of {height} × {width} pixels; both sides must be even.")
+    with (
+        files.whole_file(path) as temporary,
+        av.open(str(temporary), "w", format="mp4", options=dict(CONTAINER)) as container,
+    ):
+        rate = Fraction(fps).limit_denominator(1000)
+        stream = container.add_stream("libx264", rate=rate, options=dict(OPTIONS))
+        assert isinstance(stream, av.VideoStream)
+        stream.width = width
+        stream.height = height
+        stream.pix_fmt = PIXELS
+        count = 0
+        for frame in itertools.chain((first,), rest):
+            if frame.shape != first.shape:
+                raise InputError(
+                    f"{path}: frame {count} has shape {frame.shape}, the first {first.shape}; "
+                    "frames of one video have one size."
+                )
+            image = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            container.mux(stream.encode(image))
+            count += 1
+        container.mux(stream.encode())
+    return count
+
+
+def read_video(path: Path) -> NDArray[np.uint8]:
+    """Return all frames of a video, (n, height, width, 3) RGB.
+
+    Raises:
+        BadFile: it cannot be decoded.
+    """
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    except (OSError, av.FFmpegError, IndexError) as error:
+        raise BadFile(f"{path} cannot be decoded ({first_line(error)}).") from None
+    return np.asarray(np.stack(frames), np.uint8)
