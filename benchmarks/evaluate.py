@@ -30,7 +30,8 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent
-from surgicai_vision.evaluation.rollout import Episode, evaluate
+from surgicai_vision.evaluation.rollout import evaluate
+from surgicai_vision.evaluation.slot import Episode
 
 ENCODER = "imagenet-lite"
 VIEW = "front"

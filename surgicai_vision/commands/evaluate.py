@@ -15,8 +15,10 @@ from surgicai_vision.commands.options import (
     FILE_ONLY,
     NOT_NEGATIVE,
     TASK,
+    VIEWS,
     WEIGHTS,
     default_text,
+    within,
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON
@@ -24,6 +26,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.features.encoders import WeightsSource
 
 if TYPE_CHECKING:
+    from surgicai_vision.evaluation.filming import Filming
     from surgicai_vision.evaluation.policy_spec import PolicySpec
 
 app = App(
@@ -55,6 +58,12 @@ class Options:
         expert_swap: For a hierarchical policy, the subtask that the expert does, or all: each in
             turn.
         out: Folder for the rows; an earlier evaluation in it is replaced.
+        video: Folder for videos of the episodes, one MP4 each; an earlier filming in it is
+            replaced.
+        video_of: Which episodes: all, failures, successes, or a number: of the first so many
+            starts.
+        video_view: Views side by side in a video.
+        video_size: Height and width of each view in a video [px], even.
     """
 
     policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
@@ -75,6 +84,10 @@ class Options:
         DIRECTORY,
         default_text("outputs/evaluations/<task>-<policy>-starts<seed>+<episodes>"),
     ] = None
+    video: Annotated[Path | None, DIRECTORY] = None
+    video_of: Annotated[str, Parameter(metavar="WHICH")] = "all"
+    video_view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
+    video_size: Annotated[int, within(64, 960), Parameter(metavar="PX")] = 384
     env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
@@ -85,6 +98,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     from surgicai_vision.evaluation.storage import MARKER
 
     if options.expert_swap == ALL:
+        if options.video:
+            raise InputError(f"--video does not go with --expert-swap {ALL}; give one subtask.")
         return _evaluate_swaps(options, console)
     spec = open_given(
         options.policy,
@@ -98,11 +113,26 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     default = folders.evaluation_folder(spec.config.task, spec.name, options.seed, options.episodes)
     out = options.out or default
     folders.check_folder(out, MARKER)
+    filming = _filming(options)
     with console.stage(f"evaluating {spec.name} on {spec.config.task}", "steps") as progress:
-        result = evaluate_into(out, spec, seeds, options.workers, progress)
+        result = evaluate_into(out, spec, seeds, options.workers, progress, filming)
     console.say(summary_line(result))
     console.say(f"episodes: {out}")
-    return {**result, "out": str(out)}
+    if filming is None:
+        return {**result, "out": str(out)}
+    videos = [str(filming.folder / name) for name in filming.videos()]
+    console.say(f"videos: {filming.folder} ({len(videos)})")
+    return {**result, "out": str(out), "videos": videos}
+
+
+def _filming(options: Options) -> "Filming | None":
+    """Return which episodes become videos; None without --video."""
+    from surgicai_vision.evaluation.filming import INDEX, Filming, Look
+
+    if options.video is None:
+        return None
+    folders.check_folder(options.video, INDEX, "--video")
+    return Filming(options.video, options.video_of, Look(options.video_view, options.video_size))
 
 
 def open_given(

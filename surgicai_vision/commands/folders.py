@@ -36,21 +36,22 @@ def evaluation_folder(task: str, policy: str, seed: int, episodes: int) -> Path:
     return OUTPUTS / "evaluations" / f"{task}-{policy}-starts{seed}+{episodes}"
 
 
-def check_folder(out: Path, marker: str) -> None:
+def check_folder(out: Path, marker: str, option: str = "--out") -> None:
     """Refuse an output folder that cannot be written or holds something else, before any work.
 
     Args:
         out: the folder to be made or continued.
         marker: the file that marks it as ours.
+        option: what the folder was given as, for the message.
     """
-    files.check_output(out, may_resume=marker)
+    files.check_output(out, may_resume=marker, option=option)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=files.TEMPORARY):
             pass
     except OSError as error:
         raise InputError(
-            f"--out {out} cannot be written: {error.strerror}; choose another folder."
+            f"{option} {out} cannot be written: {error.strerror}; choose another folder."
         ) from None
 
 

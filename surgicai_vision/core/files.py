@@ -126,27 +126,28 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def check_output(path: Path, *, may_resume: str | None = None) -> None:
+def check_output(path: Path, *, may_resume: str | None = None, option: str = "--out") -> None:
     """Refuse an output folder that cannot be written or holds other files, before any work.
 
     Args:
         path: the folder to be made.
         may_resume: name of a file that marks the folder as one to be continued.
+        option: what the folder was given as, for the message.
     """
     if path.exists():
         if not path.is_dir():
-            raise OutputExists(f"--out {path} is a file; give a folder that does not exist yet.")
+            raise OutputExists(f"{option} {path} is a file; give a folder that does not exist yet.")
         ours = may_resume is not None and (path / may_resume).exists()
         if any(path.iterdir()) and not ours:
             raise OutputExists(
-                f"--out {path} already holds files; give a folder that does not exist yet."
+                f"{option} {path} already holds files; give a folder that does not exist yet."
             )
     parent = path
     while not parent.exists():
         parent = parent.parent
     if not os.access(parent, os.W_OK | os.X_OK) or not parent.is_dir():
         raise InputError(
-            f"--out {path} cannot be written: no permission on {parent}; choose another folder."
+            f"{option} {path} cannot be written: no permission on {parent}; choose another folder."
         )
 
 

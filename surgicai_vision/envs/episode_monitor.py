@@ -6,6 +6,7 @@ An `EpisodeMonitor` only reads: an episode is the same with and without it.
   (`envs.bite_measures`).
 * `slip`, `turn`: the needle's largest shift [m] and turn [rad] in the active jaws since they took
   it.
+* `force`: net force on the tissue when the last control step ended [N]; 0 at the start.
 * `tissue_force`: largest net force [N] of needle and instruments (not of the thread) on the
   phantom, as a force plate under it would show. Sampled when a control step ends, at 50 Hz: a
   shorter blow can be missed. `tissue_impulse` is its sum over time [N s].
@@ -53,6 +54,7 @@ class EpisodeMonitor:
         self._watch = None
         self.slip = 0.0
         self.turn = 0.0
+        self.force = 0.0
         self.tissue_force = 0.0
         self.tissue_impulse = 0.0
         self.tears = math.nan if self._env.simulation.tissue is None else 0.0
@@ -75,9 +77,9 @@ class EpisodeMonitor:
         slip, turn = info["needle_slip"]
         self.slip = max(self.slip, float(slip))
         self.turn = max(self.turn, float(turn))
-        force = self._plate.force(simulation.data)
-        self.tissue_force = max(self.tissue_force, force)
-        self.tissue_impulse += force * self._env.dt
+        self.force = self._plate.force(simulation.data)
+        self.tissue_force = max(self.tissue_force, self.force)
+        self.tissue_impulse += self.force * self._env.dt
         self.paper_success = self.paper_success or bool(info["paper_success"])
         self._watch.update()
         if simulation.tissue is not None:

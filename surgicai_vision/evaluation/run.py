@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from surgicai_vision.core.progress import Progress, Stage
+from surgicai_vision.evaluation.filming import Filming
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.rollout import evaluate
@@ -34,6 +35,7 @@ def evaluate_into(
     seeds: Sequence[int],
     workers: int | None = None,
     progress: Progress | None = None,
+    filming: Filming | None = None,
 ) -> Row:
     """Evaluate, store everything in the folder `out` and return the summary.
 
@@ -43,8 +45,11 @@ def evaluate_into(
         seeds: start seeds, in a row.
         workers: processes.
         progress: called as progress(steps done, steps at most).
+        filming: which episodes become videos; None films nothing.
     """
-    episodes = evaluate(spec.make_agent, spec.config, seeds, workers=workers, progress=progress)
+    episodes = evaluate(
+        spec.make_agent, spec.config, seeds, workers=workers, progress=progress, filming=filming
+    )
     about = {
         "command": command_line(),
         "provenance": provenance(),

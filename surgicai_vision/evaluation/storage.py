@@ -17,7 +17,7 @@ from surgicai_vision.core import files
 from surgicai_vision.core.config import JSON, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.evaluation.metrics import as_table, summary
-from surgicai_vision.evaluation.rollout import Episode, Film
+from surgicai_vision.evaluation.slot import Episode, Film
 from surgicai_vision.training.run_config import RunConfig
 
 MARKER = "evaluation.json"

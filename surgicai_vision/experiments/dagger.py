@@ -24,7 +24,7 @@ from surgicai_vision.demos.demonstrator import BehaviourPolicy
 from surgicai_vision.demos.record import Learner, record_into
 from surgicai_vision.evaluation.agent import Agent, Env, Observation
 from surgicai_vision.evaluation.policy_spec import open_policy
-from surgicai_vision.evaluation.rollout import env_of
+from surgicai_vision.evaluation.slot import env_of
 
 
 @final

@@ -35,6 +35,8 @@ SHORT = TaskConfig("grasp", max_steps=12)
 class FakeEnv:
     """Counts steps; seed s succeeds after s steps, 97 cannot start, 98 diverges, 99 raises."""
 
+    subtask = SimpleNamespace(name="grasp", arm="psm2")
+
     def __init__(self, config):
         self.config, self.closed = config, False
 
@@ -78,7 +80,7 @@ class FakeMonitor:
 
     def clear(self):
         self.bite = BiteMeasures()
-        self.slip = self.turn = self.tissue_force = self.tissue_impulse = 0.0
+        self.force = self.slip = self.turn = self.tissue_force = self.tissue_impulse = 0.0
         self.tears = self.thread_drawn = np.nan
         self.paper_success = False
 

@@ -215,7 +215,7 @@ class Pretend:
         shift = chosen.run.shift
         self.calls.append((shift.axis, shift.strength))
         from surgicai_vision.evaluation.metrics import EpisodeMetrics
-        from surgicai_vision.evaluation.rollout import Episode, Film
+        from surgicai_vision.evaluation.slot import Episode, Film
         from surgicai_vision.evaluation.storage import write_evaluation
 
         film = Film(np.zeros(1, np.int64), np.zeros((1, 2)))

@@ -12,7 +12,8 @@ import pyarrow.parquet as pq
 
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig, to_mapping
-from surgicai_vision.evaluation.rollout import Episode, EpisodeMetrics, Film
+from surgicai_vision.evaluation.metrics import EpisodeMetrics
+from surgicai_vision.evaluation.slot import Episode, Film
 from surgicai_vision.evaluation.storage import FORMAT, write_evaluation
 from surgicai_vision.training.run_config import RunConfig, Shift, Starts
 

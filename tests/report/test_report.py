@@ -12,7 +12,8 @@ from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, SurgicaiError
 from surgicai_vision.envs import contact_sheet
-from surgicai_vision.evaluation.rollout import Episode, EpisodeMetrics, Film
+from surgicai_vision.evaluation.metrics import EpisodeMetrics
+from surgicai_vision.evaluation.slot import Episode, Film
 from surgicai_vision.evaluation.storage import (
     FORMAT,
     find_evaluations,

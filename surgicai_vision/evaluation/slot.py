@@ -1,0 +1,224 @@
+"""Slot: one env and the episode of an agent that runs in it.
+
+`evaluation.rollout` runs several at once; `evaluation.watch` runs one that a person looks at. Both
+take the same steps, so what is watched is what is counted.
+
+    slot = Slot(0, agent, config)
+    slot.begin(seed)
+    while not slot.ended:
+        slot.step(agent.act([0], [slot.env], [slot.observation])[0])
+    slot.moment, slot.states, slot.moments   # the present, and the whole episode so far
+    episode = slot.take()
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import PhysicsError
+from surgicai_vision.evaluation.agent import Agent, Env, Observation
+from surgicai_vision.evaluation.metrics import EpisodeMetrics, failure_kind
+
+FILM_FRAMES = 10
+"""States kept of each episode, evenly spaced from the first to the last."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """States of one episode: `steps` (k,) and `states` (k, n) for the env's `set_state_vector`."""
+
+    steps: NDArray[np.int64]
+    states: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A row and the film of its episode."""
+
+    row: EpisodeMetrics
+    film: Film
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What is measured when a control step has ended: what a person is shown of it.
+
+    Attributes:
+        step: control steps taken so far; 0 at the start.
+        subtask: the subtask that is on.
+        arm: its arm.
+        distance: from the goal [m].
+        angle: from the goal [rad].
+        contact: both pads of the active jaws touch the needle.
+        force: net force of needle and instruments on the tissue [N] (`EpisodeMonitor.force`).
+        stages: of the whole procedure, subtasks that succeeded so far in their order.
+        success: the task has succeeded.
+    """
+
+    step: int
+    subtask: str
+    arm: str
+    distance: float
+    angle: float
+    contact: bool
+    force: float
+    stages: int
+    success: bool
+
+
+def env_of(agent: Agent, config: TaskConfig) -> Env:
+    """Make an env that shows what the agent sees."""
+    from surgicai_vision import envs
+
+    cameras = tuple(agent.cameras)
+    return envs.make(
+        config,
+        obs_type="pixels_agent_pos" if cameras else "state",
+        cameras=cameras,
+        image_size=agent.image_size,
+        depth=agent.depth,
+    )
+
+
+@final
+@dataclass
+class Slot:
+    """One env and the episode that runs in it; see the module's docstring.
+
+    Args:
+        index: the slot's number, by which the agent tells its episodes apart.
+        agent: what acts.
+        task_config: the task.
+    """
+
+    index: int
+    agent: Agent
+    task_config: TaskConfig
+    seed: int | None = None
+    steps: int = 0
+    ended: bool = False
+    error: str = ""
+    diverged: bool = False
+    touched: bool = False
+    observation: Observation = field(default_factory=lambda: np.zeros(0, np.float32))
+    info: dict[str, Any] = field(default_factory=dict)
+    states: list[NDArray[np.float64]] = field(default_factory=list)
+    moments: list[Moment] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        from surgicai_vision.envs.episode_monitor import EpisodeMonitor
+
+        self.env = env_of(self.agent, self.task_config)
+        self.monitor = EpisodeMonitor(self.env)
+
+    def begin(self, seed: int) -> None:
+        """Start the episode of `seed`."""
+        self.seed = seed
+        self.steps = 0
+        self.states = []
+        self.moments = []
+        self.ended = self.diverged = self.touched = False
+        self.error = ""
+        self.monitor.clear()
+        try:
+            self.observation, self.info = self.env.reset(seed=seed)
+            self.touched = bool(self.info.get("contact"))
+            self.monitor.reset()
+            self.agent.reset(self.index, self.env, seed)
+        except PhysicsError as error:
+            self.info, self.ended, self.error = {}, True, str(error)
+        self._keep()
+
+    def step(self, action: NDArray[np.float32]) -> None:
+        """Take one step."""
+        if not np.isfinite(action).all():
+            self.ended, self.error = True, "the policy's action is not finite"
+            return
+        try:
+            self.observation, _, terminated, truncated, self.info = self.env.step(action)
+        except PhysicsError as error:
+            terminated, truncated, self.error, self.diverged = True, False, str(error), True
+        else:
+            self.monitor.update(self.info)
+        if self.info.get("physics_error"):
+            self.error, self.diverged = self.error or "the physics diverged", True
+        self.steps += 1
+        self.touched = self.touched or bool(self.info.get("contact"))
+        self.ended = bool(
+            terminated or truncated or self.error or self.steps >= self.task_config.max_steps
+        )
+        if not self.error:
+            self._keep()
+
+    def take(self) -> Episode:
+        """Return the ended episode and free the slot."""
+        assert self.seed is not None
+        contact = bool(self.info.get("contact", False))
+        success = bool(self.info.get("is_success", False)) and not self.error
+        monitor = self.monitor
+        bite = monitor.bite
+        held = not self.error and monitor.is_held()
+        failure = failure_kind(self.error, self.diverged, self.touched, bite.wrong_hole, held)
+        row = EpisodeMetrics(
+            task=self.task_config.task,
+            policy=self.agent.name,
+            seed=self.seed,
+            success=success,
+            steps=self.steps,
+            trajectory_length_mm=1e3 * float(self.info.get("tip_path", 0.0)),
+            d_trans_mm=1e3 * float(self.info.get("d_trans", np.nan)),
+            d_angle_deg=float(np.degrees(self.info.get("d_angle", np.nan))),
+            contact=contact,
+            error=self.error,
+            grasp=self.task_config.scene.grasp,
+            failure="" if success else failure,
+            stages=int(self.info.get("progress", success)),
+            entry_mm=1e3 * bite.entry_error,
+            exit_mm=1e3 * bite.exit_error,
+            bite_depth_mm=1e3 * bite.depth,
+            bite_length_mm=1e3 * bite.length,
+            entry_deg=math.degrees(bite.entry_angle),
+            exit_deg=math.degrees(bite.exit_angle),
+            slip_mm=1e3 * monitor.slip,
+            slip_deg=math.degrees(monitor.turn),
+            tissue_force_n=monitor.tissue_force,
+            tissue_impulse_ns=monitor.tissue_impulse,
+            tears=monitor.tears,
+            thread_mm=1e3 * monitor.thread_drawn,
+            paper_success=monitor.paper_success and not self.error,
+        )
+        self.seed = None
+        return Episode(row, self._film())
+
+    def _keep(self) -> None:
+        if self.error:
+            return
+        self.states.append(np.asarray(self.env.get_state(), dtype=np.float64))
+        self.moments.append(self._moment())
+
+    def _moment(self) -> Moment:
+        """Return what is measured now."""
+        subtask = self.env.subtask
+        return Moment(
+            step=self.steps,
+            subtask=subtask.name,
+            arm=subtask.arm,
+            distance=float(self.info["d_trans"]),
+            angle=float(self.info["d_angle"]),
+            contact=bool(self.info["contact"]),
+            force=self.monitor.force,
+            stages=int(self.info.get("progress", 0)),
+            success=bool(self.info["is_success"]),
+        )
+
+    def _film(self) -> Film:
+        if not self.states:
+            return Film(np.zeros(0, np.int64), np.zeros((0, 0)))
+        steps = np.unique(
+            np.linspace(0, len(self.states) - 1, FILM_FRAMES).round().astype(np.int64)
+        )
+        return Film(steps, np.stack([self.states[step] for step in steps]))
