@@ -100,6 +100,7 @@ RANDOMISATION_LIMITS: Mapping[str, float] = types.MappingProxyType(
         "phantom_turn": 15.0,
         "robot_start": 15.0,
         "distractors": 5,
+        "appearance_shift": 1.0,
     }
 )
 """Axis → largest magnitude: beyond it the scene is out of view or the procedure impossible."""
@@ -148,6 +149,8 @@ class RandomisationConfig:
             own look. "" takes the plain look. See docs/looks.md.
         distractors: most things that lie about, 0 to 5: a second needle, gauze, a clip, cut thread,
             blood. An episode draws how many. They are only seen.
+        appearance_shift: how far the look of each episode is on the way to one of a held-out
+            family, 0 to 1; for tests alone.
     """
 
     light: float = 0.0
@@ -167,6 +170,7 @@ class RandomisationConfig:
     needle_arc: str = ""
     appearance: str = ""
     distractors: int = 0
+    appearance_shift: float = 0.0
 
     def __post_init__(self) -> None:
         for axis, limit in RANDOMISATION_LIMITS.items():

@@ -4,6 +4,8 @@ Both are drawn whichever is on, and both are an identity with a seed, of which e
 follows (`scene.visual.appearance`, `scene.visual.distractors`).
 """
 
+import dataclasses
+
 import numpy as np
 
 from surgicai_vision.core import names
@@ -17,12 +19,21 @@ FAMILIES = {names.TRAIN: names.TRAIN_APPEARANCES, names.HELDOUT: names.HELDOUT_A
 
 def draw_appearance(config: RandomisationConfig, rng: np.random.Generator) -> Appearance:
     """Draw one episode's appearance; it takes as many numbers whatever `config` says."""
+    one = _draw(config.appearance, rng)
+    other = _draw(names.HELDOUT if config.appearance_shift else "", rng)
+    return dataclasses.replace(
+        one, share=config.appearance_shift, other=other.family, other_seed=other.seed
+    )
+
+
+def _draw(families: str, rng: np.random.Generator) -> Appearance:
+    """Draw an appearance of a family or a set of them; the plain one of ""."""
     share = float(rng.uniform())
     seed = int(rng.integers(SEEDS))
-    if not config.appearance:
+    if not families:
         return Appearance()
-    families = FAMILIES.get(config.appearance, (config.appearance,))
-    return Appearance(families[int(share * len(families))], seed)
+    chosen = FAMILIES.get(families, (families,))
+    return Appearance(chosen[int(share * len(chosen))], seed)
 
 
 def draw_litter(config: RandomisationConfig, rng: np.random.Generator) -> Litter:

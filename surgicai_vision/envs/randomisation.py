@@ -78,8 +78,9 @@ TIP_ANGLES = MappingProxyType(
 CHOICES = ("pair", "needle_arc")
 """Axes that are a choice, one number each: the pair that is sewn, 1 to 4, or 0 for the scene's own;
 the angle of the needle's tip beyond the own one's [rad]."""
-LOOKS = ("appearance", "distractors")
-"""Axes that are only seen, two numbers each: family and seed, count and seed."""
+LOOKS = MappingProxyType({"appearance": 2, "appearance_shift": 3, "distractors": 2})
+"""Axes that are only seen → how many numbers hold each: family and seed; share, family and seed;
+count and seed."""
 STAND = ("phantom", "tray")
 """Bodies that the phantom's placement moves; in the scene's own model they are at the origin."""
 DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0")
@@ -87,7 +88,7 @@ DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "a
 _SIZES = {
     **{axis: len(unit) for axis, unit in UNITS.items()},
     **dict.fromkeys(CHOICES, 1),
-    **dict.fromkeys(LOOKS, 2),
+    **LOOKS,
 }
 _EDGES = tuple(accumulate(_SIZES.values(), initial=0))
 _PLACES = {
@@ -162,7 +163,8 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
     """Write one episode's numbers into `model`, a copy of the scene's own, which is only read."""
     source = scene.model
     numbers = {axis: np.array(draws[place]) for axis, place in _PLACES.items()}
-    appearance.apply(source, model, Appearance.of_numbers(*numbers["appearance"]))
+    shown = Appearance.of_numbers(*numbers["appearance"], *numbers["appearance_shift"])
+    appearance.apply(source, model, shown)
     _light(model, 1.0 + numbers["light"])
     _tint(model, 1.0 + numbers["colour"].reshape(2, 3))
     distractors.scatter(source, model, Litter.of_numbers(*numbers["distractors"]))

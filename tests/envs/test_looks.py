@@ -51,6 +51,26 @@ def test_an_episode_draws_one_of_its_families(appearance, families):
     assert min(map(drawn.count, families)) > 0.8 * 2000 / len(families)
 
 
+def test_a_shift_goes_to_held_out_families_and_nothing_else_draws_them():
+    rng = np.random.default_rng(0)
+    config = RandomisationConfig(appearance="train", appearance_shift=0.3)
+    drawn = [looks.draw_appearance(config, rng) for _ in range(200)]
+    assert {look.family for look in drawn} == set(names.TRAIN_APPEARANCES)
+    assert {look.other for look in drawn} == set(names.HELDOUT_APPEARANCES)
+    assert {look.share for look in drawn} == {0.3}
+    assert {looks.draw_appearance(EVERYTHING, rng).other for _ in range(200)} == {""}
+
+
+def test_a_shift_grows_from_the_own_look_to_the_held_out_one():
+    images = []
+    for shift in (0.0, 0.25, 0.5, 1.0):
+        env = make(RandomisationConfig(light=0.001, appearance_shift=shift))
+        env.reset(seed=3)
+        images.append(image(env).astype(int))
+    far = [np.abs(each - images[0]).mean() for each in images[1:]]
+    assert 1.0 < far[0] < far[1] < far[2]
+
+
 def test_counts_of_distractors_are_drawn_evenly():
     rng = np.random.default_rng(0)
     counts = [looks.draw_litter(EVERYTHING, rng).count for _ in range(3000)]
@@ -67,7 +87,7 @@ def test_turning_looks_on_leaves_the_other_axes_and_the_start_as_they_were():
     for seed in range(5):
         plain.reset(seed=seed)
         looking.reset(seed=seed)
-        size = randomisation.SIZE - 2 * len(randomisation.LOOKS)
+        size = randomisation.SIZE - sum(randomisation.LOOKS.values())
         assert plain.simulation.draws[:size] == looking.simulation.draws[:size]
         assert np.array_equal(plain.data.qpos, looking.data.qpos)
 
@@ -135,7 +155,7 @@ def test_brightness_and_tint_scale_the_look_that_was_drawn():
     for seed in range(3):
         env.reset(seed=seed)
         draws = env.simulation.draws
-        plain = (*(0.0,) * (randomisation.SIZE - 4), *draws[-4:])
+        plain = (*(0.0,) * (randomisation.SIZE - 7), *draws[-7:])
         factor = 1.0 + draws[0]
         bright = env.model.vis.headlight.diffuse.copy()
         env.simulation.randomise(plain)

@@ -12,6 +12,7 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
+from surgicai_vision.envs.randomisation import LOOKS
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
@@ -101,8 +102,12 @@ def test_an_episode_keeps_its_direction_and_grows_with_the_strength(axis):
         drawn[strength] = env.reset(seed=5)[1]["randomisation"]
     assert set(drawn[0.5]) == set(drawn[1.0]) == set(AXES[axis].world)
     for name, values in drawn[1.0].items():
-        if name != "latency":
-            np.testing.assert_allclose(drawn[0.5][name], values / 2)
+        half = drawn[0.5][name]
+        if name in LOOKS:  # how much of a look, then which
+            assert 0 < half[0] < values[0]
+            np.testing.assert_array_equal(half[1:], values[1:])
+        elif name != "latency":
+            np.testing.assert_allclose(half, values / 2)
             assert np.abs(values).max() > 0
 
 

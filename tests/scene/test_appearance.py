@@ -158,8 +158,29 @@ def test_going_back_to_an_appearance_shows_the_same_pixels(source, model):
         assert np.array_equal(renderer.render(at_rest(model), "front"), first)
 
 
+def test_a_mixture_lies_between_its_looks(source, model):
+    own, other = Appearance("fat", 1), Appearance("liver", 2)
+    images = []
+    for share in (0.0, 0.5, 1.0):
+        mixture = Appearance("fat", 1, share, "liver", 2)
+        images.append(draw_textures(mixture)["tissue"].astype(float))
+        seen(source, model, mixture)
+    assert np.array_equal(images[0], draw_textures(own)["tissue"])
+    assert np.array_equal(images[2], draw_textures(other)["tissue"])
+    assert np.abs(images[1] - (images[0] + images[2]) / 2).max() <= 0.5
+    for share, look in ((0.0, own), (1.0, other)):
+        pixels = seen(source, model, Appearance("fat", 1, share, "liver", 2))
+        assert np.abs(pixels.astype(int) - seen(source, model, look)).max() <= 1
+
+
 def test_numbers_are_an_appearance_and_back():
-    for look in (Appearance(), Appearance("silicone", 0), Appearance("scar", appearance.SEEDS - 1)):
+    last = appearance.SEEDS - 1
+    for look in (
+        Appearance(),
+        Appearance("silicone", 0),
+        Appearance("scar", last),
+        Appearance("fat", 3, 0.1, "liver", last),
+    ):
         assert Appearance.of_numbers(*look.numbers) == look
 
 

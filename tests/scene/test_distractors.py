@@ -60,6 +60,11 @@ def test_all_kinds_are_drawn():
     assert kinds == set(KINDS)
 
 
+def test_fewer_are_the_first_of_more():
+    for seed in range(10):
+        assert draw(Litter(2, seed)) == draw(Litter(MOST, seed))[:2]
+
+
 def test_they_are_seen_as_background(source):
     """No pixel becomes another part's, but those that a thing hides become background."""
     model = copy.copy(source)

@@ -60,6 +60,14 @@ _SINGLE: Mapping[str, Axis] = MappingProxyType(
         "field_of_view": Axis("vertical field of view off by ±10°", {"camera_fovy": 10.0}),
         "light": Axis("brightness of each light off by ±80 %", {"light": 0.8}),
         "tint": Axis("colour channels of tissue and surroundings off by ±80 %", {"colour": 0.8}),
+        "tissue": Axis(
+            "tissue, drape, needle, instruments and light all look as in a held-out family",
+            {"appearance_shift": 1.0},
+        ),
+        "distractors": Axis(
+            "up to 5 things lie about: a second needle, gauze, a clip, cut thread, blood",
+            {"distractors": 5},
+        ),
         "smoke": Axis(
             "drifting grey smoke that hides 40 to 90 % of what lies behind it", images=("smoke",)
         ),

@@ -3,8 +3,9 @@
 Interface:
 
 * `Appearance(family, seed)` is the whole identity of a look. The family "" is the plain look that
-  the scene was compiled with; the others are `names.APPEARANCES`. `Appearance.numbers` are the two
-  floats that a state holds for it, and `Appearance.of_numbers` is its inverse.
+  the scene was compiled with; the others are `names.APPEARANCES`. With `share`, `other` and
+  `other_seed` it is a mixture of two. `Appearance.numbers` are the floats that a state holds for
+  it, and `Appearance.of_numbers` is its inverse.
 * `draw_look(appearance) -> Look`: colours, finishes and light. Cheap.
 * `draw_textures(appearance) -> {texture: image}`: what the surfaces show, of fixed sizes. 30 to 80
   ms, kept for the last few appearances.
@@ -26,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import check_name
-from surgicai_vision.scene.visual import cloths, textures, tissues
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.scene.visual import cloths, fields, textures, tissues
 from surgicai_vision.scene.visual.families import FAMILIES, Bounds, Finish, Lamps
 from surgicai_vision.scene.visual.fields import Image, Size
 
@@ -43,7 +44,7 @@ SPOT_DISTANCE = 0.14
 """Distance from the endoscope at which its spot has its strength [m]: about the holes."""
 SPOT_CAMERAS = ("endo_left", "front")
 """The first of these that a scene has carries the spot."""
-LIGHT_FIELDS = ("active", "ambient", "diffuse", "specular", "dir", "cutoff", "exponent")
+WHITE: Image = np.full((1, 1, 3), 255, np.uint8)
 
 SIZES: Mapping[str, Size] = {
     "tissue": tissues.TISSUE_SIZE,
@@ -58,31 +59,48 @@ TEXTURED = {"tissue": "tissue", "drape": "drape", "tray": "tray", "steel": "meta
 
 @dataclass(frozen=True)
 class Appearance:
-    """A look: a family and a seed within it.
+    """A look: a family and a seed within it, or a mixture of two such looks.
 
     Attributes:
         family: one of `names.APPEARANCES`, or "" for the plain look.
         seed: of what is drawn within the family, 0 to `SEEDS` - 1.
+        share: of the other look, 0 to 1.
+        other: the other look's family.
+        other_seed: its seed.
     """
 
     family: str = ""
     seed: int = 0
+    share: float = 0.0
+    other: str = ""
+    other_seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.family:
-            check_name("appearance", self.family, names.APPEARANCES)
+        for family in filter(None, (self.family, self.other)):
+            check_name("appearance", family, names.APPEARANCES)
+        if self.share and not self.other:
+            raise InputError(f"An appearance with a share of {self.share} of no other one.")
 
     @property
-    def numbers(self) -> tuple[float, float]:
-        """Return the family's place in `names.APPEARANCES`, from 1, 0 for plain; and the seed."""
-        if not self.family:
-            return 0.0, 0.0
-        return float(names.APPEARANCES.index(self.family) + 1), float(self.seed)
+    def numbers(self) -> tuple[float, ...]:
+        """Return family, seed, share, other family and its seed; a family as its place, from 1."""
+        return (
+            *(float(_place(self.family)), float(self.seed)),
+            *(self.share, float(_place(self.other)), float(self.other_seed)),
+        )
 
     @classmethod
-    def of_numbers(cls, family: float, seed: float) -> "Appearance":
+    def of_numbers(
+        cls, family: float, seed: float, share: float, other: float, other_seed: float
+    ) -> "Appearance":
         """Return the appearance of `numbers`."""
-        return cls(names.APPEARANCES[int(family) - 1], int(seed)) if family else cls()
+        families = ("", *names.APPEARANCES)
+        return cls(families[int(family)], int(seed), share, families[int(other)], int(other_seed))
+
+
+def _place(family: str) -> int:
+    """Return a family's place in `names.APPEARANCES`, from 1; 0 for the plain look."""
+    return names.APPEARANCES.index(family) + 1 if family else 0
 
 
 @dataclass(frozen=True)
@@ -148,7 +166,17 @@ def draw_look(appearance: Appearance) -> Look:
 
 @functools.lru_cache(maxsize=KEPT)
 def draw_textures(appearance: Appearance) -> Mapping[str, Image]:
-    """Draw the textures of an appearance, (height, width, 3) uint8 each; not to be written."""
+    """Draw the textures of an appearance, (height, width, 3) uint8 each; not to be written.
+
+    The plain look has two; the slots of the others are white in it.
+    """
+    if appearance.share:
+        own = draw_textures(Appearance(appearance.family, appearance.seed))
+        other = draw_textures(Appearance(appearance.other, appearance.other_seed))
+        return {
+            name: fields.to_bytes(_mixed(own.get(name, WHITE), image, appearance.share))
+            for name, image in other.items()
+        }
     if not appearance.family:
         return {"tissue": textures.tissue(), "drape": textures.cloth()}
     family = FAMILIES[appearance.family]
@@ -164,18 +192,47 @@ def draw_textures(appearance: Appearance) -> Mapping[str, Image]:
     }
 
 
+def _mixed(own: Image, other: Image, share: float) -> fields.Field:
+    """Return `own` with a share of `other`."""
+    first: fields.Field = np.asarray(own, np.float32)
+    second: fields.Field = np.asarray(other, np.float32)
+    mixed: fields.Field = first + np.float32(share) * (second - first)
+    return mixed
+
+
 def apply(source: mujoco.MjModel, model: mujoco.MjModel, appearance: Appearance) -> None:
     """Write an appearance into `model`, a copy of the compiled `source`, which is only read."""
-    for field in ("mat_rgba", "mat_specular", "mat_shininess", "mat_texid"):
-        getattr(model, field)[:] = getattr(source, field)
-    for field in LIGHT_FIELDS:
-        getattr(model, f"light_{field}")[:] = getattr(source, f"light_{field}")
-    for kind in ("ambient", "diffuse", "specular"):
-        getattr(model.vis.headlight, kind)[:] = getattr(source.vis.headlight, kind)
+    _write(source, model, appearance.family, appearance.seed)
+    if appearance.share:
+        own = [field.copy() for field in _fields(model)]
+        active = model.light_active.copy()
+        _write(source, model, appearance.other, appearance.other_seed)
+        for before, field in zip(own, _fields(model), strict=True):
+            field[:] = before + appearance.share * (field - before)
+        model.light_active[:] = np.maximum(active, model.light_active)
     model.numeric(NUMBERS).data[:] = appearance.numbers
-    if not appearance.family:
+
+
+def _fields(model: mujoco.MjModel) -> list[NDArray[np.float64]]:
+    """Return what of a model an appearance decides, but textures and which lights are on."""
+    headlight = model.vis.headlight
+    return [
+        *(model.mat_rgba, model.mat_specular, model.mat_shininess),
+        *(model.light_ambient, model.light_diffuse, model.light_specular),
+        *(model.light_dir, model.light_cutoff, model.light_exponent),
+        *(headlight.ambient, headlight.diffuse, headlight.specular),
+    ]
+
+
+def _write(source: mujoco.MjModel, model: mujoco.MjModel, family: str, seed: int) -> None:
+    """Write the look of a family into `model`."""
+    for field, compiled in zip(_fields(model), _fields(source), strict=True):
+        field[:] = compiled
+    model.mat_texid[:] = source.mat_texid
+    model.light_active[:] = source.light_active
+    if not family:
         return
-    look = draw_look(appearance)
+    look = draw_look(Appearance(family, seed))
     for name, material in look.materials.items():
         index = model.material(name).id
         model.mat_rgba[index, :3] = material.colour
@@ -232,8 +289,7 @@ def paint(model: mujoco.MjModel, context: mujoco.MjrContext) -> None:
 
 def _generator(appearance: Appearance, stream: int) -> np.random.Generator:
     """Return the generator of one part of an appearance."""
-    place, _ = appearance.numbers
-    return np.random.default_rng((int(place), appearance.seed, stream))
+    return np.random.default_rng((_place(appearance.family), appearance.seed, stream))
 
 
 def _between(rng: np.random.Generator, bounds: Bounds) -> float:

@@ -249,8 +249,11 @@ def add_distractors(spec: mujoco.MjSpec) -> None:
 
 
 def draw(litter: Litter) -> list[Thing]:
-    """Draw what lies about; fewer things than asked for only where no free place was found."""
-    rng = np.random.default_rng((litter.seed, litter.count))
+    """Draw what lies about: with one seed, fewer are the first of more.
+
+    There are fewer things than asked for only where no free place was found.
+    """
+    rng = np.random.default_rng(litter.seed)
     things: list[Thing] = []
     for _ in range(litter.count):
         for _ in range(len(KINDS)):

@@ -60,7 +60,7 @@ def add_materials(spec: mujoco.MjSpec) -> None:
             height=height,
             width=width,
         )
-    spec.add_numeric(name=appearance.NUMBERS, size=2, data=[0.0, 0.0])
+    spec.add_numeric(name=appearance.NUMBERS, size=5, data=[0.0] * 5)
     for name, values in MATERIALS.items():
         material = spec.add_material(name=name, **values)
         if name in ("tissue", "drape"):
@@ -92,6 +92,8 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
         name="endoscope",
         type=mujoco.mjtLightType.mjLIGHT_SPOT,
         active=False,
+        diffuse=[0.0, 0.0, 0.0],
+        specular=[0.0, 0.0, 0.0],
         attenuation=[SPOT_NEAR, 0.0, falloff],
         castshadow=True,
     )
