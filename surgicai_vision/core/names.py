@@ -35,9 +35,20 @@ ACTIVE_ARM = MappingProxyType(
 
 FIXED_CAMERAS = ("front", "front_right", "back")
 WRIST_CAMERAS = ("wrist_psm1", "wrist_psm2")
-CROPS = ("front_psm1", "front_psm2", "back_psm1", "back_psm2")
+ENDOSCOPE_CAMERAS = ("endo_left", "endo_right")
+"""The two eyes of a da Vinci endoscope."""
+CROPS = (
+    "front_psm1",
+    "front_psm2",
+    "back_psm1",
+    "back_psm2",
+    "endo_left_psm1",
+    "endo_left_psm2",
+    "endo_right_psm1",
+    "endo_right_psm2",
+)
 """Crops of a fixed camera's image about an arm's jaws (`scene.crops`)."""
-CAMERAS = (*FIXED_CAMERAS, *WRIST_CAMERAS, *CROPS)
+CAMERAS = (*FIXED_CAMERAS, *WRIST_CAMERAS, *CROPS[:4], *ENDOSCOPE_CAMERAS, *CROPS[4:])
 """Our cameras and crops; `core.cameras` knows those of other distributions too, and every view.
 
 A place in this tuple is a number of the camera's own (`core.cameras.camera_number`): append new

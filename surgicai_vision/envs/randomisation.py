@@ -40,6 +40,7 @@ RIGS = (
     ("back",),
     ("wrist_psm1",),
     ("wrist_psm2",),
+    ("endo_left", "endo_right"),
 )
 """Cameras that move as one, about the first. A camera of another distribution takes the draw of
 "front", about its own place. A crop is cut from what its camera sees, at the place that the nominal

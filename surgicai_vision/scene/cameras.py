@@ -6,9 +6,11 @@ world has the pixel `K (R p + t)` divided by its third component, with `K = intr
 t] = inverse(extrinsics(…))`.
 
 Sources: "front" is the left endoscope of SurgicAI's scene, moved as `ENDOSCOPE` says; "front_right"
-the right one; "back" the camera opposite to them. The surgical robotics challenge also puts a
-camera on each insertion link; there it looks along the shaft and sees little else, so ours stand
-off it and aim at the jaws.
+the right one; "back" the camera opposite to them. "endo_left" and "endo_right" are the eyes of a da
+Vinci Xi's endoscope in the same place, with its baseline, field of view and sensor. They stand
+beside SurgicAI's, whose names, toe-in and 4 : 3 image the comparison with its paper needs. The
+surgical robotics challenge also puts a camera on each insertion link; there it looks along the
+shaft and sees little else, so ours stand off it and aim at the jaws.
 
 A crop ("front_psm2" and its like, `scene.crops`) is no camera of the scene: it is a window of the
 image that its camera takes at a higher resolution. It has its camera's pose, and that camera's K
@@ -130,6 +132,18 @@ class Crop:
         """Add nothing: the camera whose image is cropped stands in the scene."""
 
 
+def look_at(direction: Vector, up: Vector) -> Array:
+    """Return the rotation (3, 3) of an OpenCV camera frame that looks along `direction`.
+
+    `up` shows upwards in its image.
+    """
+    forward: Array = np.array(direction, dtype=np.float64)
+    forward /= np.linalg.norm(forward)
+    right: Array = np.asarray(np.cross(forward, np.array(up, dtype=np.float64)), dtype=np.float64)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
 ENDOSCOPE = (-0.008, 0.100, 0.160)
 ENDOSCOPE_DIRECTION = (0.040, -0.451, -0.892)
 ENDOSCOPE_FOVY = 0.9
@@ -164,10 +178,46 @@ def _endoscope(side: float) -> CameraPose:
     )
 
 
+DA_VINCI_SIZE = (1024, 1280)
+"""Height and width of a da Vinci Xi's images [pixel] (EndoVis 2017)."""
+DA_VINCI_FOCAL = 1084.0
+"""Focal length of both its eyes [pixel]: 50.6° high and 61.1° wide.
+
+Source: a calibration of the da Vinci Xi of the EndoVis 2017 challenges (kidney boundary detection,
+data set 18, quoted in the README of ghattab/kidney-edge-detection): 1084.21, 1084.05 pixels left,
+1083.43, 1083.22 right. Both principal points lie 50 pixels inwards there, which shifts the images
+and changes no ray: left out, as is the lens's distortion (k1 below .001).
+"""
+DA_VINCI_FOVY = 2.0 * math.atan(DA_VINCI_SIZE[0] / 2.0 / DA_VINCI_FOCAL)
+"""Vertical field of view of its eyes [rad]."""
+DA_VINCI_BASELINE = 0.00435
+"""Distance between its eyes [m], whose axes are parallel to 0.07° (the same calibration)."""
+DA_VINCI_SHAFT = 0.0044
+"""Radius of its shaft [m]: an "8 mm endoscope" through an 8.8 mm cannula."""
+DA_VINCI_TILT = math.radians(30.0)
+"""Angle between its shaft and its axis [rad]: the 30° endoscope, looking down; there is one of 0°
+too. The shaft is not drawn: it comes from between the arms' ports, over both
+(`tests/scene/test_endoscope.py`)."""
+
+
+def _da_vinci(side: float) -> CameraPose:
+    """Return the left (side = 1) or the right (-1) eye, about SurgicAI's middle, axes parallel."""
+    rotation = look_at(ENDOSCOPE_DIRECTION, (0.0, 0.0, 1.0))
+    x, y, z = np.array(ENDOSCOPE) - rotation[:, 0] * side * DA_VINCI_BASELINE / 2.0
+    return CameraPose(
+        position=(float(x), float(y), float(z)),
+        direction=ENDOSCOPE_DIRECTION,
+        up=(0.0, 0.0, 1.0),
+        fovy=DA_VINCI_FOVY,
+    )
+
+
 FRONT = _endoscope(1.0)
 FRONT_RIGHT = _endoscope(-1.0)
 BACK = CameraPose((0.0, -0.0359, 0.1659), (0.0, 0.707, -0.707), (0.0, 0.707, 0.707), 0.8)
 """Poses in world; "back" stands where SurgicAI's does."""
+ENDO_LEFT = _da_vinci(1.0)
+ENDO_RIGHT = _da_vinci(-1.0)
 WRIST_PSM1 = WristCamera(PSM1)
 WRIST_PSM2 = WristCamera(PSM2)
 
@@ -207,18 +257,6 @@ def add_cameras(spec: mujoco.MjSpec, names: Iterable[str], instrument: str) -> N
     """Add the cameras called `names` to a scene with both arms."""
     for name in names:
         CAMERAS.load(name).add_to(spec, name, instrument)
-
-
-def look_at(direction: Vector, up: Vector) -> Array:
-    """Return the rotation (3, 3) of an OpenCV camera frame that looks along `direction`.
-
-    `up` shows upwards in its image.
-    """
-    forward: Array = np.array(direction, dtype=np.float64)
-    forward /= np.linalg.norm(forward)
-    right: Array = np.asarray(np.cross(forward, np.array(up, dtype=np.float64)), dtype=np.float64)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
 def intrinsics(

@@ -27,7 +27,7 @@ from surgicai_vision.scene.cameras import add_cameras
 from surgicai_vision.scene.visual import materials
 
 TIMESTEP = 0.002
-USER_DATA = 192
+USER_DATA = 208
 """Numbers the envs keep inside MuJoCo's state (goal, progress), so that one vector is the whole
 state.
 """

@@ -16,7 +16,15 @@ import math
 
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.names import PSM1, PSM2
-from surgicai_vision.scene.cameras import BACK, FRONT, CameraPose, Crop, Vector, Window
+from surgicai_vision.scene.cameras import (
+    BACK,
+    DA_VINCI_SIZE,
+    ENDOSCOPE,
+    FRONT,
+    Crop,
+    Vector,
+    Window,
+)
 
 SPAN = 0.050
 """Height of what a crop shows at the holes [m]: at 224 × 224 pixels 0.22 mm a pixel, where "front"
@@ -27,15 +35,20 @@ NEAREST = 0.001
 """Distance along the camera's axis [m] that a point has at least: none lies behind the lens."""
 
 
-def _crop(camera: str, pose: CameraPose, arm: str) -> Crop:
-    """Return the crop of one of our cameras about an arm's jaws."""
-    return Crop(camera, arm, math.dist(pose.position, CROPPED), SPAN)
+def _crops(camera: str, stand: Vector, aspect: float) -> tuple[Crop, Crop]:
+    """Return the crops about psm1 and psm2 of a camera that stands at a point in world [m]."""
+    distance = math.dist(stand, CROPPED)
+    first, second = (Crop(camera, arm, distance, SPAN, aspect) for arm in (PSM1, PSM2))
+    return first, second
 
 
-FRONT_PSM1 = _crop("front", FRONT, PSM1)
-FRONT_PSM2 = _crop("front", FRONT, PSM2)
-BACK_PSM1 = _crop("back", BACK, PSM1)
-BACK_PSM2 = _crop("back", BACK, PSM2)
+_SURGICAI = 640 / 480
+_DA_VINCI = DA_VINCI_SIZE[1] / DA_VINCI_SIZE[0]
+FRONT_PSM1, FRONT_PSM2 = _crops("front", FRONT.position, _SURGICAI)
+BACK_PSM1, BACK_PSM2 = _crops("back", BACK.position, _SURGICAI)
+# Both eyes' crops are of one scale: that of the middle between them.
+ENDO_LEFT_PSM1, ENDO_LEFT_PSM2 = _crops("endo_left", ENDOSCOPE, _DA_VINCI)
+ENDO_RIGHT_PSM1, ENDO_RIGHT_PSM2 = _crops("endo_right", ENDOSCOPE, _DA_VINCI)
 
 
 def whole_size(crop: Crop, fovy: float, height: int, width: int) -> tuple[int, int]:

@@ -1,10 +1,14 @@
-"""Visibility: at the end of a successful subtask both world views show the needle."""
+"""Visibility: at the end of a successful subtask the views of the world show the needle.
+
+"front", "back" and both eyes of the endoscope, and the crops of these about the active arm, in which
+it is larger.
+"""
 
 import pytest
 
 from surgicai_vision import envs
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.names import PARTS
+from surgicai_vision.core.names import ACTIVE_ARM, ENDOSCOPE_CAMERAS, PARTS
 from surgicai_vision.demos.expert import Expert
 
 SEEDS = range(8)
@@ -15,7 +19,8 @@ PIXELS = 25
 @pytest.mark.parametrize("task", ["grasp", "place", "insert", "handoff"])
 def test_the_needle_is_seen_at_the_end(task):
     env = envs.make(TaskConfig(task=task))
-    counts = {"front": [], "back": []}
+    crops = [f"{eye}_{ACTIVE_ARM[task]}" for eye in ENDOSCOPE_CAMERAS]
+    counts = {view: [] for view in ("front", "back", *ENDOSCOPE_CAMERAS, *crops)}
     for seed in SEEDS:
         env.reset(seed=seed)
         expert, info, ended = Expert(env), {}, False
@@ -29,3 +34,5 @@ def test_the_needle_is_seen_at_the_end(task):
     env.close()
     for camera, seen in counts.items():
         assert min(seen) >= PIXELS, (camera, seen)
+    for eye, crop in zip(ENDOSCOPE_CAMERAS, crops, strict=True):
+        assert min(counts[crop]) > 2 * min(counts[eye])
