@@ -1,6 +1,6 @@
 """Visibility: at the end of a successful subtask the views of the world show the needle.
 
-"front", "back" and both eyes of the endoscope, and the crops of these about the active arm, in which
+"front", "back" and both eyes of the endoscope, and the crops of these about the active arm, where
 it is larger.
 """
 
