@@ -1,7 +1,7 @@
 """Needle hold: soft tissue holds the needle's shaft at up to two places.
 
 Each hold ties a carrier, a point that slides along the needle's arc with friction, to an anchor in
-the tissue. A hold is an elastic spring across the shaft; its anchor gives way as
+the tissue. A hold is an elastic spring; its anchor gives way across the shaft as
 `TissueForces.give_way` says. One of the two can hold the middle of a path: its anchor then moves
 with the path, and keeps what it has given way.
 """
@@ -77,9 +77,12 @@ class NeedleHolds:
         self.rub(0.0, 0.0)
 
     def angle(self, index: int) -> float:
-        """Return the needle's angle at which it is held [rad]."""
-        angle: float = self._data.qpos.item(self._hinge[index])
-        return angle
+        """Return the angle of the needle's point that passes a hold [rad].
+
+        That is not the carrier's: by its friction the shaft drags the tissue along, before it
+        slides.
+        """
+        return self._arc.nearest(self._anchors[index])
 
     def anchor(self, index: int) -> Point:
         """Return where it is held, in the phantom's frame [m]."""

@@ -158,11 +158,14 @@ class NeedleArc:
         return self.at(self.tip_angle)
 
     def nearest(self, point: Point) -> float:
-        """Return the angle of the needle's point nearest to a point [rad]."""
+        """Return the angle of the needle's point nearest to a point [rad], in (-π/2, 3π/2]."""
         dx, dy, dz = (a - b for a, b in zip(point, self._centre, strict=True))
         u = self._u
         v = self._v
-        return math.atan2(v[0] * dx + v[1] * dy + v[2] * dz, -(u[0] * dx + u[1] * dy + u[2] * dz))
+        along = -(u[0] * dx + u[1] * dy + u[2] * dz)
+        across = v[0] * dx + v[1] * dy + v[2] * dz
+        # From the middle of the range, so that no angle of a needle is near the cut.
+        return math.pi / 2 - math.atan2(along, across)
 
     def towards(self, flank: int) -> float:
         """Return the cosine of the angle between the tip's direction and a flank's normal."""
