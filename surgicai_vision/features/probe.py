@@ -11,6 +11,9 @@ orientation is fitted as two columns of its matrix and put back among the rotati
 An episode's error is the median over its frames; reported is the median over episodes, with a
 percentile bootstrap over episodes. `chance` is the error of the mean pose of the episodes fitted
 on.
+
+A crop shows where the needle is beside the jaws, not where it is in the world. With
+`proprioception` the active arm's reported tip pose and jaw are read as well, as a policy has them.
 """
 
 from collections.abc import Sequence
@@ -83,6 +86,7 @@ def probe(
     dataset: Dataset,
     features: Sequence[Features],
     *,
+    proprioception: bool = False,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Probe:
@@ -90,7 +94,8 @@ def probe(
 
     Args:
         dataset: an opened dataset.
-        features: one entry of the cache per view.
+        features: one entry of the cache per view; none to probe proprioception alone.
+        proprioception: read the active arm's reported tip pose and jaw beside the features.
         seed: of the folds and of the bootstrap.
         progress: called with (folds done, folds in all).
 
@@ -100,8 +105,8 @@ def probe(
             dataset.
     """
     pose = _pose(dataset)
-    if not features:
-        raise InputError("A probe needs the features of at least one view.")
+    if not features and not proprioception:
+        raise InputError("A probe needs the features of at least one view, or proprioception.")
     for entry in features:
         if entry.manifest["dataset"] != dataset.fingerprint or len(entry.rows) != dataset.length:
             raise InputError(
@@ -109,7 +114,15 @@ def probe(
             )
     index = np.asarray(dataset.episode_index)
     rows = spread(index, FRAMES)
-    seen = np.concatenate([np.asarray(entry.rows[rows], np.float64) for entry in features], axis=1)
+    tables = [np.asarray(entry.rows[rows], np.float64).reshape(len(rows), -1) for entry in features]
+    if proprioception:
+        tables.append(np.asarray(dataset.columns()[names.STATE][rows], np.float64))
+    scale = np.sqrt(max(table.shape[1] for table in tables))
+    # Every table weighs as much as another, however many columns it has.
+    weights = np.concatenate(
+        [np.full(table.shape[1], scale / np.sqrt(table.shape[1])) for table in tables]
+    )
+    seen = np.concatenate(tables, axis=1)
     position, rotation = _targets(pose[rows])
     folds = _folds(index[rows], FOLDS, np.random.default_rng(seed))
     # Every episode is held out once; row 0 of the errors is the probe's, row 1 the mean pose's.
@@ -117,7 +130,7 @@ def probe(
     angle = np.empty((2, len(rows)))
     for done, fold in enumerate(np.unique(folds)):
         held = folds == fold
-        reader = _Reader(seen[~held], seen[held], folds[~held])
+        reader = _Reader(seen[~held], seen[held], folds[~held], weights)
         for at, answer in enumerate((reader.answer, reader.mean)):
             tip[at, held] = 1e3 * np.linalg.norm(answer(position[~held]) - position[held], axis=1)
             angle[at, held] = _angles(answer(rotation[~held]), rotation[held])
@@ -208,12 +221,15 @@ class _Reader:
         fitted: features of the rows fitted, (n, d).
         asked: features of the rows asked, (m, d).
         folds: fold of each row fitted, to choose a penalty on.
+        weights: what each feature's standard deviation becomes, (d,).
     """
 
-    def __init__(self, fitted: Array, asked: Array, folds: NDArray[np.int64]) -> None:
+    def __init__(
+        self, fitted: Array, asked: Array, folds: NDArray[np.int64], weights: Array
+    ) -> None:
         mean = fitted.mean(0)
         std = fitted.std(0)
-        std = np.where(std > SMALLEST_STD, std, np.inf)
+        std = np.where(std > SMALLEST_STD, std, np.inf) / weights
         fitted = (fitted - mean) / std
         asked = (asked - mean) / std
         gram = fitted @ fitted.T

@@ -88,6 +88,22 @@ def test_views_stand_side_by_side() -> None:
     assert both.tip.median < 0.2 * alone.tip.median
 
 
+def test_proprioception_places_what_a_crop_shows() -> None:
+    """Features that say where the tip is beside the jaws need to know where the jaws are."""
+    generator = np.random.default_rng(3)
+    dataset = Dataset()
+    position, _ = _targets(dataset.pose)
+    jaws = position + generator.normal(scale=0.02, size=position.shape)
+    state = np.concatenate([jaws, np.zeros((len(jaws), 4))], axis=1)
+    told = dataset.columns() | {names.STATE: state.astype(np.float32)}
+    dataset.columns = lambda: told  # type: ignore[method-assign]
+    mixing = generator.normal(size=(3, 200))
+    crop = [features(50 * (position - jaws) @ mixing, dataset)]
+    blind, alone = probe(dataset, [], proprioception=True), probe(dataset, crop)
+    both = probe(dataset, crop, proprioception=True)
+    assert both.tip.median < 0.1 * min(blind.tip.median, alone.tip.median)
+
+
 def test_dual_ridge_is_ridge_in_closed_form() -> None:
     generator = np.random.default_rng(0)
     fitted, asked, target = (generator.normal(size=shape) for shape in ((30, 8), (5, 8), (30, 2)))
