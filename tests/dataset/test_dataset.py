@@ -513,9 +513,8 @@ def test_recording_does_not_depend_on_the_workers(tmp_path, recorded):
 
 
 def test_rendering_does_not_depend_on_the_workers_and_equals_what_was_seen_live(tmp_path, recorded):
-    import surgicai_vision.envs as envs
-
-    options = {"size": 64, "depth": True, "segmentation": True}
+    views = ("front", "endo_left_psm2")
+    options = {"views": views, "size": 64, "depth": True, "segmentation": True}
     spawned = render_demos(recorded, tmp_path / "spawned", context=RunContext(2), **options)
     inline = render_demos(recorded, tmp_path / "inline", context=RunContext(0), **options)
     dataset = open_dataset(tmp_path / "spawned")
@@ -525,12 +524,12 @@ def test_rendering_does_not_depend_on_the_workers_and_equals_what_was_seen_live(
     # Live: the same seed and the recorded actions, looked at on the way.
     demo = read_demo(list_demos(recorded)[1])
     shown = {"obs_type": "pixels_agent_pos", "image_size": 64, "depth": True, "segmentation": True}
-    env = envs.make(demo.config, **shown)
+    env = envs.make(demo.config, cameras=views, **shown)
     observation, _ = env.reset(seed=demo.seed)
     row = int(np.flatnonzero(dataset.episode_index == 1)[0])
     columns = dataset.columns()
     for step, action in enumerate(demo.action):
-        for view in ("front", "back"):
+        for view in views:
             frame = row + step
             np.testing.assert_array_equal(
                 dataset.frames(view, frame, frame + 1)[0], observation[view]
