@@ -13,7 +13,6 @@ from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.evaluation.robustness.axes import AXES, shifted_config
 from surgicai_vision.evaluation.robustness.corruption import CORRUPTIONS, Moment
-from surgicai_vision.scene.rendering import FrameRenderer
 
 Image = NDArray[np.uint8]
 UNSEEN = ("latency",)
@@ -39,7 +38,7 @@ def axis_images(
     Args:
         config: the task.
         axis: a key of `AXES`.
-        view: the camera.
+        view: the camera or the crop.
         seed: of the start.
         size: height and width [pixel].
         quality: of `scene.rendering.QUALITIES`.
@@ -49,8 +48,7 @@ def axis_images(
     for strength in strengths:
         env = envs.make(shifted_config(config, AXES[axis], strength), obs_type="state")
         env.reset(seed=seed)
-        with FrameRenderer(env.model, size, size, quality) as renderer:
-            image = renderer.render(env.data, view).astype(np.uint8, copy=False)
+        image = env.image(view, (size, size), quality=quality).astype(np.uint8, copy=False)
         env.close()
         moment = Moment(seed, 0, camera_number(view))
         for kind in AXES[axis].images:
