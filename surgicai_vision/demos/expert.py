@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, UnreachablePose
 from surgicai_vision.core.plugins import resolve
 from surgicai_vision.demos.demonstrator import Demonstrator
-from surgicai_vision.envs import poses
+from surgicai_vision.envs import control, poses
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.envs.geometry import (
@@ -32,6 +32,7 @@ from surgicai_vision.envs.geometry import (
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.holes import SURFACE
+from surgicai_vision.scene.kinematics import forward_flat, inverse_flat
 from surgicai_vision.scene.rotations import matrix_to_rotvec, rotvec_to_matrix
 
 Matrix = NDArray[np.float64]
@@ -51,6 +52,9 @@ CLOSING_ANGLE = math.radians(20.0)
 """Off by less than this, jaws that are closing go on closing [m, rad]."""
 CLEAR = 0.004
 """Height of the needle's lowest point over the tissue at which it may turn and travel [m]."""
+LIFT = 0.01
+"""How far above its place the tool is sent to lift the needle [m]; where no joint limit is in the
+way."""
 OUTSIDE = 0.006
 """How far before the entry the tip gets into line [m]."""
 DRIVE = math.radians(1.8)
@@ -60,6 +64,8 @@ LEAD = math.radians(9.0)
 BLOCKED = 0.001
 """A needle this far off its path [m] is blocked: in `3dmed_straight` PSM2's wrist touches the
 ridge's steep flank."""
+WAYPOINTS = (0.2, 0.4, 0.6, 0.8, 1.0)
+"""Shares of a straight way at which its joints are checked."""
 HANDOFF_OFFSET = math.radians(4.0)
 """The expert grasps the needle a little nearer to the tip than the goal, away from the tissue."""
 
@@ -124,9 +130,11 @@ class WorldState:
         task_state: the task's state beyond MuJoCo's.
         step: the step sizes of an action.
         base: T_world_base of the active arm.
+        instrument: its instrument.
         needle: T_world_needle.
         tip: T_world_tip of the active arm.
-        command: T_world_tip that the active arm is commanded to.
+        told: what the active arm is commanded to, in its own view.
+        command: T_world_tip that this really is.
         command_jaw: commanded jaw angle [rad].
         holds: whether the active arm's jaws hold the needle.
     """
@@ -138,9 +146,11 @@ class WorldState:
         self.task_state = simulation.task_state
         self.step = StepSize.of(env.config.step)
         self.base = poses.square(simulation.bases[self.arm])
+        self.instrument = env.config.scene.instrument
         self.needle = poses.square(simulation.needle())
         self.tip = poses.square(simulation.tip(self.arm))
         command = simulation.pending(self.arm, self.step)
+        self.told = command
         self.command = self.base @ poses.square(simulation.true_pose(self.arm, command))
         self.command_jaw = command.jaw
         self.holds = simulation.holds(self.arm)
@@ -167,8 +177,10 @@ def action_towards(world: WorldState, target: ToolTarget) -> NDArray[np.float32]
     from it may be off without letting go. (With a label of 0, its small errors add up: 7 of 50
     learned placings dropped the needle.)
     """
-    move = command_error(world, target.tip)
-    move /= max(1.0, float(np.abs(move).max()))
+    way = command_error(world, target.tip)
+    move = way / max(1.0, float(np.abs(way).max()))
+    if not is_free(world, way):
+        move = move_of_joints(world, target.tip, move)
     jaw = (
         -1.0
         if target.jaw <= 0.0
@@ -177,12 +189,55 @@ def action_towards(world: WorldState, target: ToolTarget) -> NDArray[np.float32]
     return np.append(move, jaw).astype(np.float32)
 
 
+def is_free(world: WorldState, way: Matrix) -> bool:
+    """Return True if no joint limit is in a straight way (6,) in step sizes from the command."""
+    steps = max(1.0, float(np.abs(way).max()))
+    near = world.told.joints
+    for share in (1.0 / steps, *WAYPOINTS):
+        action = [*(share * way).tolist(), 0.0]
+        pose = control.moved(world.told.pose, action, world.step)
+        try:
+            near = inverse_flat(pose, world.instrument, near)
+        except UnreachablePose:
+            return False
+    return True
+
+
+def move_of_joints(world: WorldState, tip: Matrix, otherwise: Matrix) -> Matrix:
+    """Return a move (6,) in step sizes on the straight way of the joints to T_world_tip.
+
+    No joint limit is ever in that way. `otherwise` is returned where the pose cannot be reached.
+    """
+    to_base = np.linalg.inv(world.base)
+    try:
+        now, then = (
+            np.array(inverse_flat(poses.flat(to_base @ pose), world.instrument, world.told.joints))
+            for pose in (world.command, tip)
+        )
+    except UnreachablePose:
+        return otherwise
+    share = 1.0
+    while True:
+        joints = np.array(world.told.joints) + share * (then - now)
+        pose = forward_flat(tuple(joints.tolist()), world.instrument)
+        move = error_in_base(poses.square(world.told.pose), poses.square(pose), world.step)
+        largest = float(np.abs(move).max())
+        if largest <= 1.0:
+            return move
+        share *= 0.99 / largest
+
+
 def command_error(world: WorldState, tip: Matrix) -> Matrix:
     """Return the way from the command to T_world_tip in step sizes and the base's axes, (6,)."""
-    inverse = world.base[:3, :3].T
-    shift = inverse @ (tip[:3, 3] - world.command[:3, 3]) / world.step.translation
-    turn = matrix_to_rotvec(inverse @ tip[:3, :3] @ world.command[:3, :3].T @ world.base[:3, :3])
-    return np.concatenate([shift, turn / world.step.rotation])
+    to_base = np.linalg.inv(world.base)
+    return error_in_base(to_base @ world.command, to_base @ tip, world.step)
+
+
+def error_in_base(pose: Matrix, goal: Matrix, step: StepSize) -> Matrix:
+    """Return the way from T_base_tip `pose` to `goal` in step sizes and the base's axes, (6,)."""
+    shift = (goal[:3, 3] - pose[:3, 3]) / step.translation
+    turn = matrix_to_rotvec(goal[:3, :3] @ pose[:3, :3].T) / step.rotation
+    return np.concatenate([shift, turn])
 
 
 def _angle_between(a: Matrix, b: Matrix) -> float:
@@ -280,10 +335,11 @@ def _place(world: WorldState) -> ToolTarget:
     goal = world.stitch.place()
     outward = world.stitch.pair.entry.rotation[:, 2]
     line = world.needle[:3, :3] @ world.needle_line.T + world.needle[:3, 3:4]
-    if float(line[2].min()) < SURFACE + CLEAR and _angle_between(world.needle, goal) > math.radians(
-        20.0
-    ):
-        return ToolTarget(_shifted(world.command, np.array([0.0, 0.0, 0.01])), 0.0)
+    is_low = float(line[2].min()) < SURFACE + CLEAR
+    if is_low and _angle_between(world.needle, goal) > math.radians(20.0):
+        lifted = _shifted(world.command, np.array([0.0, 0.0, LIFT]))
+        if is_free(world, command_error(world, lifted)):
+            return ToolTarget(lifted, 0.0)
     offset = line[:, -1] - np.asarray(world.stitch.pair.entry.centre)
     beside = float(np.linalg.norm(offset - (offset @ outward) * outward))
     away = (

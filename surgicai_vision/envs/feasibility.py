@@ -4,8 +4,8 @@
 
 * Room for PSM2's jaws at the end of the insertion (`geometry`): every pair that may be sewn, with
   the smallest needle of every arc that may be drawn.
-* Reach: the joints of both arms along the needle's whole way, and at the grasp of a needle that
-  lies on the tissue, for the corners of the phantom's places.
+* Reach: the joints of both arms along the needle's whole way, with nominal grasps, for the corners
+  of the phantom's places. (A start whose own, imperfect grasp is out of reach is drawn again.)
 * View: with the phantom's place varied, both holes stay in the image of `VIEW`.
 
 Within the limits of `core.config` the layout `simple` with instrument 400006 passes the last two
@@ -30,22 +30,16 @@ from surgicai_vision.core.config import (
 )
 from surgicai_vision.core.errors import InputError, UnreachablePose
 from surgicai_vision.core.names import PSM1, PSM2
-from surgicai_vision.envs import poses
-from surgicai_vision.envs.geometry import EXTRA, INSERT_DEPTH, Stitch, grasp_in_needle
+from surgicai_vision.envs.geometry import Stitch, grasp_in_needle
 from surgicai_vision.envs.placement import SLIDE, Placement
 from surgicai_vision.envs.randomisation import TIP_ANGLES
+from surgicai_vision.envs.reach import extraction, insertion, joints_along
 from surgicai_vision.envs.starts import GRASP_ANGLES
-from surgicai_vision.scene import build_scene, kinematics, needle
+from surgicai_vision.scene import build_scene, needle
 from surgicai_vision.scene.holes import PAIRS, HolePair
-from surgicai_vision.scene.kinematics import Joints
 
 VIEW = "front"
 """The camera in whose image the holes must stay: the endoscope."""
-WAY = 9
-"""Places along the needle's way at which the joints are checked."""
-OUT = math.radians(12.0)
-"""How far past the exit the pull-out turns the needle's base [rad] (`demos.expert`)."""
-
 
 def refuse_impossible(config: TaskConfig, through: bool) -> None:
     """Refuse a task that geometry forbids for something that may be drawn.
@@ -201,12 +195,18 @@ def _refuse_unreachable(scene: SceneConfig, axes: RandomisationConfig) -> None:
     angles = [TIP_ANGLES[arc] for arc in _arcs(axes)]
     for where, size, tip_angle in itertools.product(corners(scene, axes), sizes, angles):
         stitch = Stitch.of(_placed(scene, where), needle.RADIUS * size, tip_angle)
-        for arm, tips in (
-            *((PSM2, insertion(stitch, angle)) for angle in stitch.grasps(*GRASP_ANGLES)),
-            (PSM1, extraction(stitch)),
+        low, high = (
+            grasp_in_needle(PSM2, angle, radius=stitch.radius)
+            for angle in stitch.grasps(*GRASP_ANGLES)
+        )
+        taken = grasp_in_needle(PSM1, stitch.handoff_angle, radius=stitch.radius)
+        for arm, way in (
+            (PSM2, insertion(stitch, low)),
+            (PSM2, insertion(stitch, high)),
+            (PSM1, extraction(stitch, taken)),
         ):
             try:
-                follow(arm, tips, scene.instrument)
+                joints_along(arm, way, scene.instrument)
             except UnreachablePose as error:
                 x, y = where.shift
                 raise InputError(
@@ -216,35 +216,3 @@ def _refuse_unreachable(scene: SceneConfig, axes: RandomisationConfig) -> None:
                     f"{math.degrees(tip_angle):.0f}°: {error} Allowed: a smaller phantom_turn, "
                     "phantom_shift or needle_size, or a shorter needle_arc."
                 ) from error
-
-
-def insertion(stitch: Stitch, angle: float) -> list[NDArray[np.float64]]:
-    """Return T_world_tip (4, 4) along the insertion by a grasp at `angle` [rad]."""
-    grasp = grasp_in_needle(PSM2, angle, radius=stitch.radius)
-    last = stitch.angle_at_entry(stitch.insert_angle, INSERT_DEPTH + EXTRA)
-    return [stitch.place() @ grasp] + [
-        stitch.on_arc(at) @ grasp for at in np.linspace(stitch.tip_angle, last, WAY)
-    ]
-
-
-def extraction(stitch: Stitch) -> list[NDArray[np.float64]]:
-    """Return T_world_tip (4, 4) along the pull-out by the nominal grasp."""
-    grasp = grasp_in_needle(PSM1, stitch.handoff_angle, radius=stitch.radius)
-    first = stitch.angle_at_entry(stitch.insert_angle, INSERT_DEPTH + EXTRA)
-    last = -2 * stitch.half - OUT
-    way = [stitch.on_arc(at) @ grasp for at in np.linspace(first, last, WAY)]
-    return [*way, stitch.pulled() @ grasp]
-
-
-def follow(arm: str, tips: list[NDArray[np.float64]], instrument: str) -> list[Joints]:
-    """Return an arm's joints along T_world_tip (4, 4), each found from the one before.
-
-    Raises:
-        UnreachablePose: past a joint limit.
-    """
-    from_world = np.linalg.inv(kinematics.base_in_world(arm))
-    joints: list[Joints] = []
-    for tip in tips:
-        pose = poses.flat(from_world @ tip)
-        joints.append(kinematics.inverse_flat(pose, instrument, joints[-1] if joints else None))
-    return joints

@@ -10,6 +10,7 @@ from surgicai_vision.core.names import PSM2
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import Stitch, needle_frame_flat
 from surgicai_vision.envs.place import draw_psm2_grasp
+from surgicai_vision.envs.reach import insertion, is_followed
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import about_point, draw_rotation, hold_needle
 from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
@@ -36,13 +37,17 @@ class Insert(Subtask):
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the needle with its tip near the entry, outside the tissue."""
         nominal = stitch.place()
-        tip = nominal[:3, :3] @ needle.point(stitch.tip_angle, stitch.radius) + nominal[:3, 3]
+        point = nominal[:3, :3] @ needle.point(stitch.tip_angle, stitch.radius) + nominal[:3, 3]
         shift = draw_in_ball(rng, START_SHIFT)
         outward = stitch.pair.entry.rotation[:, 2]
         if shift @ outward < -0.0005:
             shift = shift - 2 * (shift @ outward) * outward
-        needle_pose = about_point(nominal, tip, draw_rotation(rng, START_TURN), shift)
-        held = hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch))
+        needle_pose = about_point(nominal, point, draw_rotation(rng, START_TURN), shift)
+        tip = draw_psm2_grasp(rng, needle_pose, stitch)
+        way = insertion(stitch, np.linalg.inv(needle_pose) @ tip)
+        if not is_followed(PSM2, way, simulation.scene.config.instrument):
+            return False
+        held = hold_needle(simulation, PSM2, needle_pose, tip)
         return held and not simulation.touches_phantom(needle=True)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:

@@ -10,6 +10,7 @@ from surgicai_vision.core.names import PSM2
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import Stitch, needle_frame_flat
 from surgicai_vision.envs.grasp import lying_needle
+from surgicai_vision.envs.reach import is_followed
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import (
     GRASP_ANGLES,
@@ -60,7 +61,11 @@ class Place(Subtask):
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the needle that still lies on the tissue."""
         needle_pose = lying_needle(simulation, stitch, rng)
-        return hold_needle(simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch))
+        tip = draw_psm2_grasp(rng, needle_pose, stitch)
+        goal = stitch.place() @ np.linalg.inv(needle_pose) @ tip
+        if not is_followed(PSM2, [goal], simulation.scene.config.instrument):
+            return False
+        return hold_needle(simulation, PSM2, needle_pose, tip)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at its tip and that frame in the entry."""

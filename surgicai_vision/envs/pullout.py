@@ -5,11 +5,13 @@ from types import MappingProxyType
 
 import numpy as np
 
+from surgicai_vision.core.errors import UnreachablePose
 from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import Stitch, needle_frame_flat
 from surgicai_vision.envs.handoff import STRAIGHT, inserted_needle
 from surgicai_vision.envs.place import draw_psm2_grasp
+from surgicai_vision.envs.reach import extraction, is_followed
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.starts import draw_grasp_error, grasp_pose, hold_needle
 from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
@@ -42,9 +44,15 @@ class Pullout(Subtask):
         simulation.task_state.holes_passed = 2
         away = draw_psm2_grasp(rng, needle_pose, stitch)
         away[:3, 3] -= RETREAT * away[:3, 2]
-        simulation.pose_arm(PSM2, simulation.to_base(PSM2, poses.flat(away)), RELEASED_JAW)
+        try:
+            simulation.pose_arm(PSM2, simulation.to_base(PSM2, poses.flat(away)), RELEASED_JAW)
+        except UnreachablePose:
+            return False
         error = draw_grasp_error(rng, GRASP_SHIFT, GRASP_TILT)
         grasp = grasp_pose(PSM1, needle_pose, stitch.handoff_angle, error, stitch.radius)
+        way = extraction(stitch, np.linalg.inv(needle_pose) @ grasp)
+        if not is_followed(PSM1, way, simulation.scene.config.instrument):
+            return False
         held = hold_needle(simulation, PSM1, needle_pose, grasp, STRAIGHT)
         return held and not simulation.touches_phantom(needle=False)
 

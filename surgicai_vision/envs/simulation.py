@@ -49,6 +49,9 @@ RELEASE_JAW = 0.1
 """How far its jaw opens a step [rad], to 0.5 rad."""
 RELEASE_SHIFT = 0.001
 """How far it is then drawn back a step [m]."""
+BESIDE = 0.015
+"""How far beside the exit PSM1 starts at least [m], 27 mm in the scene's own place. Draws of its
+start and of the phantom that would put it nearer, in the way of PSM2, are moved out."""
 
 
 _COMMANDS = TaskState.SIZE
@@ -113,10 +116,7 @@ class Simulation:
         self.data.time = CLOCK_START
         self.task_state = TaskState()
         for arm in names.ARMS:
-            start = kinematics.start_in_base(arm)
-            to_base = kinematics.base_in_world(arm)[:3, :3].T
-            start[:3, 3] += to_base @ randomisation.start_shift(self.draws, arm)
-            self.pose_arm(arm, poses.flat(start), kinematics.STARTS[arm].jaw)
+            self.pose_arm(arm, poses.flat(self._start(arm)), kinematics.STARTS[arm].jaw)
         if self._own:
             self.data.userdata[_DRAWS:_WELDS] = self.draws
         if self._welds:
@@ -124,6 +124,19 @@ class Simulation:
         if self.tissue:
             self.tissue.clear()
         self.refresh()
+
+    def _start(self, arm: str) -> NDArray[np.float64]:
+        """Return T_base_tip (4, 4) of an arm at the start; PSM1 leaves the stitch to PSM2."""
+        start = kinematics.start_in_base(arm)
+        base = kinematics.base_in_world(arm)
+        shift = randomisation.start_shift(self.draws, arm)
+        if arm == names.PSM1:
+            tip = (base @ start)[:3, 3] + shift
+            leave = self.pair.exit
+            beside = np.array([math.cos(leave.turn), math.sin(leave.turn), 0.0])
+            shift = shift + max(0.0, BESIDE - beside @ (tip - leave.centre)) * beside
+        start[:3, 3] += base[:3, :3].T @ shift
+        return start
 
     def randomise(self, draws: randomisation.Draws) -> None:
         """Apply one episode's randomisation to the model; `reset` or `refresh` must follow.

@@ -1,0 +1,61 @@
+"""Reach: whether an arm's joints can follow the needle's way through the tissue.
+
+A way is a list of T_world_tip (4, 4) of the arm that holds the needle by a grasp T_needle_tip.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core.errors import UnreachablePose
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.geometry import EXTRA, INSERT_DEPTH, Stitch
+from surgicai_vision.scene import kinematics
+from surgicai_vision.scene.kinematics import Joints
+
+Matrix = NDArray[np.float64]
+
+PLACES = 9
+"""Places along the circle at which the joints are found."""
+OUT = math.radians(12.0)
+"""How far past the exit the pull-out turns the needle's base [rad]."""
+
+
+def insertion(stitch: Stitch, grasp: Matrix) -> list[Matrix]:
+    """Return the way of PSM2 from the entry to the end of the insertion, by T_needle_tip."""
+    last = stitch.angle_at_entry(stitch.insert_angle, INSERT_DEPTH + EXTRA)
+    circle = [stitch.on_arc(at) @ grasp for at in np.linspace(stitch.tip_angle, last, PLACES)]
+    return [stitch.place() @ grasp, *circle]
+
+
+def extraction(stitch: Stitch, grasp: Matrix) -> list[Matrix]:
+    """Return the way of PSM1 from there to the end of the pull-out, by T_needle_tip."""
+    first = stitch.angle_at_entry(stitch.insert_angle, INSERT_DEPTH + EXTRA)
+    last = -2 * stitch.half - OUT
+    circle = [stitch.on_arc(at) @ grasp for at in np.linspace(first, last, PLACES)]
+    return [*circle, stitch.pulled() @ grasp]
+
+
+def joints_along(arm: str, way: Sequence[Matrix], instrument: str) -> list[Joints]:
+    """Return an arm's joints along a way, each found from the one before.
+
+    Raises:
+        UnreachablePose: past a joint limit.
+    """
+    from_world = np.linalg.inv(kinematics.base_in_world(arm))
+    joints: list[Joints] = []
+    for tip in way:
+        pose = poses.flat(from_world @ tip)
+        joints.append(kinematics.inverse_flat(pose, instrument, joints[-1] if joints else None))
+    return joints
+
+
+def is_followed(arm: str, way: Sequence[Matrix], instrument: str) -> bool:
+    """Return True if no joint limit of the arm is in the way."""
+    try:
+        joints_along(arm, way, instrument)
+    except UnreachablePose:
+        return False
+    return True
