@@ -2,9 +2,12 @@
 
     python benchmarks/expert.py --task all --episodes 500
     python benchmarks/expert.py --task suture --episodes 200 --thread 10
+    python benchmarks/expert.py --randomisation world --seed 500000
+    python benchmarks/expert.py --randomisation pair=any,phantom_turn=10
 
 `all` are the five subtasks. Episodes whose physics diverged count as failures and are counted
-apart.
+apart. `--randomisation world` draws all that is geometry at once, each axis as far as geometry
+allows (`WORLD`).
 """
 
 import argparse
@@ -14,10 +17,29 @@ from common import chunks, emit, median, spread
 
 from surgicai_vision import envs
 from surgicai_vision.core import names
-from surgicai_vision.core.config import SceneConfig, TaskConfig, to_mapping
+from surgicai_vision.core.config import (
+    RandomisationConfig,
+    SceneConfig,
+    TaskConfig,
+    from_mapping,
+    read_changes,
+    to_mapping,
+)
 from surgicai_vision.core.errors import SurgicaiError
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.evaluation.statistics import clopper_pearson
+
+WORLD = RandomisationConfig(
+    phantom_shift=10.0,
+    phantom_turn=15.0,
+    pair="any",
+    needle_size=0.16,
+    needle_arc="any",
+    needle_thickness=0.3,
+    robot_start=15.0,
+)
+"""A world that varies: every geometric axis at its limit. The needle's size is the largest that
+leaves PSM2's jaws room in every pair with a needle of a third of a circle."""
 
 
 class Job(NamedTuple):
@@ -80,6 +102,14 @@ def table(config: TaskConfig, episodes: list[Episode]) -> dict[str, Any]:
     }
 
 
+def read_randomisation(text: str) -> RandomisationConfig:
+    """Read "", "world" or "axis=value,…"."""
+    if text == "world":
+        return WORLD
+    changes = read_changes(text.split(",")) if text else {}
+    return from_mapping(RandomisationConfig, changes, "--randomisation")
+
+
 def main() -> None:
     """Play and print one JSON line."""
     parser = argparse.ArgumentParser(
@@ -96,6 +126,7 @@ def main() -> None:
     parser.add_argument("--tissue-forces", default="phantom", choices=names.TISSUE_FORCES)
     parser.add_argument("--step", default="paper")
     parser.add_argument("--tolerance", default="paper")
+    parser.add_argument("--randomisation", default="", help='"world", or axis=value,…')
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
     scene = SceneConfig(
@@ -107,7 +138,10 @@ def main() -> None:
         tissue_forces=chosen.tissue_forces,
     )
     tasks = names.SUBTASKS if chosen.task == "all" else (chosen.task,)
-    configs = [TaskConfig(task, scene, chosen.step, chosen.tolerance) for task in tasks]
+    axes = read_randomisation(chosen.randomisation)
+    configs = [
+        TaskConfig(task, scene, chosen.step, chosen.tolerance, randomisation=axes) for task in tasks
+    ]
     jobs = [
         Job(config, seeds) for config in configs for seeds in chunks(chosen.seed, chosen.episodes)
     ]
@@ -118,7 +152,10 @@ def main() -> None:
         )
         for config in configs
     }
-    emit("expert", {"seed": chosen.seed, "scene": to_mapping(scene), "tasks": rows})
+    row = {"seed": chosen.seed, "scene": to_mapping(scene), "tasks": rows}
+    if axes.on:
+        row["randomisation"] = {axis: to_mapping(axes)[axis] for axis in axes.on}
+    emit("expert", row)
 
 
 if __name__ == "__main__":

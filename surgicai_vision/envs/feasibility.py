@@ -41,6 +41,7 @@ from surgicai_vision.scene.holes import PAIRS, HolePair
 VIEW = "front"
 """The camera in whose image the holes must stay: the endoscope."""
 
+
 def refuse_impossible(config: TaskConfig, through: bool) -> None:
     """Refuse a task that geometry forbids for something that may be drawn.
 
