@@ -84,6 +84,12 @@ class NeedleHolds:
         """
         return self._arc.nearest(self._anchors[index])
 
+    def drag(self, index: int) -> float:
+        """Return the force with which the shaft drags the tissue along, towards the tip [N]."""
+        carrier: float = self._data.qpos.item(self._hinge[index])
+        way = self._arc.radius * (carrier - self.angle(index))
+        return self._forces.lateral_stiffness * way
+
     def anchor(self, index: int) -> Point:
         """Return where it is held, in the phantom's frame [m]."""
         return self._anchors[index]

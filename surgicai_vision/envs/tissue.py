@@ -67,6 +67,10 @@ SEARCH = 0.005
 """How far from the tip along the arc the skin can be where it is pierced [m]."""
 FRONT = 0.0001
 """A tip that is this near to its furthest way [m] is cutting."""
+SLIDING = 0.97
+"""Share of the force at which the shaft slides, from which it does."""
+HIGHEST = 0.003
+"""How far the tip lifts the skin at most, however little it is pushed [m]."""
 LEAVING = 0.0002
 """Embedded length [m] below which the needle is out."""
 
@@ -337,18 +341,28 @@ class Tissue:
             self._extend_path()
             passage.depth = max(passage.depth, -self._ridge.height(tip))
             passage.length = length
-        resistance = forces.friction * length
+        lifting, height = self._lifted()
+        resistance = forces.friction * max(length - height, 0.0)
         if is_cutting:
             resistance += forces.cutting
-            piece = self._ridge.nearest_piece(tip)
-            for leaving in (2 * piece, 2 * piece + 1):
-                height = self._ridge.over(leaving, tip)
-                if height > 0.0 and self._arc.towards(leaving) > OUTWARD:
-                    if height >= forces.dent_out and self._come_out(leaving):
-                        return
-                    resistance += min(forces.skin_stiffness * height, forces.puncture_out)
+            if height > 0.0:
+                # The skin lets the tip through when the shaft no longer drags the tissue along.
+                is_pushed = self._holds.drag(0) > SLIDING * (resistance + forces.puncture_out)
+                if (is_pushed or height > HIGHEST) and self._come_out(lifting):
+                    return
+                resistance += min(forces.skin_stiffness * height, forces.puncture_out)
         self._holds.hold_middle(1, self._path, 0.5 * min(length / self._front, 1.0))
         self._holds.rub(resistance, 0.0)
+
+    def _lifted(self) -> tuple[int, float]:
+        """Return the flank that the tip lifts from inside, and how far [m]; none where it is 0."""
+        tip = self._arc.tip
+        first = 2 * self._ridge.nearest_piece(tip)
+        for flank in (first, first + 1):
+            height = self._ridge.over(flank, tip)
+            if height > 0.0 and self._arc.towards(flank) > OUTWARD:
+                return flank, height
+        return NO_FLANK, 0.0
 
     def _come_out(self, flank: int) -> bool:
         """Go through the skin from inside; return False where the arc does not cross it."""

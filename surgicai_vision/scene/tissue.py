@@ -100,11 +100,6 @@ class TissueForces:
         """
         return self.puncture_in / self.skin_stiffness - needle.TIP_RADIUS
 
-    @property
-    def dent_out(self) -> float:
-        """Return how far the tip lifts the skin from inside before it goes through [m]."""
-        return self.puncture_out / self.skin_stiffness
-
     def give_way(self, distance: float, yielded: float) -> tuple[float, float, bool]:
         """Return how an anchor gives way to what it holds, across shaft or thread.
 
@@ -138,9 +133,9 @@ FORCES = MappingProxyType(
             puncture_out=1.0,
             cutting=0.1,
             friction=75.0,
-            lateral_stiffness=500.0,
+            lateral_stiffness=1000.0,
             yield_force=1.5,
-            hardening=500.0,
+            hardening=1000.0,
             tear_force=3.0,
             thread_friction=20.0,
         ),
@@ -151,9 +146,9 @@ FORCES = MappingProxyType(
             puncture_out=0.7,
             cutting=0.15,
             friction=60.0,
-            lateral_stiffness=800.0,
+            lateral_stiffness=1500.0,
             yield_force=3.2,
-            hardening=800.0,
+            hardening=1500.0,
             tear_force=6.0,
             thread_friction=25.0,
         ),
@@ -164,9 +159,9 @@ FORCES = MappingProxyType(
             puncture_out=0.4,
             cutting=0.05,
             friction=25.0,
-            lateral_stiffness=200.0,
+            lateral_stiffness=300.0,
             yield_force=0.4,
-            hardening=200.0,
+            hardening=300.0,
             tear_force=1.0,
             thread_friction=8.0,
         ),

@@ -268,12 +268,12 @@ def _at(shift):
 def test_beyond_the_yield_force_a_part_stays_and_the_needle_is_pulled_back():
     simulation, circle, angle = driven_to(THROUGH)
     pose = circle.pose(angle)
-    shift = np.array([0.0, 0.005, 0.0])
+    shift = np.array([0.0, 0.003, 0.0])
     largest = pushed(simulation, pose, shift)
-    hardened = PHANTOM.yield_force + 0.5 * (PHANTOM.lateral_stiffness * 0.005 - PHANTOM.yield_force)
+    hardened = PHANTOM.yield_force + 0.5 * (PHANTOM.lateral_stiffness * 0.003 - PHANTOM.yield_force)
     assert largest == pytest.approx(2 * hardened, rel=0.1)
     pushed(simulation, pose + _at(shift), -shift)
-    stayed = (0.005 - PHANTOM.yield_force / PHANTOM.lateral_stiffness) / 2
+    stayed = (0.003 - PHANTOM.yield_force / PHANTOM.lateral_stiffness) / 2
     assert force_across(simulation, 25) == pytest.approx(
         2 * PHANTOM.lateral_stiffness * stayed, rel=0.2
     )
@@ -283,7 +283,7 @@ def test_beyond_the_yield_force_a_part_stays_and_the_needle_is_pulled_back():
 def test_at_the_tear_force_it_tears_and_the_force_drops():
     simulation, circle, angle = driven_to(THROUGH)
     pose = circle.pose(angle)
-    largest = pushed(simulation, pose, np.array([0.0, 0.0105, 0.0]))
+    largest = pushed(simulation, pose, np.array([0.0, 0.006, 0.0]))
     tissue = simulation.tissue
     assert tissue.tears >= 2 and tissue.bite.tears == tissue.tears
     assert largest < 2.3 * PHANTOM.tear_force

@@ -35,7 +35,7 @@ def driven(scene: SceneConfig, draws: tuple[float, ...] | None = None) -> Simula
     )
     weld.name1, weld.name2 = "needle", "hand"
     weld.data[:11] = [0.0] * 6 + [1.0] + [0.0] * 3 + [1.0]
-    weld.solref, weld.solimp = [0.004, 1.0], [0.999, 0.9999, 0.0001, 0.5, 2.0]
+    weld.solref, weld.solimp = [0.004, 1.0], [0.9999, 0.99999, 0.0001, 0.5, 2.0]
     whole = dataclasses.replace(build_scene(scene), model=spec.compile())
     simulation = Simulation(whole, own_model=True)
     if draws is not None:
