@@ -58,10 +58,12 @@ COMMANDS = MappingProxyType(
         "probe": "Read the needle's pose from frozen features by a linear probe.",
         "cache": "List, measure or prune the cached features.",
         "train": "Train a policy on a dataset's features.",
+        "policies": "List the policies that come with the product.",
         "policy": "Share a trained policy.",
         "evaluate": "Run a policy from held-out starts and count successes.",
         "robustness": "Run a policy while light, cameras, images or the arm shift.",
         "sweep": "Encode, train and evaluate every run of a grid.",
+        "release": "Build the policies that come with the product, from nothing.",
         "report": "Write the report of stored results.",
         "completion": "Print the script that completes commands and options in a shell.",
     }

@@ -48,8 +48,8 @@ class Options:
     """Options of `evaluate`.
 
     Attributes:
-        policy: A checkpoint folder, a hierarchical.yaml, module:factory, or expert, replay, random
-            or zero.
+        policy: A checkpoint folder, a hierarchical.yaml, released:NAME (see `policies`),
+            module:factory, or expert, replay, random or zero.
         task: The task.
         episodes: Number of episodes.
         seed: Seed of the first start; each episode takes the next.
@@ -171,8 +171,9 @@ def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:
         variants_of,
     )
     from surgicai_vision.evaluation.hierarchical import SUFFIXES
+    from surgicai_vision.training.released import resolve
 
-    path = Path(options.policy)
+    path = resolve(options.policy)
     if path.suffix not in SUFFIXES:
         raise InputError(
             f"--expert-swap {ALL} is for the YAML file of a hierarchical policy; leave it out."

@@ -1,5 +1,6 @@
 """`quickstart`: run the whole flow once, small, and write its report."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,7 +9,15 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import COUNT, DIRECTORY, FILE_ONLY, NOT_NEGATIVE, TASK, VIEWS
+from surgicai_vision.commands.options import (
+    COUNT,
+    DIRECTORY,
+    FILE_ONLY,
+    FRACTION,
+    NOT_NEGATIVE,
+    TASK,
+    VIEWS,
+)
 from surgicai_vision.experiments.quickstart_config import PolicyChoice, Quickstart
 
 app = App(name="quickstart", help_epilogue="example:\n  surgicai-vision quickstart")
@@ -20,24 +29,26 @@ class Options:
     """Options of `quickstart`.
 
     Attributes:
-        task: The task.
+        procedure: Who sews the whole procedure of the first act.
+        task: The task of the second act.
         demonstrations: Expert demonstrations.
+        noise: How much what the expert executes is disturbed.
         view: Rendered views.
         size: Height and width of images [px].
-        depth: Render depth beside RGB.
-        recipe: Recipe of behaviour cloning.
+        frame_stride: Control steps from frame to frame.
         episodes: Held-out starts of each evaluation.
         seed: Training seed.
         workers: Number of processes.
         out: Folder to make or to continue.
     """
 
+    procedure: Annotated[str | None, Parameter(metavar="POLICY")] = Quickstart.procedure
     task: Annotated[str, TASK] = Quickstart.task
     demonstrations: Annotated[int, COUNT] = Quickstart.demonstrations
+    noise: Annotated[float, FRACTION] = Quickstart.noise
     view: Annotated[tuple[str, ...], VIEWS] = Quickstart.view
     size: Annotated[int, COUNT, Parameter(metavar="PX")] = Quickstart.size
-    depth: bool = Quickstart.depth
-    recipe: str = Quickstart.recipe
+    frame_stride: Annotated[int, COUNT] = Quickstart.frame_stride
     episodes: Annotated[int, COUNT] = Quickstart.episodes
     seed: Annotated[int, NOT_NEGATIVE] = Quickstart.seed
     workers: Annotated[int, COUNT] = folders.CORES
@@ -52,7 +63,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     from surgicai_vision.experiments.quickstart import run_quickstart
 
     context = RunContext(options.workers, stage=console.stage)
-    result = run_quickstart(plan_of(options), options.out, context)
+    result = run_quickstart(plan_of(options), options.out, context, console.say)
     console.say()
     for line in table(result["results"]):
         console.say(line)
@@ -64,12 +75,13 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 def plan_of(options: Options) -> Quickstart:
     """Return the quickstart that the options describe."""
     return Quickstart(
+        procedure=options.procedure,
         task=options.task,
         demonstrations=options.demonstrations,
+        noise=options.noise,
         view=options.view,
         size=options.size,
-        depth=options.depth,
-        recipe=options.recipe,
+        frame_stride=options.frame_stride,
         policies=Quickstart.policies if options.policies is None else options.policies,
         episodes=options.episodes,
         seed=options.seed,
@@ -79,8 +91,12 @@ def plan_of(options: Options) -> Quickstart:
 def table(results: list[dict[str, Any]]) -> list[str]:
     """Return the lines of a table of evaluations."""
     head = ("policy", "success", "95 % interval", "length [mm]", "steps")
-    rows = [head, *(_row(result) for result in results)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
+    return aligned([head, *(_row(result) for result in results)])
+
+
+def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return the lines of a table with its columns aligned; the first row is its head."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows

@@ -49,8 +49,8 @@ class Options:
             labels stay the expert's.
         noise_from: Lowest such deviation: each episode draws its own between this and --noise.
         perturb_start_fraction: Share of episodes that start with a push that is not recorded.
-        learner: A checkpoint that acts until a step drawn at random; labels stay the expert's
-            (DAgger).
+        learner: A checkpoint, or released:NAME, that acts until a step drawn at random; labels
+            stay the expert's (DAgger).
         post_success_steps: Control steps that an episode goes on after its success.
         workers: Number of processes.
         out: Folder to make or to continue.

@@ -40,8 +40,8 @@ class Options:
     """Options of `robustness`.
 
     Attributes:
-        policy: A checkpoint folder, a hierarchical.yaml, module:factory, or expert, replay, random
-            or zero.
+        policy: A checkpoint folder, a hierarchical.yaml, released:NAME (see `policies`),
+            module:factory, or expert, replay, random or zero.
         task: The task.
         axis: What shifts.
         strength: How much, from 0 (not at all) to 1, increasing.

@@ -60,7 +60,7 @@ class Options:
         policy: The kind of policy.
         change: Replace values of the recipe, such as clock=false,map_head=softmax.
         epochs: Passes over the frames.
-        start: Checkpoint to start from, with the same inputs (fine-tuning).
+        start: Checkpoint, or released:NAME, to start from, with the same inputs (fine-tuning).
         save_every: Also keep a checkpoint every N epochs; 0 keeps the last alone.
         log: Where losses are drawn.
         seed: Training seed.

@@ -62,9 +62,10 @@ class HierarchicalConfig:
     """Who decides, who acts, and when a subtask ends.
 
     Attributes:
-        hlp: folder of the high-level policy's checkpoint, or "order".
-        grasp: what acts in the subtask, a checkpoint's folder or a baseline; likewise place,
-            insert, handoff and pullout. A file names no code: "module:factory" is refused.
+        hlp: folder of the high-level policy's checkpoint, "released:hlp", or "order".
+        grasp: what acts in the subtask, a checkpoint's folder, a released policy or a baseline;
+            likewise place, insert, handoff and pullout. A file names no code: "module:factory" is
+            refused.
         termination: one of `TERMINATIONS`.
         steps: control steps a subtask may take.
         decisions: decisions an episode may take.

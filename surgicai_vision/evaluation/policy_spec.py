@@ -2,6 +2,7 @@
 
 open_policy("expert", task="grasp")          # or random, zero
 open_policy("replay", dataset=dataset)       # the mean demonstration, without observing
+open_policy("released:grasp")                # a policy that comes with the product
 open_policy("outputs/train/grasp-…")         # a checkpoint of ours or of LeRobot's
 open_policy("hierarchical.yaml")             # a high-level policy over low-level ones
 open_policy("my_package.my_module:factory")  # a function that returns an `agent.Agent`
@@ -38,7 +39,7 @@ from surgicai_vision.evaluation.hierarchical import (
 )
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
-from surgicai_vision.training import policies
+from surgicai_vision.training import policies, released
 from surgicai_vision.training.run_config import OWN, RunConfig
 
 if TYPE_CHECKING:
@@ -96,8 +97,8 @@ def open_policy(
     """Return what `given` names; checkpoints are read and their weights looked up at once.
 
     Args:
-        given: a baseline's name, "replay", a checkpoint folder of ours or LeRobot's, the YAML file
-            of a hierarchical policy, or "module:factory".
+        given: a baseline's name, "replay", "released:NAME", a checkpoint folder of ours or
+            LeRobot's, the YAML file of a hierarchical policy, or "module:factory".
         task: the task; None takes the checkpoint's, else grasp.
         env: fields of `TaskConfig` that differ from the default's; None keeps the env a policy was
             trained in.
@@ -111,7 +112,8 @@ def open_policy(
         InputError: a policy of another task, or an option that does not go with this policy.
         MissingWeights: an encoder's weights are not at hand.
     """
-    text, path = str(given), Path(given)
+    text = str(given)
+    path = released.resolve(given)
     if expert_swap is not None and path.suffix not in SUFFIXES:
         raise InputError(
             f"--expert-swap {expert_swap} is for the YAML file of a hierarchical policy; "
@@ -129,9 +131,12 @@ def open_policy(
     elif _names_code(text):
         spec = _from_factory(text, TaskConfig(task or "grasp"))
     elif not path.exists() and path.parent == Path():
-        raise UnknownName("policy or checkpoint folder", text, (*BASELINES, REPLAY))
+        known = (*BASELINES, REPLAY, *map(released.PREFIX.__add__, released.released_names()))
+        raise UnknownName("policy or checkpoint folder", text, known)
     else:
         spec = _from_folder(path, task, weights)
+    if released.is_released(text):
+        spec = dataclasses.replace(spec, about={**spec.about, "folder": text})
     if task not in (None, spec.config.task):
         raise InputError(
             f"{text} was trained for '{spec.config.task}', not for '{task}'; "
@@ -142,7 +147,7 @@ def open_policy(
 
 def _names_code(text: str) -> bool:
     """Return True for "module:factory"."""
-    return ":" in text and not Path(text).exists()
+    return ":" in text and not released.is_released(text) and not Path(text).exists()
 
 
 def _in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
@@ -314,14 +319,15 @@ def hierarchical_policy(
             known[subtask] = spec.run
     high: functools.partial[PolicyAgent] | None = None
     if config.hlp != ORDER:
-        checkpoint = read_checkpoint(Path(config.hlp))
+        folder = released.resolve(config.hlp)
+        checkpoint = read_checkpoint(folder)
         if checkpoint.policy != "hlp" or checkpoint.task.task != names.SUTURE:
             raise InputError(
                 f"{config.hlp} is '{checkpoint.policy}' of '{checkpoint.task.task}'; "
                 "hlp: takes an 'hlp' of 'suture'."
             )
         known["hlp"] = checkpoint.run
-        high = functools.partial(policy_agent, Path(config.hlp), weights)
+        high = functools.partial(policy_agent, folder, weights)
     envs = {
         dataclasses.replace(run.env, task=names.SUTURE, max_steps=config.max_steps)
         for run in known.values()

@@ -25,6 +25,7 @@ from surgicai_vision.demos.record import Learner, record_into
 from surgicai_vision.evaluation.agent import Agent, Env, Observation
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.slot import env_of
+from surgicai_vision.training import released
 
 
 @final
@@ -57,6 +58,7 @@ def learner_of(folder: Path, config: TaskConfig) -> Learner:
         InputError: a policy of another task, or one that is not trained or does not act.
         MissingWeights: the encoder's weights are not at hand.
     """
+    folder = released.resolve(folder)
     spec = open_policy(folder, task=config.task)
     checkpoint = spec.about.get("checkpoint")
     if not isinstance(checkpoint, Mapping):

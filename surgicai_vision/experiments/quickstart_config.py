@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import TaskConfig, check_frame_stride
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.features import encoders
 from surgicai_vision.training.run_config import RunConfig
@@ -10,10 +10,21 @@ from surgicai_vision.training.run_config import RunConfig
 
 @dataclass(frozen=True)
 class PolicyChoice:
-    """A policy's inputs: an encoder with its views, or neither for proprioception alone."""
+    """A policy to train.
+
+    Attributes:
+        encoder: its encoder; None, and no views, for proprioception alone.
+        view: its views.
+        pool: what is taken from the encoder.
+        recipe: the recipe of behaviour cloning.
+        change: what is changed in the recipe, "key=value" each.
+    """
 
     encoder: str | None = None
     view: tuple[str, ...] = ()
+    pool: str = "global"
+    recipe: str = "paper"
+    change: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -21,33 +32,37 @@ class Quickstart:
     """What a quickstart does; the defaults are configs/quickstart.yaml.
 
     Attributes:
-        task: the task.
+        procedure: who sews the whole procedure of the first act; None leaves it out.
+        task: the task of the second act.
         demonstrations: expert demonstrations to train on.
+        noise: how much what the expert executes is disturbed.
         view: rendered views.
         size: height and width of images [px].
-        depth: render depth beside RGB.
-        recipe: recipe of behaviour cloning.
-        policies: what is trained and evaluated.
+        frame_stride: control steps from frame to frame.
+        policies: what is trained and evaluated, the one to be shown first.
         episodes: held-out starts of each evaluation.
         seed: training seed.
     """
 
-    task: str = "grasp"
-    demonstrations: int = 25
-    view: tuple[str, ...] = ("front", "back")
+    procedure: str | None = "released:suture"
+    task: str = "handoff"
+    demonstrations: int = 120
+    noise: float = 0.6
+    view: tuple[str, ...] = ("front_psm1", "back_psm1", "back")
     size: int = 224
-    depth: bool = True
-    recipe: str = "paper"
+    frame_stride: int = 5
     policies: tuple[PolicyChoice, ...] = (
-        PolicyChoice("imagenet-lite", ("front",)),
-        PolicyChoice("imagenet-lite", ("back",)),
-        PolicyChoice("random", ("back",)),
-        PolicyChoice(),
+        PolicyChoice("imagenet-lite-early", ("front_psm1", "back_psm1"), "spatial", "best"),
+        PolicyChoice("imagenet-lite", ("back",), change=("frame_stride=5",)),
+        PolicyChoice(change=("frame_stride=5",)),
     )
-    episodes: int = 20
+    episodes: int = 50
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_frame_stride(self.frame_stride)
+        if not 0.0 <= self.noise <= 1.0:
+            raise InputError(f"noise is {self.noise:g}; it must be within 0 and 1.")
         for run in self.runs:
             if run.encoder:
                 encoders.check_encoder_name(run.encoder)
@@ -70,9 +85,13 @@ class Quickstart:
                 TaskConfig(self.task),
                 choice.encoder,
                 choice.view,
-                recipe=self.recipe,
+                pool=choice.pool,
+                recipe=choice.recipe,
+                changes=choice.change,
                 demonstrations=self.demonstrations,
                 demonstrator="expert",
+                noise=self.noise,
+                frame_stride=self.frame_stride,
                 seed=self.seed,
             )
             for choice in self.policies

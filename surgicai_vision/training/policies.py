@@ -17,6 +17,7 @@ from surgicai_vision.core.errors import BadFile, check_name
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.core.plugins import POLICIES_GROUP, Registry
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
+from surgicai_vision.training import released
 from surgicai_vision.training.checkpoint import (
     Checkpoint,
     check_encoder,
@@ -100,15 +101,16 @@ def recipe_of(run: RunConfig) -> "Recipe":
 
 
 def load_policy(folder: Path | str) -> "Policy":
-    """Load a trained policy from a checkpoint folder, verified.
+    """Load a trained policy from a checkpoint folder or by its name `released:NAME`, verified.
 
     Returns:
         The policy; `policy.checkpoint` says everything about it.
 
     Raises:
         BadFile: a folder that is no whole checkpoint, or one that was changed.
+        InputError: a released policy that does not exist, or one of another scene.
     """
-    return restore(read_checkpoint(Path(folder)))
+    return restore(read_checkpoint(released.resolve(folder)))
 
 
 def restore(checkpoint: Checkpoint) -> "Policy":

@@ -29,7 +29,7 @@ class Options:
     """Options of `policy push`.
 
     Attributes:
-        policy: A checkpoint folder.
+        policy: A checkpoint folder, or released:NAME.
         repo: Where to; made when it does not exist.
         evaluation: Folder of an evaluation of this policy, whose successes the card tells.
         private: Make it private.
@@ -50,14 +50,16 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     """Verify the policy, push it and print where it is."""
     from surgicai_vision.training.checkpoint import read_checkpoint
     from surgicai_vision.training.hub import model_card, push_policy
+    from surgicai_vision.training.released import resolve
 
-    checkpoint = read_checkpoint(options.policy)
+    folder = resolve(options.policy)
+    checkpoint = read_checkpoint(folder)
     successes = _successes(options.evaluation, checkpoint) if options.evaluation else None
     if options.dry_run:
         console.say(model_card(checkpoint, options.repo, options.licence, successes))
         return {"repo": options.repo, "dry_run": True}
     address = push_policy(
-        options.policy,
+        folder,
         options.repo,
         private=options.private,
         licence=options.licence,

@@ -1,0 +1,218 @@
+"""Release: build the policies that come with the product, from nothing to their cards.
+
+Record, render, encode, train, evaluate on held-out starts, write the card. One folder holds the
+work, below the hash of the scene it is done in:
+
+    <out>/<scene hash>/<demonstrations>/demos, dataset
+    <out>/<scene hash>/policies/<name>, evaluations/<name>
+
+A step that is there is not done again, so the same command continues a broken-off build, and a
+changed scene begins anew. Each policy goes into `released_folder()` as soon as it is counted; the
+whole procedure comes last, of parts that are released by then.
+"""
+
+import functools
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import yaml
+
+from surgicai_vision import __version__
+from surgicai_vision.core import files, names
+from surgicai_vision.core.config import digest, from_mapping, to_mapping
+from surgicai_vision.core.errors import InputError, OutputExists, check_name
+from surgicai_vision.core.executor import RunContext
+from surgicai_vision.dataset import open_dataset
+from surgicai_vision.demos.rollout import Disturbance
+from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
+from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
+from surgicai_vision.evaluation.provenance import command_line
+from surgicai_vision.evaluation.run import evaluate_once
+from surgicai_vision.experiments.prepare import prepare_dataset
+from surgicai_vision.experiments.release_config import (
+    HLP,
+    Demonstrations,
+    ReleasedPolicy,
+    ReleasePlan,
+)
+from surgicai_vision.experiments.run import train_run
+from surgicai_vision.features import encoders
+from surgicai_vision.scene import build_scene
+from surgicai_vision.training import policies
+from surgicai_vision.training.checkpoint import CARD, WEIGHTS, Checkpoint, read_checkpoint
+from surgicai_vision.training.released import (
+    PREFIX,
+    PROCEDURE,
+    VARIABLE,
+    ReleaseCard,
+    read_card,
+    released_folder,
+    write_released,
+)
+from surgicai_vision.training.run_config import Starts
+
+PLAN_FILE = "plan.json"
+
+
+def run_release(
+    plan: ReleasePlan, out: Path, context: RunContext, only: Sequence[str] = ()
+) -> list[ReleaseCard]:
+    """Build what is not built yet and write it to `released_folder()`.
+
+    Args:
+        plan: what to build.
+        out: folder of the work.
+        context: processes and progress.
+        only: names of `plan.names`; all of them by default.
+
+    Returns:
+        The cards, in the plan's order.
+
+    Raises:
+        UnknownName: a policy, view, encoder or recipe that does not exist; before any work.
+        InputError: a folder that cannot be written; before any work.
+        MissingWeights: the encoder's weights are not at hand; before any work.
+        OutputExists: `out` holds the work of another plan.
+    """
+    for name in only:
+        check_name("policy of the plan", name, plan.names)
+    chosen = [name for name in plan.names if name in only or not only]
+    encoders.find_weights(plan.encoder)
+    for policy in plan.policies:
+        policies.recipe_of(plan.run(policy))
+    _check_writable(released_folder())
+    scene = build_scene(plan.task_config(names.SUTURE).scene).hash
+    build = _Build(plan, out / scene[:12], scene, context)
+    build.claim()
+    cards = [build.subtask(policy) for policy in plan.policies if policy.name in chosen]
+    return [*cards, build.procedure()] if names.SUTURE in chosen else cards
+
+
+@dataclass(frozen=True)
+class _Build:
+    """One build.
+
+    Attributes:
+        plan: what is built.
+        out: folder of the work.
+        scene_hash: of the scene.
+        context: processes and progress.
+    """
+
+    plan: ReleasePlan
+    out: Path
+    scene_hash: str
+    context: RunContext
+
+    def claim(self) -> None:
+        """Make the folder of the work, or refuse that of another plan."""
+        files.check_output(self.out, may_resume=PLAN_FILE)
+        path = self.out / PLAN_FILE
+        wanted = to_mapping(self.plan)
+        if path.exists() and files.read_json(path) != wanted:
+            raise OutputExists(
+                f"{self.out} holds the work of another plan (see {path}); give another --out."
+            )
+        self.out.mkdir(parents=True, exist_ok=True)
+        files.write_json(path, wanted)
+
+    def subtask(self, policy: ReleasedPolicy) -> ReleaseCard:
+        """Train, count and release one policy."""
+        recorded = self.plan.recorded(policy)
+        folder = self.out / "policies" / policy.name
+        if not (folder / CARD).exists():
+            dataset = open_dataset(self._dataset(recorded))
+            run = self.plan.run(policy)
+            train_run(run, dataset, folder, self.context.stage, subtask=policy.subtask)
+        checkpoint = read_checkpoint(folder)
+        whose = f"the {policy.subtask} of " if policy.subtask else ""
+        card = ReleaseCard(
+            name=policy.name,
+            run=checkpoint.run,
+            scene_hash=self.scene_hash,
+            data=f"{whose}{recorded.episodes} demonstrations of {recorded.task} by the scripted "
+            f"expert ({recorded.demonstrator}), {checkpoint.frames} frames",
+            licence=self.plan.licence,
+            encoder=_encoder(checkpoint),
+            command=command_line(),
+            code_version=__version__,
+        )
+        if policies.policy_plugin(policy.policy).target == names.ACTION:
+            card = self._counted(card, folder, policy.name)
+        write_released(card, {name: (folder / name).read_bytes() for name in (CARD, WEIGHTS)})
+        return read_card(policy.name)
+
+    def procedure(self) -> ReleaseCard:
+        """Count the whole procedure by the released parts, and release it."""
+        parts = {name: f"{PREFIX}{name}" for name in (*names.SUBTASKS, HLP)}
+        hashes = {name: read_card(name).files[WEIGHTS] for name in parts}
+        config = from_mapping(
+            HierarchicalConfig, {**parts, "grasp_hold": self.plan.grasp_hold}, PROCEDURE
+        )
+        content = yaml.safe_dump(to_mapping(config), sort_keys=False).encode()
+        policy = f"{PREFIX}{names.SUTURE}"
+        card = ReleaseCard(
+            name=names.SUTURE,
+            run=hierarchical_policy(config).run,
+            scene_hash=self.scene_hash,
+            data=f"the released {', '.join(parts)}",
+            licence=self.plan.licence,
+            encoder="",
+            command=command_line(),
+            code_version=__version__,
+            parts=hashes,
+        )
+        write_released(card, {PROCEDURE: content})
+        card = self._counted(card, policy, f"{names.SUTURE}-{digest(hashes)[:8]}")
+        write_released(card, {PROCEDURE: content})
+        return read_card(names.SUTURE)
+
+    def _dataset(self, recorded: Demonstrations) -> Path:
+        """Record and render; return the dataset's folder."""
+        return prepare_dataset(
+            self.plan.task_config(recorded.task),
+            self.out / recorded.name,
+            self.context,
+            demonstrations=recorded.episodes,
+            views=recorded.view,
+            size=self.plan.size,
+            depth=False,
+            frame_stride=recorded.frame_stride,
+            demonstrator=recorded.demonstrator,
+            disturbance=Disturbance(recorded.noise),
+            post_success_steps=recorded.post_success_steps,
+        )
+
+    def _counted(self, card: ReleaseCard, given: str | Path, folder: str) -> ReleaseCard:
+        """Evaluate a policy on the held-out starts; return its card with the count."""
+        starts = Starts(names.TEST_SEED, self.plan.episodes)
+        summary = evaluate_once(
+            self.out / "evaluations" / folder,
+            functools.partial(open_policy, given),
+            starts.seeds,
+            self.context.stage,
+            self.context.workers,
+        )
+        return replace(card, successes=summary["successes"], starts=starts)
+
+
+def _encoder(checkpoint: Checkpoint) -> str:
+    """Return the encoder of a policy with its weights' source and licence, in words."""
+    if checkpoint.encoder is None:
+        return ""
+    about = checkpoint.encoder.card
+    return f"{checkpoint.encoder.name}, frozen, not included: {about['source']}, {about['licence']}"
+
+
+def _check_writable(folder: Path) -> None:
+    """Refuse a folder of released policies that cannot be written, before any work."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=files.TEMPORARY):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{folder} cannot be written: {error.strerror}; set {VARIABLE} to another folder."
+        ) from None
