@@ -1,11 +1,16 @@
-"""Quickstart: the whole flow once, small, from demonstrations to the report.
+"""Quickstart, in two acts: a whole procedure to watch, then the whole flow once, small.
 
-One folder holds everything: `demos/`, `dataset/`, `policies/<name>/`, `evaluations/<name>/`,
-`run.json` and `report.html`. A step that is there is not done again, so the same command continues
-a broken-off run.
+Act 1: a released policy sews one stitch from images; a video is written (`first_stitch`). Act 2:
+demonstrations of one subtask, rendered, encoded; policies trained on them and counted on the same
+held-out starts.
+
+One folder holds everything: `procedure/`, `demos/`, `dataset/`, `policies/<name>/`,
+`evaluations/<name>/`, `run.json` and `report.html`. A step that is there is not done again, so the
+same command continues a broken-off run.
 """
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,10 +20,12 @@ from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.progress import timed
 from surgicai_vision.dataset import open_dataset
+from surgicai_vision.demos.rollout import Disturbance
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.run import evaluate_once
 from surgicai_vision.evaluation.storage import FORMAT, RUN_FILE, Row, read_versioned
+from surgicai_vision.experiments.first_stitch import POSTER, STRIP, VIDEO, find_sewer, sew
 from surgicai_vision.experiments.prepare import prepare_dataset
 from surgicai_vision.experiments.quickstart_config import Quickstart
 from surgicai_vision.experiments.run import train_run
@@ -26,19 +33,26 @@ from surgicai_vision.features import encoders
 from surgicai_vision.report import write_report
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import CARD
-from surgicai_vision.training.run_config import Starts
+from surgicai_vision.training.run_config import RunConfig, Starts
+
+PROCEDURE = "procedure"
+"""Folder of the first act."""
 
 
-def run_quickstart(plan: Quickstart, out: Path, context: RunContext) -> Row:
+def run_quickstart(
+    plan: Quickstart, out: Path, context: RunContext, say: Callable[[str], None]
+) -> Row:
     """Do everything that is not done yet and write the report.
 
     Args:
         plan: what to do.
         out: the folder; one of another plan is refused.
         context: processes and progress.
+        say: told a line wherever something has come out.
 
     Returns:
-        {"report", "results" (summaries, expert last), "seconds"}.
+        {"report", "procedure" (what the first act came to, or None), "results" (summaries, expert
+        last), "seconds"}.
 
     Raises:
         MissingWeights: an encoder's weights are not at hand; before any work.
@@ -49,7 +63,22 @@ def run_quickstart(plan: Quickstart, out: Path, context: RunContext) -> Row:
         policies.recipe_of(run)
         if run.encoder:
             encoders.find_weights(run.encoder)
+    sewer = find_sewer(plan.procedure) if plan.procedure else None
     state = _open_state(plan, out)
+    sewn: Row | None = None
+    if sewer is not None:
+        say(f"Act 1. A whole procedure by {sewer.who}.")
+        if sewer.why:
+            say(f"  It stands in for {plan.procedure}: {sewer.why}")
+        with timed(context.stage, state["seconds"]) as measured:
+            sewn = sew(sewer, out / PROCEDURE, say, measured)
+        state["video"] = _video(sewn)
+        _store_state(out, state)
+        say("")
+        say(
+            f"Act 2. A policy of {plan.task}, from demonstrations to counted successes, and what "
+            "it is to be compared with."
+        )
     config = TaskConfig(plan.task)
     seeds = Starts(names.TEST_SEED, plan.episodes).seeds
     evaluations = out / "evaluations"
@@ -62,7 +91,9 @@ def run_quickstart(plan: Quickstart, out: Path, context: RunContext) -> Row:
             demonstrations=plan.demonstrations,
             views=plan.view,
             size=plan.size,
-            depth=plan.depth,
+            depth=False,
+            frame_stride=plan.frame_stride,
+            disturbance=Disturbance(plan.noise),
         )
         dataset = open_dataset(folder)
         for run in plan.runs:
@@ -70,9 +101,9 @@ def run_quickstart(plan: Quickstart, out: Path, context: RunContext) -> Row:
             if not (policy / CARD).exists():
                 train_run(run, dataset, policy, measured)
             spec = functools.partial(open_policy, policy)
-            results.append(
-                evaluate_once(evaluations / run.name, spec, seeds, measured, context.workers)
-            )
+            result = evaluate_once(evaluations / run.name, spec, seeds, measured, context.workers)
+            results.append(result)
+            say(f"  {result['successes']:>2}/{result['episodes']}  {result['policy']}")
             _store_state(out, state)
         spec = functools.partial(open_policy, "expert", task=plan.task)
         results.append(
@@ -81,14 +112,60 @@ def run_quickstart(plan: Quickstart, out: Path, context: RunContext) -> Row:
     state["provenance"] = provenance()
     state["data"] = (
         f"{plan.demonstrations} demonstrations of the scripted expert, {dataset.length} frames; "
-        f"{' and '.join(plan.view)} at {plan.size} × {plan.size}, "
-        f"RGB{' and depth' if plan.depth else ''}; "
-        f"behaviour cloning, recipe '{plan.recipe}', training seed {plan.seed}"
+        f"{' and '.join(plan.view)} at {plan.size} × {plan.size}; "
+        f"behaviour cloning, training seed {plan.seed}"
     )
+    state.update(_finding(plan, results))
     _store_state(out, state)
     with context.stage("report", "parts") as progress:
         page = write_report(out, progress=progress)
-    return {"report": str(page), "results": results, "seconds": sum(state["seconds"].values())}
+    return {
+        "report": str(page),
+        "procedure": sewn,
+        "results": results,
+        "seconds": sum(state["seconds"].values()),
+    }
+
+
+def _finding(plan: Quickstart, results: Sequence[Row]) -> dict[str, str]:
+    """Return the page's headline, how many of how many beside what, and the line below it."""
+    trained = list(zip(plan.runs, results, strict=False))
+    (run, shown), *others = trained
+    low, high = shown["ci95"]
+    beside = ", ".join(f"{_words(other)} {result['successes']}" for other, result in others)
+    details = "; ".join(f"{result['policy']} {_count(result)}" for result in results[1:])
+    inputs = f"{run.encoder} on {' + '.join(run.views)}" if run.encoder else run.inputs
+    return {
+        "headline": f"{plan.task.capitalize()}, {_words(run)}: {shown['successes']} of "
+        f"{shown['episodes']} held-out starts" + (f"; {beside}" if beside else ""),
+        "lead": f"{plan.demonstrations} demonstrations; {inputs}: {100 * shown['success_rate']:.0f}"
+        f" %, 95 % interval {100 * low:.0f}–{100 * high:.0f} %. Beside it, from the same "
+        f"demonstrations and on the same starts: {details}.",
+    }
+
+
+def _words(run: RunConfig) -> str:
+    """Return a policy in words for a headline."""
+    if not run.encoder:
+        return "without images"
+    recipe = Path(run.recipe).stem
+    return "by the paper's recipe" if recipe == "paper" else f"from images by recipe {recipe}"
+
+
+def _count(result: Row) -> str:
+    return f"{result['successes']}/{result['episodes']}"
+
+
+def _video(sewn: Row) -> Row:
+    """Return what the report shows of the first act."""
+    how = "from images" if not sewn["why"] and "images" in sewn["who"] else "from the state"
+    return {
+        "file": f"{PROCEDURE}/{VIDEO}",
+        "poster": f"{PROCEDURE}/{POSTER}",
+        "strip": f"{PROCEDURE}/{STRIP}",
+        "title": f"One whole procedure, sewn {how} by {sewn['policy']}",
+        "text": sewn["text"],
+    }
 
 
 def _open_state(plan: Quickstart, out: Path) -> Row:

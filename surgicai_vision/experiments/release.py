@@ -30,6 +30,7 @@ from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.provenance import command_line
 from surgicai_vision.evaluation.run import evaluate_once
+from surgicai_vision.evaluation.storage import read_rows
 from surgicai_vision.experiments.prepare import prepare_dataset
 from surgicai_vision.experiments.release_config import (
     HLP,
@@ -54,6 +55,8 @@ from surgicai_vision.training.released import (
 from surgicai_vision.training.run_config import Starts
 
 PLAN_FILE = "plan.json"
+SHOWN = 5
+"""Solved starts that a card names: they are solved again wherever the policy is installed."""
 
 
 def run_release(
@@ -148,9 +151,7 @@ class _Build:
         """Count the whole procedure by the released parts, and release it."""
         parts = {name: f"{PREFIX}{name}" for name in (*names.SUBTASKS, HLP)}
         hashes = {name: read_card(name).files[WEIGHTS] for name in parts}
-        config = from_mapping(
-            HierarchicalConfig, {**parts, "grasp_hold": self.plan.grasp_hold}, PROCEDURE
-        )
+        config = from_mapping(HierarchicalConfig, {**self.plan.procedure, **parts}, "procedure")
         content = yaml.safe_dump(to_mapping(config), sort_keys=False).encode()
         policy = f"{PREFIX}{names.SUTURE}"
         card = ReleaseCard(
@@ -188,14 +189,18 @@ class _Build:
     def _counted(self, card: ReleaseCard, given: str | Path, folder: str) -> ReleaseCard:
         """Evaluate a policy on the held-out starts; return its card with the count."""
         starts = Starts(names.TEST_SEED, self.plan.episodes)
+        out = self.out / "evaluations" / folder
         summary = evaluate_once(
-            self.out / "evaluations" / folder,
+            out,
             functools.partial(open_policy, given),
             starts.seeds,
             self.context.stage,
             self.context.workers,
         )
-        return replace(card, successes=summary["successes"], starts=starts)
+        solved = [int(row["seed"]) for row in read_rows(out) if row["success"]]
+        return replace(
+            card, successes=summary["successes"], starts=starts, solved=tuple(solved[:SHOWN])
+        )
 
 
 def _encoder(checkpoint: Checkpoint) -> str:

@@ -77,7 +77,7 @@ class ReleasePlan:
         episodes: held-out starts of each evaluation.
         demonstrations: what is recorded and rendered.
         policies: what is trained; the five subtasks and the high-level policy make `suture`.
-        grasp_hold: control steps that ends a grasp in the whole procedure.
+        procedure: when a subtask of the whole procedure ends, as `HierarchicalConfig` has it.
         epochs: passes over the frames; None takes the recipe's.
         env: fields of `TaskConfig` that differ from the default's, in every task.
     """
@@ -91,7 +91,7 @@ class ReleasePlan:
     episodes: int
     demonstrations: tuple[Demonstrations, ...]
     policies: tuple[ReleasedPolicy, ...]
-    grasp_hold: int
+    procedure: Mapping[str, JSON] = field(default_factory=dict)
     epochs: int | None = None
     env: Mapping[str, JSON] = field(default_factory=dict)
 

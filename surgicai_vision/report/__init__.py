@@ -27,6 +27,7 @@ from surgicai_vision.report.reader import (
     read_results,
 )
 from surgicai_vision.report.tables import write_changed, write_tables
+from surgicai_vision.report.video import opening_video
 
 __all__ = [
     "GRID_FILE",
@@ -69,6 +70,7 @@ def write_report(
     title = collected.run.get("title", folder.resolve().name)
     report(1, strips + 3)
     reel = filmstrips.make_reel(groups, strips, lambda done, total: report(1 + done, total + 3))
+    path = out or folder / PAGE_FILE
     filled = {
         **page.numbers(collected, groups, pairs),
         **origin(collected, groups),
@@ -78,8 +80,8 @@ def write_report(
         ),
         "footer": page.footer(collected),
         "title": title,
+        "video": opening_video(folder, path, collected.run),
     }
-    path = out or folder / PAGE_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     tables = write_tables(path.parent, groups, pairs, title)
     sheet = failure_sheet(groups, reel)

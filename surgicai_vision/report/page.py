@@ -41,7 +41,7 @@ def numbers(
     index = {item.condition: at for at, item in enumerate(groups)}
     best = {task: best_trained(of_task(groups, task)) for task in task_names()}
     return {
-        **headline(groups),
+        **(_told(collected) or headline(groups)),
         "counts": _counts(collected),
         "paper": sections.paper_rows(groups, index),
         "paper_source": paper.SOURCE,
@@ -72,6 +72,12 @@ def numbers(
         "missing": sections.missing_rows(groups),
         "notes": collected.notes,
     }
+
+
+def _told(collected: Collected) -> dict[str, str]:
+    """Return the main finding as the run itself tells it; empty where it does not."""
+    run = collected.run
+    return {key: run[key] for key in ("headline", "lead")} if run.get("headline") else {}
 
 
 def headline(groups: Sequence[Group]) -> dict[str, str]:

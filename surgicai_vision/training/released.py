@@ -58,6 +58,7 @@ class ReleaseCard:
         code_version: version of this package.
         successes: successful episodes; None for a policy that is judged as part of another.
         starts: the held-out starts they were counted on.
+        solved: the first few of them that it solved; a test solves them again.
         format: version of this layout.
     """
 
@@ -73,6 +74,7 @@ class ReleaseCard:
     parts: Mapping[str, str] = field(default_factory=dict)
     successes: int | None = None
     starts: Starts | None = None
+    solved: tuple[int, ...] = ()
     format: int = FORMAT
 
     @property

@@ -1,0 +1,187 @@
+"""First stitch: one whole procedure that a person can watch, as a video and a film strip.
+
+    sewing = find_sewer("released:suture")
+    row = sew(sewing, Path("outputs/quickstart/procedure"), say=print)
+
+The folder gets `procedure.mp4`, `strip.jpg`, `poster.jpg` (the video's first image) and, written
+last, `procedure.json`; where that is there nothing is done again.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import files, names
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.progress import Stage, silent_stage
+from surgicai_vision.core.video import Image, write_video
+from surgicai_vision.envs import contact_sheet
+from surgicai_vision.evaluation.filming import Look, outcome_of, video_frames
+from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
+from surgicai_vision.evaluation.slot import Slot
+from surgicai_vision.evaluation.storage import Row
+from surgicai_vision.training.released import is_released
+
+MARKER: Final = "procedure.json"
+VIDEO: Final = "procedure.mp4"
+POSTER: Final = "poster.jpg"
+STRIP: Final = "strip.jpg"
+FILES: Final = (VIDEO, POSTER, STRIP)
+STARTS: Final = range(names.TEST_SEED, names.TEST_SEED + 3)
+"""Held-out starts that are tried in order; each that fails is said."""
+LOOK: Final = Look(views=("front", "back"), size=320)
+STRIP_SIZE: Final = 224
+"""Height and width of the film strip's images [px]."""
+
+
+@dataclass(frozen=True)
+class Sewer:
+    """Who sews.
+
+    Attributes:
+        spec: what acts.
+        who: who that is, in words.
+        why: why it is not the one that was asked for; "" where it is.
+    """
+
+    spec: PolicySpec
+    who: str
+    why: str = ""
+
+
+def find_sewer(given: str) -> Sewer:
+    """Return who sews: the policy asked for or, in the place of a released one, the expert.
+
+    Args:
+        given: whatever `open_policy` takes for a whole procedure. A released policy that is not
+            there, or of another scene, is stood in for by the scripted expert.
+
+    Raises:
+        InputError: it is nothing that can sew a whole procedure.
+    """
+    expert = "the scripted expert, which reads the simulator's state and sees no image"
+    if given == "expert":
+        return Sewer(open_policy(given, task=names.SUTURE), expert)
+    try:
+        spec = open_policy(given, task=names.SUTURE)
+    except InputError as error:
+        if not is_released(given):
+            raise
+        return Sewer(open_policy("expert", task=names.SUTURE), expert, str(error))
+    return Sewer(spec, f"{given}, a policy that sees images" if spec.run.views else given)
+
+
+def sew(
+    sewer: Sewer,
+    out: Path,
+    say: Callable[[str], None],
+    stage: Stage = silent_stage,
+    starts: Iterable[int] = STARTS,
+) -> Row:
+    """Sew from the first start that succeeds, and film it.
+
+    Args:
+        sewer: who sews.
+        out: folder to make or to continue.
+        say: told a line as each subtask ends.
+        stage: shows progress.
+        starts: seeds of the starts; the last one is filmed even if it fails.
+
+    Returns:
+        What `procedure.json` holds: who sewed, "success", "subtasks" with the simulated time [s] at
+        which each ended, the starts that failed before, and the time it took [s].
+    """
+    if (out / MARKER).exists():
+        row: Row = files.read_json(out / MARKER)
+        say(f"  {row['text']}")
+        return row
+    out.mkdir(parents=True, exist_ok=True)
+    begun = time.monotonic()
+    slot = Slot(0, sewer.spec.make_agent(), sewer.spec.config)
+    failed: list[int] = []
+    try:
+        for seed in starts:
+            with stage(f"sewing: start {seed}", "steps") as progress:
+                ends = _run(slot, seed, say, progress)
+            episode = slot.take().row
+            if episode.success:
+                break
+            failed.append(seed)
+            say(f"  start {seed}: {outcome_of(episode)}")
+        states = slot.states
+        title = f"{episode.policy}, start {seed}"
+        frames = _with_poster(
+            video_frames(sewer.spec.config, states, slot.moments, title, outcome_of(episode), LOOK),
+            out / POSTER,
+        )
+        total = len(states) // LOOK.every
+        with stage("filming", "images") as progress:
+            write_video(out / VIDEO, _counted(frames, progress, total), LOOK.fps)
+        _strip(sewer, [states[0], *(states[step] for step in ends.values())], ends, out / STRIP)
+    finally:
+        slot.env.close()
+    seconds = {subtask: step / names.FPS for subtask, step in ends.items()}
+    tried = f", after {len(failed)} that failed" if failed and episode.success else ""
+    row = {
+        "who": sewer.who,
+        "why": sewer.why,
+        "policy": episode.policy,
+        "start": seed,
+        "success": episode.success,
+        "failed_starts": failed,
+        "subtasks": seconds,
+        "seconds": time.monotonic() - begun,
+        "text": f"{'sewn' if episode.success else 'not sewn'} from start {seed}{tried}: "
+        f"{episode.steps / names.FPS:.1f} s of simulated time; {out / VIDEO}",
+    }
+    files.write_json(out / MARKER, row)
+    say(f"  {row['text']}")
+    return row
+
+
+def _run(
+    slot: Slot, seed: int, say: Callable[[str], None], progress: Callable[..., None]
+) -> dict[str, int]:
+    """Run an episode; return the control step at which each subtask ended."""
+    ends: dict[str, int] = {}
+    slot.begin(seed)
+    while not slot.ended:
+        slot.step(slot.agent.act([0], [slot.env], [slot.observation])[0])
+        progress(slot.steps, slot.task_config.max_steps)
+        done = names.SUBTASKS[: slot.moments[-1].stages]
+        for subtask in done:
+            if subtask not in ends:
+                ends[subtask] = len(slot.states) - 1
+                say(f"  {subtask:<8} done after {slot.steps / names.FPS:4.1f} s")
+    return ends
+
+
+def _with_poster(frames: Iterator[Image], path: Path) -> Iterator[Image]:
+    """Yield the frames and write the first of them as a JPEG."""
+    for index, frame in enumerate(frames):
+        if index == 0:
+            files.write_bytes(path, contact_sheet.jpeg(frame))
+        yield frame
+
+
+def _counted(frames: Iterator[Image], progress: Callable[..., None], total: int) -> Iterator[Image]:
+    """Yield the frames and tell how many have been."""
+    for count, frame in enumerate(frames, 1):
+        progress(min(count, total), total)
+        yield frame
+
+
+def _strip(
+    sewer: Sewer, states: list[NDArray[np.float64]], ends: dict[str, int], path: Path
+) -> None:
+    """Write the film strip: the start and the end of each subtask, in every view of the video."""
+    columns = ["start", *(f"{name}, {step / names.FPS:.1f} s" for name, step in ends.items())]
+    with contact_sheet.state_renderer(sewer.spec.config, STRIP_SIZE) as draw:
+        rows = [(view, [draw(state, view) for state in states]) for view in LOOK.views]
+    figure = contact_sheet.sheet(rows, columns, f"The whole procedure by {sewer.who}")
+    figure.savefig(path, dpi=100)

@@ -1,0 +1,40 @@
+"""The video that a page opens with, where its run has one.
+
+A run says so in `run.json`: `"video": {"file", "poster", "strip", "title", "text"}`, files by their
+place in the results folder. Small files are embedded, so that the page stays one file.
+"""
+
+import base64
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+EMBEDDED: Final = 5_000_000
+"""Bytes up to which a video is embedded; a larger one stays beside the page."""
+KINDS: Final = {".mp4": "video/mp4", ".jpg": "image/jpeg"}
+
+
+def opening_video(folder: Path, page: Path, run: Mapping[str, Any]) -> dict[str, str] | None:
+    """Return what the template shows of a run's video; None where there is none.
+
+    Args:
+        folder: the results.
+        page: where the page is written.
+        run: what `run.json` holds.
+    """
+    told = run.get("video")
+    if not told or not (folder / told["file"]).is_file():
+        return None
+    files = {key: _address(folder / told[key], page) for key in ("file", "poster", "strip")}
+    return {**files, "title": told["title"], "text": told["text"]}
+
+
+def _address(path: Path, page: Path) -> str:
+    """Return a file as a data URI, or by its place beside the page where it is large."""
+    if not path.is_file():
+        return ""
+    if path.stat().st_size > EMBEDDED:
+        return os.path.relpath(path.resolve(), page.resolve().parent)
+    content = base64.b64encode(path.read_bytes()).decode()
+    return f"data:{KINDS[path.suffix]};base64,{content}"
