@@ -1,5 +1,6 @@
 # make setup        make .venv (and install what this machine lacks)
-# make quickstart   set up, then run the main job: outputs/quickstart/report.html
+# make quickstart   set up, then sew one stitch and train one policy: outputs/quickstart/report.html
+# make released     set up, then build the released policies anew (hours; ONLY=grasp,hlp)
 # make test         set up, then pass the tests
 # make check        lint, format, types, import rule, tests
 # make figures      count what CONTRIBUTING.md asks of the sources
@@ -11,7 +12,7 @@ BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
-.PHONY: setup quickstart test lint check figures format lock
+.PHONY: setup quickstart released test lint check figures format lock
 .NOTPARALLEL:
 
 setup:
@@ -19,6 +20,9 @@ setup:
 
 quickstart: setup
 	$(BIN)/surgicai-vision quickstart
+
+released: setup
+	$(BIN)/surgicai-vision release $(if $(ONLY),--only $(ONLY))
 
 test: setup
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

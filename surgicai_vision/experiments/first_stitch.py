@@ -8,7 +8,7 @@ last, `procedure.json`; where that is there nothing is done again.
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -22,6 +22,7 @@ from surgicai_vision.core.progress import Stage, silent_stage
 from surgicai_vision.core.video import Image, write_video
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.filming import Look, outcome_of, video_frames
+from surgicai_vision.evaluation.metrics import EpisodeMetrics
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.evaluation.slot import Slot
 from surgicai_vision.evaluation.storage import Row
@@ -81,7 +82,7 @@ def sew(
     out: Path,
     say: Callable[[str], None],
     stage: Stage = silent_stage,
-    starts: Iterable[int] = STARTS,
+    starts: Sequence[int] = STARTS,
 ) -> Row:
     """Sew from the first start that succeeds, and film it.
 
@@ -94,54 +95,72 @@ def sew(
 
     Returns:
         What `procedure.json` holds: who sewed, "success", "subtasks" with the simulated time [s] at
-        which each ended, the starts that failed before, and the time it took [s].
+        which each ended, the number of starts that "failed", and the "seconds" it took.
     """
     if (out / MARKER).exists():
-        row: Row = files.read_json(out / MARKER)
-        say(f"  {row['text']}")
-        return row
+        known: Row = files.read_json(out / MARKER)
+        say(f"  {known['text']}: {out / VIDEO}")
+        return known
     out.mkdir(parents=True, exist_ok=True)
     begun = time.monotonic()
     slot = Slot(0, sewer.spec.make_agent(), sewer.spec.config)
-    failed: list[int] = []
     try:
-        for seed in starts:
-            with stage(f"sewing: start {seed}", "steps") as progress:
-                ends = _run(slot, seed, say, progress)
-            episode = slot.take().row
-            if episode.success:
-                break
-            failed.append(seed)
-            say(f"  start {seed}: {outcome_of(episode)}")
-        states = slot.states
-        title = f"{episode.policy}, start {seed}"
-        frames = _with_poster(
-            video_frames(sewer.spec.config, states, slot.moments, title, outcome_of(episode), LOOK),
-            out / POSTER,
+        attempts = _attempts(slot, starts, say, stage)
+        shown = attempts[-1]
+        row = shown.row
+        title = f"{row.policy}, start {row.seed}"
+        frames = video_frames(
+            sewer.spec.config, slot.states, slot.moments, title, outcome_of(row), LOOK
         )
-        total = len(states) // LOOK.every
+        total = len(slot.states) // LOOK.every
         with stage("filming", "images") as progress:
-            write_video(out / VIDEO, _counted(frames, progress, total), LOOK.fps)
-        _strip(sewer, [states[0], *(states[step] for step in ends.values())], ends, out / STRIP)
+            frames = _counted(_with_poster(frames, out / POSTER), progress, total)
+            write_video(out / VIDEO, frames, LOOK.fps)
+        _strip(sewer, slot.states, shown.ends, out / STRIP)
     finally:
         slot.env.close()
-    seconds = {subtask: step / names.FPS for subtask, step in ends.items()}
-    tried = f", after {len(failed)} that failed" if failed and episode.success else ""
-    row = {
+    failed = len(attempts) - row.success
+    tried = f", after {failed} that failed" if failed and row.success else ""
+    told = {
         "who": sewer.who,
         "why": sewer.why,
-        "policy": episode.policy,
-        "start": seed,
-        "success": episode.success,
-        "failed_starts": failed,
-        "subtasks": seconds,
+        "policy": row.policy,
+        "start": row.seed,
+        "success": row.success,
+        "failed": failed,
+        "subtasks": [
+            {"subtask": subtask, "end_s": step / names.FPS} for subtask, step in shown.ends.items()
+        ],
         "seconds": time.monotonic() - begun,
-        "text": f"{'sewn' if episode.success else 'not sewn'} from start {seed}{tried}: "
-        f"{episode.steps / names.FPS:.1f} s of simulated time; {out / VIDEO}",
+        "text": f"{'sewn' if row.success else 'not sewn'} from start {row.seed}{tried}, in "
+        f"{row.steps / names.FPS:.1f} s of simulated time",
     }
-    files.write_json(out / MARKER, row)
-    say(f"  {row['text']}")
-    return row
+    files.write_json(out / MARKER, told)
+    say(f"  {told['text']}: {out / VIDEO}")
+    return told
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """One episode: its row, and the control step at which each subtask ended."""
+
+    row: EpisodeMetrics
+    ends: dict[str, int]
+
+
+def _attempts(
+    slot: Slot, starts: Sequence[int], say: Callable[[str], None], stage: Stage
+) -> list[_Attempt]:
+    """Run episodes until one succeeds; the slot keeps the last one's states."""
+    attempts: list[_Attempt] = []
+    for seed in starts:
+        with stage(f"sewing: start {seed}", "steps") as progress:
+            ends = _run(slot, seed, say, progress)
+        attempts.append(_Attempt(slot.take().row, ends))
+        if attempts[-1].row.success:
+            break
+        say(f"  start {seed}: {outcome_of(attempts[-1].row)}")
+    return attempts
 
 
 def _run(
@@ -177,11 +196,12 @@ def _counted(frames: Iterator[Image], progress: Callable[..., None], total: int)
 
 
 def _strip(
-    sewer: Sewer, states: list[NDArray[np.float64]], ends: dict[str, int], path: Path
+    sewer: Sewer, states: Sequence[NDArray[np.float64]], ends: dict[str, int], path: Path
 ) -> None:
     """Write the film strip: the start and the end of each subtask, in every view of the video."""
     columns = ["start", *(f"{name}, {step / names.FPS:.1f} s" for name, step in ends.items())]
+    shown = [states[step] for step in (0, *ends.values())]
     with contact_sheet.state_renderer(sewer.spec.config, STRIP_SIZE) as draw:
-        rows = [(view, [draw(state, view) for state in states]) for view in LOOK.views]
+        rows = [(view, [draw(state, view) for state in shown]) for view in LOOK.views]
     figure = contact_sheet.sheet(rows, columns, f"The whole procedure by {sewer.who}")
     figure.savefig(path, dpi=100)

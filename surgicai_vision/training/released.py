@@ -28,7 +28,6 @@ from pathlib import Path
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.core.files import PACKAGE, read_json, sha256_file, write_bytes, write_json
-from surgicai_vision.scene import build_scene
 from surgicai_vision.training.checkpoint import WEIGHTS
 from surgicai_vision.training.run_config import RunConfig, Starts
 
@@ -178,6 +177,8 @@ def read_card(name: str) -> ReleaseCard:
 
 def mismatch(card: ReleaseCard) -> str:
     """Return why the policy does not belong to the present scene, "" where it does."""
+    from surgicai_vision.scene import build_scene  # not above: `--help` reads this module
+
     present = build_scene(card.env.scene).hash
     if present == card.scene_hash:
         return ""

@@ -8,13 +8,17 @@ import pytest
 import yaml
 
 from surgicai_vision.commands.main import main
+from surgicai_vision.core import names
+from surgicai_vision.core.video import read_video
 
 TINY = {
+    "task": "grasp",
     "demonstrations": 3,
+    "noise": 0.0,
     "episodes": 2,
     "view": ["back"],
     "size": 64,
-    "depth": False,
+    "frame_stride": 1,
     "workers": 1,
     "policies": [{"encoder": "imagenet-lite", "view": ["back"]}, {}],
 }
@@ -43,6 +47,7 @@ def run(folder, monkeypatch, capsys, *arguments):
     """Run a command in `folder`; return its exit code and its JSON result."""
     monkeypatch.chdir(folder)
     monkeypatch.setenv("SURGICAI_VISION_CACHE", str(folder / "cache"))
+    monkeypatch.setenv("SURGICAI_VISION_RELEASED", str(folder / "nothing"))
     code = main([*arguments, "--json"])
     return code, json.loads(capsys.readouterr().out.splitlines()[-1])
 
@@ -70,6 +75,9 @@ def test_quickstart_runs_and_runs_again_without_work(folder, monkeypatch, capsys
     assert all(result["episodes"] == 2 and result["errors"] == 0 for result in first["results"])
     page = (folder / first["report"]).read_text()
     assert page.count("<img") >= 3, "at least the views"
+    assert page.index("<video") < page.index("<img"), "the video is what the page opens with"
+    assert 'src="data:video/mp4;base64,' in page and 'poster="data:image/jpeg;base64,' in page
+    assert page.split('<h1 id="headline">')[1].startswith("Grasp, by the paper&#39;s recipe: ")
     before = times(folder / "out")
     code, second = run(
         folder, monkeypatch, capsys, "quickstart", "--config", "tiny.yaml", "--out", "out"
@@ -77,6 +85,23 @@ def test_quickstart_runs_and_runs_again_without_work(folder, monkeypatch, capsys
     assert code == 0
     assert second["results"] == first["results"]
     assert times(folder / "out") == before
+
+
+def test_the_first_act_is_a_whole_procedure_by_whom_the_page_names(folder):
+    sewn = json.loads((folder / "out/procedure/procedure.json").read_text())
+    assert sewn["success"] and [row["subtask"] for row in sewn["subtasks"]] == list(names.SUBTASKS)
+    assert sewn["policy"] == "expert" and "no policy is released" in sewn["why"]
+    frames = read_video(folder / "out/procedure/procedure.mp4")
+    assert len(frames) > 25 * sewn["subtasks"][-1]["end_s"] and frames[0].any()
+    page = (folder / "out/report.html").read_text()
+    assert "sewn from the state by expert" in page
+
+
+def test_a_first_act_by_what_cannot_sew_is_refused_before_any_work(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert main(["quickstart", "--procedure", "exprt", "--out", "never"]) == 2
+    assert "Did you mean 'expert'" in capsys.readouterr().err
+    assert not (folder / "never").exists()
 
 
 def test_a_checkpoint_of_it_is_evaluated_to_the_same_result(folder, monkeypatch, capsys):
