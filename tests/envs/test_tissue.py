@@ -270,13 +270,15 @@ def test_beyond_the_yield_force_a_part_stays_and_the_needle_is_pulled_back():
     pose = circle.pose(angle)
     shift = np.array([0.0, 0.003, 0.0])
     largest = pushed(simulation, pose, shift)
-    hardened = PHANTOM.yield_force + 0.5 * (PHANTOM.lateral_stiffness * 0.003 - PHANTOM.yield_force)
+    drive_still(simulation, 5)
+    # The needle tilts a little in the hand: what counts is how far its point in the skin is.
+    way = simulation.needle_point(angle)[1] - simulation.tissue.bite.entry[1]
+    stayed = (way - PHANTOM.yield_force / PHANTOM.lateral_stiffness) / 2
+    hardened = PHANTOM.yield_force + PHANTOM.hardening * stayed
     assert largest == pytest.approx(2 * hardened, rel=0.1)
     pushed(simulation, pose + _at(shift), -shift)
-    stayed = (0.003 - PHANTOM.yield_force / PHANTOM.lateral_stiffness) / 2
-    assert force_across(simulation, 25) == pytest.approx(
-        2 * PHANTOM.lateral_stiffness * stayed, rel=0.2
-    )
+    left = 2 * PHANTOM.lateral_stiffness * stayed
+    assert force_across(simulation, 25) == pytest.approx(left, rel=0.15)
     assert simulation.tissue.tears == 0
 
 
