@@ -28,9 +28,10 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from surgicai_vision.envs import poses
+from surgicai_vision.envs.bite import Bite
 from surgicai_vision.envs.hole_crossing import JUMP, crossing
 from surgicai_vision.envs.simulation import Simulation
-from surgicai_vision.envs.tissue import Bite, Tissue
+from surgicai_vision.envs.tissue import Tissue
 from surgicai_vision.scene.holes import Hole, HolePair, Point
 
 
