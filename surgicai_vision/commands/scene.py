@@ -1,5 +1,6 @@
 """`scene`: show what every camera sees."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -9,13 +10,16 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
+    COUNT,
     FILE_ONLY,
     IMAGE_SIZE,
     NOT_NEGATIVE,
     TASK,
+    UNIQUE,
     VIEWS,
     default_text,
     task_config,
+    within,
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
@@ -27,6 +31,18 @@ app = App(
 QUALITIES = ("fast", "high")
 FILM_FRAMES = 6
 FIGURE_SUFFIXES = (".png", ".jpg", ".pdf", ".svg")
+ALL = "all"
+PLAIN = "plain"
+FAMILIES = {
+    ALL: ("", *names.APPEARANCES),
+    names.TRAIN: names.TRAIN_APPEARANCES,
+    names.HELDOUT: names.HELDOUT_APPEARANCES,
+    PLAIN: ("",),
+    **{name: (name,) for name in names.APPEARANCES},
+}
+"""Value of --appearance → families."""
+LOOKS = Parameter.combine(UNIQUE, Parameter(choices=tuple(FAMILIES), metavar="NAME[,NAME]"))
+AT_MOST_FIVE = Parameter.combine(within(0, 5), Parameter(metavar="N"))
 
 
 @Parameter(name="*")
@@ -43,6 +59,10 @@ class Options:
         sheet: File to write.
         film: Draw a film strip of the expert in every subtask instead, in the first view.
         axes: Draw every axis of `robustness` at every strength instead, in the first view.
+        looks: Draw families of looks instead, a row each: every view at seeds from --seed on.
+        appearance: Families of --looks: all, train, heldout, plain, or names.
+        draws: Seeds of --looks.
+        distractors: Most things that lie about in --looks, 0 to 5.
     """
 
     task: Annotated[str, TASK] = "grasp"
@@ -55,6 +75,10 @@ class Options:
     ] = None
     film: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
     axes: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
+    looks: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
+    appearance: Annotated[tuple[str, ...], LOOKS] = (ALL,)
+    draws: Annotated[int, COUNT] = 2
+    distractors: Annotated[int, AT_MOST_FIVE] = 0
     env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
@@ -70,6 +94,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         return _film(options.film, options, console)
     if options.axes:
         return _axes(options.axes, options, console)
+    if options.looks:
+        return _looks(options.looks, options, console)
     config = task_config(options.task, options.env)
     path = options.sheet or folders.OUTPUTS / f"scene-{options.task}.png"
     folders.check_file(path, "--sheet", FIGURE_SUFFIXES)
@@ -173,3 +199,34 @@ def _axes(path: Path, options: Options, console: Console) -> dict[str, object]:
     figure.savefig(path, dpi=100)
     console.say(f"sheet: {path}")
     return {"axes": {axis: AXES[axis].text for axis in shown}, "sheet": str(path), "view": view}
+
+
+def _looks(path: Path, options: Options, console: Console) -> dict[str, object]:
+    """Draw a row of images for every family of looks: each view of the start, seed after seed."""
+    from surgicai_vision.envs import contact_sheet
+
+    folders.check_file(path, "--looks", FIGURE_SUFFIXES)
+    config = task_config(options.task, options.env)
+    # A family that is named twice, as by "all" and by itself, is drawn once.
+    families = tuple(dict.fromkeys(one for name in options.appearance for one in FAMILIES[name]))
+    seeds = range(options.seed, options.seed + options.draws)
+    rows = []
+    with console.stage("rendering", "looks") as progress:
+        for done, family in enumerate(families):
+            axes = dataclasses.replace(
+                config.randomisation, appearance=family, distractors=options.distractors
+            )
+            images = contact_sheet.start_images(
+                dataclasses.replace(config, randomisation=axes),
+                options.view,
+                seeds,
+                options.size,
+                options.quality,
+            )
+            rows.append((family or PLAIN, images))
+            progress(done + 1, len(families))
+    columns = [f"{view}, seed {seed}" for seed in seeds for view in options.view]
+    figure = contact_sheet.sheet(rows, columns, f"looks: the start of {options.task}")
+    figure.savefig(path, dpi=80)
+    console.say(f"sheet: {path}")
+    return {"looks": [name for name, _ in rows], "sheet": str(path), "views": list(options.view)}

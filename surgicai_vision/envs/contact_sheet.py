@@ -57,6 +57,21 @@ def state_renderer(config: TaskConfig, size: int, quality: str = "high") -> Iter
         env.close()
 
 
+def start_images(
+    config: TaskConfig, views: Sequence[str], seeds: Sequence[int], size: int, quality: str
+) -> list[Image]:
+    """Return the starts of episodes, (size, size, 3) each: seed after seed in all the views."""
+    env = make(config, obs_type="state")
+    images = []
+    for seed in seeds:
+        env.reset(seed=seed)
+        for view in views:
+            frame = env.image(view, (size, size), names.RGB, quality)
+            images.append(coloured(frame, names.RGB))
+    env.close()
+    return images
+
+
 def coloured(frame: Frame, modality: str) -> Image:
     """Return a frame as RGB (H, W, 3): depth by a colour map, segmentation by a palette."""
     if modality == names.RGB:

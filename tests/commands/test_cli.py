@@ -18,6 +18,7 @@ from surgicai_vision.commands import COMMANDS, dataset, evaluate, policy, quicks
 from surgicai_vision.commands.console import QuietConsole
 from surgicai_vision.commands.main import INTERRUPTED, main
 from surgicai_vision.commands.options import COUNT, FILE_ONLY, VIEWS
+from surgicai_vision.core import names
 from surgicai_vision.core.config import SceneConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.core.files import configs_folder
@@ -397,3 +398,13 @@ def test_scene_draws_the_sheet(capsys, tmp_path):
     assert result["views"] == ["front", "back"]
     assert result["success"] is True
     assert (tmp_path / "a" / "sheet.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_scene_draws_looks(capsys, tmp_path):
+    arguments = ["scene", "--looks", "looks.png", "--view", "front", "--size", "32", "--draws", "1"]
+    assert main([*arguments, "--appearance", "train,plain", "--quality", "fast", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert result["looks"] == [*names.TRAIN_APPEARANCES, "plain"]
+    assert (tmp_path / "looks.png").read_bytes().startswith(b"\x89PNG")
+    assert "'mucos'" in fails(capsys, *arguments, "--appearance", "mucos")
+    assert "6" in fails(capsys, *arguments, "--distractors", "6")

@@ -95,7 +95,7 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
         diffuse=[0.0, 0.0, 0.0],
         specular=[0.0, 0.0, 0.0],
         attenuation=[SPOT_NEAR, 0.0, falloff],
-        castshadow=True,
+        castshadow=False,  # it would spot the instruments, and hide behind them
     )
     # Times the extent: a smaller shadow map shows stripes towards its edge.
     spec.visual.map.shadowclip = 9.0

@@ -46,7 +46,7 @@ def darker(colour: Colour, factor: float) -> Colour:
 
 def silicone(rng: np.random.Generator, size: Size = TISSUE_SIZE) -> Image:
     """Draw a training pad: one colour, faint casting marks, specks of pigment, no vessels."""
-    base = mixed(rng, (232.0, 196.0, 172.0), (222.0, 168.0, 156.0))
+    base = mixed(rng, (222.0, 186.0, 164.0), (214.0, 160.0, 148.0))
     share = 0.7 * fractal(rng, size, 4, 2, 3) + 0.3 * noise(rng, size, 256, 128)
     image = shaded(share, darker(base, 0.90), darker(base, 1.05))
     image = over(image, darker(base, 0.72), 0.5 * spots(rng, size, int(rng.integers(20, 90)), 1, 2))
@@ -86,16 +86,16 @@ def skin(rng: np.random.Generator, size: Size = TISSUE_SIZE) -> Image:
 
 
 def muscle(rng: np.random.Generator, size: Size = TISSUE_SIZE) -> Image:
-    """Draw muscle: red fibres along the wound in bundles, with pale fascia between them."""
-    base = mixed(rng, (176.0, 60.0, 54.0), (150.0, 40.0, 44.0))
-    sway = (60 * noise(rng, size, 6, 2)).astype(np.int64)
-    columns = (np.arange(size[1]) + sway) % size[1]
-    rows = np.arange(size[0])[:, None]
-    bundles = fractal(rng, size, 4, 26, 2)[rows, columns]
-    fibres = noise(rng, size, 24, 192)[rows, columns]
+    """Draw muscle: red fibres across the wound in bundles, with pale fascia between them."""
+    base = mixed(rng, (164.0, 64.0, 58.0), (138.0, 46.0, 48.0))
+    sway = (90 * noise(rng, size, 4, 4)).astype(np.int64)
+    rows = (np.arange(size[0])[:, None] + sway) % size[0]
+    columns = np.arange(size[1])
+    bundles = fractal(rng, size, 52, 3, 2)[rows, columns]
+    fibres = noise(rng, size, 384, 12)[rows, columns]
     image = shaded(0.6 * bundles + 0.4 * fibres, darker(base, 0.62), base, darker(base, 1.30))
-    fascia = lines(rng, size, 2, 9, 5)[rows, columns]
-    image = over(image, (226.0, 186.0, 172.0), float(rng.uniform(0.35, 0.65)) * fascia)
+    fascia = lines(rng, size, 18, 2, 5)[rows, columns]
+    image = over(image, (222.0, 184.0, 170.0), float(rng.uniform(0.35, 0.65)) * fascia)
     image = over(image, (96.0, 18.0, 34.0), 0.6 * trees(rng, size, 3, 220, 1.5, 0.15))
     return to_bytes(_wet(rng, image, size, 18, float(rng.uniform(0.5, 0.9))))
 
