@@ -16,6 +16,9 @@ Physics, images, resets and workers, each against the bare thing at equal settin
   calling thread.
 * crop: `env.image` of a crop against a camera that aims at the jaws, as 0.1 had it: the same size,
   stand and field of view.
+* looks: frames of episodes each with a look of its own (`randomisation: appearance`) against the
+  same episodes again, whose looks are drawn already, and against episodes of the plain look. An
+  episode is a reset and 200 observations of two views.
 * reset: per task [ms].
 * workers: two worker processes against one, steps of all envs a second: gymnasium's asynchronous
   vector env (`async_…`, an env a worker) and ours (`shares_…`, `--share` envs a worker), with state
@@ -50,8 +53,8 @@ from common import emit, median
 from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import CAMERAS
-from surgicai_vision.core.config import SceneConfig, TaskConfig
-from surgicai_vision.core.tasks import env_id
+from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig
+from surgicai_vision.core.tasks import SUBTASK_STEPS, env_id
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.scene.arm import GRASP_DEPTH
 from surgicai_vision.scene.cameras import crop_of
@@ -301,6 +304,45 @@ def _set_quality(model: mujoco.MjModel) -> None:
     visual.numquads = quality.quads
 
 
+def measure_looks(repeats: int) -> dict[str, Any]:
+    """Time the images of episodes with new looks, with looks seen before, and with none."""
+    plain, looking = (
+        envs.make(
+            TaskConfig("place", randomisation=RandomisationConfig(appearance=appearance)),
+            obs_type="pixels",
+            cameras=("front", "back"),
+            image_size=SIZE,
+        )
+        for appearance in ("", names.TRAIN)
+    )
+
+    def episode(env: envs.SuturingEnv, seed: int) -> float:
+        def run() -> None:
+            env.reset(seed=seed)
+            for _ in range(SUBTASK_STEPS):
+                env.observe()
+
+        return timed(run)
+
+    for env in (plain, looking):
+        episode(env, 0)
+    times = np.array(
+        [
+            (episode(looking, seed), episode(looking, seed), episode(plain, seed))
+            for seed in range(1, repeats + 1)
+        ]
+    )
+    frames = 2 * SUBTASK_STEPS
+    new, again, without = times.T.tolist()
+    return {
+        "new_looks_frames_per_s": round(frames / median(new, 9)),
+        "same_looks_frames_per_s": round(frames / median(again, 9)),
+        "plain_frames_per_s": round(frames / median(without, 9)),
+        "new_of_same": ratio(again, new),
+        "new_of_plain": ratio(without, new),
+    }
+
+
 def measure_reset(repeats: int) -> dict[str, float]:
     """Return the median time of a reset per task [ms]."""
     row = {}
@@ -369,7 +411,7 @@ def measure_help(repeats: int) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print one JSON line."""
-    parts = ("step", "tissue", "frames", "crop", "reset", "workers", "help")
+    parts = ("step", "tissue", "frames", "crop", "looks", "reset", "workers", "help")
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -393,6 +435,8 @@ def main() -> None:
         row["frames"] = measure_frames(chosen.repeats, chosen.frames)
     if "crop" in chosen.only:
         row["crop"] = measure_crop(chosen.repeats, chosen.frames)
+    if "looks" in chosen.only:
+        row["looks"] = measure_looks(chosen.repeats)
     if "reset" in chosen.only:
         row["reset_ms"] = measure_reset(chosen.repeats)
     if "help" in chosen.only:
@@ -406,7 +450,7 @@ def main() -> None:
             for kind in ("state", "pixels")
         }
     row["load_average"] = [round(value, 2) for value in os.getloadavg()]
-    emit("speed", row, render=bool({"frames", "crop"} & {*chosen.only}))
+    emit("speed", row, render=bool({"frames", "crop", "looks"} & {*chosen.only}))
 
 
 if __name__ == "__main__":

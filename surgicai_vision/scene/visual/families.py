@@ -155,8 +155,8 @@ NARROW = Lamps(
     lean=0.2,
     fill=(0.0, 0.05),
     spot=(1.10, 1.35),
-    cutoff=(24.0, 32.0),
-    exponent=(10.0, 18.0),
+    cutoff=(38.0, 46.0),
+    exponent=(14.0, 24.0),
     glare=(0.8, 1.1),
 )
 SUNSET = Lamps(

@@ -88,7 +88,7 @@ def skin(rng: np.random.Generator, size: Size = TISSUE_SIZE) -> Image:
 def muscle(rng: np.random.Generator, size: Size = TISSUE_SIZE) -> Image:
     """Draw muscle: red fibres across the wound in bundles, with pale fascia between them."""
     base = mixed(rng, (164.0, 64.0, 58.0), (138.0, 46.0, 48.0))
-    sway = (90 * noise(rng, size, 4, 4)).astype(np.int64)
+    sway = (56 * noise(rng, size, 4, 4)).astype(np.int64)
     rows = (np.arange(size[0])[:, None] + sway) % size[0]
     columns = np.arange(size[1])
     bundles = fractal(rng, size, 52, 3, 2)[rows, columns]
