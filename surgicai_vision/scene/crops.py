@@ -31,6 +31,8 @@ SPAN = 0.050
 and "back" have 0.43 and 0.47; two and a half needles, and the jaws at their middle."""
 CROPPED = (0.0, 0.050, 0.075)
 """Point in world [m] at whose distance that holds: between the holes and the needle's home."""
+LARGEST = 16384
+"""Largest side of a whole image [pixel]: OpenGL's largest viewport, in Mesa as on GPUs."""
 NEAREST = 0.001
 """Distance along the camera's axis [m] that a point has at least: none lies behind the lens."""
 
@@ -61,16 +63,23 @@ def whole_size(crop: Crop, fovy: float, height: int, width: int) -> tuple[int, i
         width: of the crop [pixel].
 
     Raises:
-        InputError: the crop is larger than the image it is cut from.
+        InputError: the crop is larger than the image it is cut from, or that image has too many
+            pixels.
     """
     seen = 2.0 * crop.distance * math.tan(fovy / 2.0)
     whole = round(height * seen / crop.span)
     across = round(whole * crop.aspect)
     if whole < height or across < width:
         raise InputError(
-            f"A crop of {height} × {width} pixels that spans {crop.span * 1e3:.0f} mm does not fit "
+            f"A crop of {height} × {width} pixels that spans {crop.span * 1e3:g} mm does not fit "
             f"into the image of '{crop.camera}', which is {whole} × {across} at that resolution; "
             "take a smaller span or a narrower image."
+        )
+    if max(whole, across) > LARGEST:
+        raise InputError(
+            f"A crop of {height} × {width} pixels that spans {crop.span * 1e3:g} mm is cut from an "
+            f"image of {whole} × {across}; at most {LARGEST} a side can be drawn: take a larger "
+            "span or a smaller image."
         )
     return whole, across
 

@@ -167,6 +167,8 @@ def test_a_window_stays_within_its_image() -> None:
 def test_a_crop_larger_than_its_image_is_refused() -> None:
     with pytest.raises(InputError, match="spans 200 mm does not fit"):
         whole_size(Crop("front", names.PSM2, distance=0.1, span=0.2), 0.9, *SIZE)
+    with pytest.raises(InputError, match="at most 16384"):
+        whole_size(Crop("front", names.PSM2, distance=0.1, span=0.0005), 0.9, *SIZE)
     with pytest.raises(InputError, match="narrower image"):
         envs.make(TaskConfig(), "pixels", ("front_psm2",), image_size=(100, 400))
 
