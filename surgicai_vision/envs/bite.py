@@ -46,7 +46,11 @@ class Bite:
 
 @dataclass
 class Passage:
-    """A bite as `Tissue` keeps it: in the phantom's frame, flanks by their index in `Ridge`."""
+    """A bite as `Tissue` keeps it: in the phantom's frame, flanks by their index in `Ridge`.
+
+    `entry_now` and `exit_now` are where the pierced places lie since the tissue gave way; the
+    others are as in `Bite`.
+    """
 
     entry: Point
     entry_flank: int
@@ -56,8 +60,10 @@ class Passage:
     length: float = 0.0
     tears: int = 0
     is_done: bool = False
+    entry_now: Point = HIDDEN
+    exit_now: Point = HIDDEN
 
-    SIZE: ClassVar[int] = 12
+    SIZE: ClassVar[int] = 18
     """Numbers of a packed passage."""
 
     @property
@@ -76,6 +82,8 @@ class Passage:
             self.length,
             self.tears,
             self.is_done,
+            *self.entry_now,
+            *self.exit_now,
         ]
 
     @classmethod
@@ -90,4 +98,6 @@ class Passage:
             length=values[9],
             tears=int(values[10]),
             is_done=bool(values[11]),
+            entry_now=(values[12], values[13], values[14]),
+            exit_now=(values[15], values[16], values[17]),
         )

@@ -9,6 +9,7 @@ from surgicai_vision.core import names
 from surgicai_vision.envs.calibration import Calibration
 from surgicai_vision.envs.observation import ObservationConfig
 from surgicai_vision.envs.simulation import Simulation
+from surgicai_vision.envs.skin import Skin
 from surgicai_vision.scene.cameras import stand
 from surgicai_vision.scene.rendering import Frame, FrameRenderer
 
@@ -23,6 +24,7 @@ class Images:
 
     def __init__(self, simulation: Simulation, calibration: Calibration):
         self._simulation = simulation
+        self._skin: Skin | None = None
         self._calibration = calibration
         self._renderer: FrameRenderer | None = None
         self._stands: dict[str, str] = {}
@@ -64,5 +66,9 @@ class Images:
             quality,
         ):
             self.close()
-            renderer = self._renderer = FrameRenderer(self._simulation.model, *size, quality)
+            tissue = self._simulation.tissue
+            if tissue is not None and self._skin is None:
+                self._skin = Skin(self._simulation, tissue)
+            renderer = FrameRenderer(self._simulation.model, *size, quality, self._skin)
+            self._renderer = renderer
         return renderer

@@ -90,6 +90,11 @@ class NeedleHolds:
         way = self._arc.radius * (carrier - self.angle(index))
         return self._forces.lateral_stiffness * way
 
+    def carried(self, index: int) -> Point:
+        """Return where the shaft has dragged the tissue to, in the phantom's frame [m]."""
+        x, y, z = self._data.site_xpos[self._site[index]].tolist()
+        return self._ridge.to_phantom((x, y, z))
+
     def anchor(self, index: int) -> Point:
         """Return where it is held, in the phantom's frame [m]."""
         return self._anchors[index]

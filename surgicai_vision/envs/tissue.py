@@ -173,6 +173,30 @@ class Tissue:
             path=tuple(self._ridge.to_world(point) for point in path),
         )
 
+    @property
+    def passages(self) -> tuple[Passage, ...]:
+        """Return the bites as they are kept, in the phantom's frame; not to be written."""
+        return tuple(self._passages)
+
+    @property
+    def ridge(self) -> Ridge:
+        """Return the phantom's frame and surface."""
+        return self._ridge
+
+    def held_at_skin(self) -> list[tuple[Point, Point]]:
+        """Return where the skin holds the needle, in the phantom's frame [m].
+
+        The place at rest, and where the shaft has dragged it to.
+        """
+        return [
+            (self._holds.anchor(index), self._holds.carried(index)) for index in self._skin_holds
+        ]
+
+    @property
+    def _skin_holds(self) -> tuple[int, ...]:
+        """Return the holds that are in the skin, not in the middle of the way."""
+        return {OUTSIDE: (), INSIDE: (0,), THROUGH: (0, 1), TRAILING: (1,)}[self.stage]
+
     def passed(self, pair: HolePair) -> int:
         """Return how many flanks of a stitch the needle passed in the direction of travel.
 
@@ -254,7 +278,17 @@ class Tissue:
             _STAGES[self.stage](self)
             if self.stage != OUTSIDE:
                 self._count_tears(self._holds.give_way())
+                self._note_skin()
         self._follow_thread()
+
+    def _note_skin(self) -> None:
+        """Note where the pierced places lie now."""
+        passage = self._passages[-1]
+        for index in self._skin_holds:
+            if index == 0:
+                passage.entry_now = self._holds.anchor(0)
+            else:
+                passage.exit_now = self._holds.anchor(1)
 
     def embed(self) -> None:
         """Begin anew with a needle that was put where it is: in the tissue or outside.

@@ -169,7 +169,7 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     if config.grasp == "attach":
         for name in names.ARMS:
             arm.add_weld(spec, name)
-    materials.dress(spec, config.layout, config.instrument)
+    materials.dress(spec, config.layout, config.instrument, config.tissue)
     add_cameras(spec, names.CAMERAS, config.instrument)
     return spec
 

@@ -15,6 +15,7 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -52,14 +53,41 @@ MAX_SIDE = 4096
 """Largest height and width of an image [pixel]."""
 
 
+class Following(Protocol):
+    """Meshes that follow the state, as the skin of soft tissue does (`envs.skin`)."""
+
+    meshes: tuple[int, ...]
+    """Their ids."""
+
+    def follow(self) -> object:
+        """Write the meshes of the present state into the model; return what they show.
+
+        Meshes that show the same are not uploaded again.
+        """
+
+
 class FrameRenderer:
     """Images of one model at one size. Close it, or use it as a context manager.
 
     Use a renderer in the thread and the process that made it.
     """
 
-    def __init__(self, model: mujoco.MjModel, height: int, width: int, quality: str = "fast"):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        height: int,
+        width: int,
+        quality: str = "fast",
+        skin: Following | None = None,
+    ):
         """Prepare images of `height` × `width` [pixel] in quality "fast" or "high".
+
+        Args:
+            model: the model.
+            height: of the images [pixel].
+            width: of the images [pixel].
+            quality: a key of `QUALITIES`.
+            skin: meshes of the model that follow the state, if it has any.
 
         Raises:
             UnknownName: another quality.
@@ -75,6 +103,7 @@ class FrameRenderer:
         self.height = int(height)
         self.width = int(width)
         self.quality = quality
+        self._skin = skin
         self._cameras: dict[str, mujoco.MjvCamera] = {}
         self._target: _Target | None = _acquire(model, self.height, self.width, quality)
 
@@ -116,7 +145,7 @@ class FrameRenderer:
         if target.lost:  # a forked child of the process that made it
             target = self._target = _acquire(self.model, self.height, self.width, self.quality)
         view = self._cameras.get(camera) or self._view(camera)
-        return target.draw(data, view, wanted, area)
+        return target.draw(data, view, wanted, area, self._skin)
 
     def _area(self, window: Window | None) -> mujoco.MjrRect:
         """Return where the whole image lies about what is drawn, OpenGL's rows going up."""
@@ -184,6 +213,7 @@ class _Target:
         self.codes = np.zeros(0, dtype=np.uint8)
         self.look = appearance.shown(model)
         self.painted = [0.0] * len(self.look)
+        self.skin: object = None
 
     def draw(
         self,
@@ -191,6 +221,7 @@ class _Target:
         view: mujoco.MjvCamera,
         wanted: tuple[str, ...],
         area: mujoco.MjrRect,
+        skin: Following | None,
     ) -> dict[str, Frame]:
         """Return the wanted modalities from at most two passes.
 
@@ -203,6 +234,12 @@ class _Target:
             appearance.paint(self.model, self.context)
             self.painted = numbers
             self.codes = np.zeros(0, dtype=np.uint8)
+        if skin is not None:
+            shown = skin.follow()
+            if shown != self.skin:
+                for mesh in skin.meshes:
+                    mujoco.mjr_uploadMesh(self.model, self.context, mesh)
+                self.skin = shown
         # Another target may have drawn since; without this its buffer would be drawn over and read.
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value

@@ -160,6 +160,7 @@ def draw_look(appearance: Appearance) -> Look:
         "shaft": family.shaft,
     }
     materials = {name: _material(rng, finish) for name, finish in finishes.items()}
+    materials["faded_ink"] = materials["ink"]
     ambient, head, lamps = _lamps(rng, family.lamps)
     return Look(materials, ambient, head, lamps)
 

@@ -15,7 +15,15 @@ from surgicai_vision.core.names import ARMS, PSM1, PSM2
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.phantom import ORIGIN, SIZE, TABLE
-from surgicai_vision.scene.visual import appearance, distractors, shapes, skin, textures, tool
+from surgicai_vision.scene.visual import (
+    appearance,
+    distractors,
+    shapes,
+    skin,
+    soft_skin,
+    textures,
+    tool,
+)
 from surgicai_vision.scene.visual.shapes import hide, show
 
 DRAPE_X = (0.04, 0.08, 0.13, 0.19, 0.27, 0.40, 0.60, 0.90)
@@ -35,6 +43,9 @@ MATERIALS: dict[str, Mapping[str, float | list[float]]] = {
     "flesh": {"rgba": [0.78, 0.45, 0.41, 1.0], "specular": 0.1, "shininess": 0.2},
     "inside": {"rgba": [0.30, 0.07, 0.08, 1.0], "specular": 0.1, "shininess": 0.2},
     "ink": {"rgba": [0.16, 0.10, 0.42, 1.0], "specular": 0.05, "shininess": 0.1},
+    "faded_ink": {"rgba": [0.16, 0.10, 0.42, 0.45], "specular": 0.05, "shininess": 0.1},
+    "wound": {"rgba": [0.28, 0.02, 0.03, 1.0], "specular": 0.6, "shininess": 0.6},
+    "halo": {"rgba": [0.70, 0.10, 0.10, 0.35], "specular": 0.3, "shininess": 0.3},
     "drape": {"rgba": [1.0, 1.0, 1.0, 1.0], "specular": 0.0, "shininess": 0.0},
     "tray": {"rgba": [0.72, 0.74, 0.74, 1.0], "specular": 0.2, "shininess": 0.3},
     "needle": {"rgba": [0.97, 0.98, 1.0, 1.0], "specular": 1.0, "shininess": 0.9},
@@ -113,9 +124,18 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
     distractors.add_distractors(spec)
 
 
-def dress(spec: mujoco.MjSpec, layout: str = "simple", instrument: str = "400006") -> None:
+def dress(
+    spec: mujoco.MjSpec,
+    layout: str = "simple",
+    instrument: str = "400006",
+    tissue: str = "channels",
+) -> None:
     """Give finished bodies their visible shape and hide the physical geoms beneath it."""
-    _dress_phantom(spec, layout)
+    if tissue == "soft":
+        hide(spec.body("phantom"))
+        soft_skin.add_soft_skin(spec, spec.body("phantom"), layout)
+    else:
+        _dress_phantom(spec, layout)
     dress_needle(spec)
     length = INSTRUMENTS[instrument].pitch_to_yaw
     tool.add_tool_meshes(spec, length)

@@ -46,7 +46,7 @@ def add_skin(spec: mujoco.MjSpec, layout: str) -> None:
     _ink(pairs).add_to(spec, "ink")
 
 
-def _flank(hole: Hole, height: float, offset: float) -> Array:
+def flank_line(hole: Hole, height: float, offset: float) -> Array:
     """Return foot, lower and upper edge of the hole, and top of one flank, (4, 2): x and z [m].
 
     Args:
@@ -62,7 +62,7 @@ def _flank(hole: Hole, height: float, offset: float) -> Array:
     return points[:, [0, 2]]
 
 
-def _crest(pair: HolePair, height: float, offset: float, count: int) -> Array:
+def crest_line(pair: HolePair, height: float, offset: float, count: int) -> Array:
     """Return `count` points over the ridge's top between the two flanks, (count, 2)."""
     tilt = abs(pair.entry.tilt)
     x = (pair.entry.centre[0] + pair.exit.centre[0]) / 2
@@ -74,7 +74,7 @@ def _crest(pair: HolePair, height: float, offset: float, count: int) -> Array:
 def _profile(pair: HolePair) -> Array:
     """Return the skin's section at one pair, (points, 2), from -x to +x."""
     height = flank_height(pair, pair.entry)
-    left, right = (_flank(hole, height, LIFT) for hole in (pair.entry, pair.exit))
+    left, right = (flank_line(hole, height, LIFT) for hole in (pair.entry, pair.exit))
     edge = SIZE[0] / 2
     sides = []
     for flank, end in ((left, ORIGIN[0] - edge), (right, ORIGIN[0] + edge)):
@@ -84,7 +84,7 @@ def _profile(pair: HolePair) -> Array:
         share = np.linspace(0.0, 1.0, 5)[1:, None]
         fillet = (1 - share) ** 2 * flat[-1] + 2 * share * (1 - share) * foot + share**2 * above
         sides.append(np.concatenate([flat + np.array([0.0, LIFT]), fillet, flank[1:]]))
-    return np.concatenate([sides[0], _crest(pair, height, LIFT, 5), sides[1][::-1]])
+    return np.concatenate([sides[0], crest_line(pair, height, LIFT, 5), sides[1][::-1]])
 
 
 LEFT_HOLE = BESIDE + 4
@@ -105,8 +105,8 @@ def _rows(pairs: Sequence[HolePair], profiles: Sequence[Array]) -> list[tuple[fl
             (-reach, False),
         ):
             rows.append((y + shift, profile, opens))
-    first = _flattened(profiles[0])
-    last = _flattened(profiles[-1])
+    first = flattened(profiles[0])
+    last = flattened(profiles[-1])
     far = [ORIGIN[1] + SIZE[1] / 2, ORIGIN[1] - SIZE[1] / 2]
     # A short strip beside the ridge's end keeps its slope out of the flat tissue's normals.
     head = [
@@ -120,7 +120,7 @@ def _rows(pairs: Sequence[HolePair], profiles: Sequence[Array]) -> list[tuple[fl
     return head + full[0] + rows + full[1] + tail
 
 
-def _flattened(profile: Array) -> Array:
+def flattened(profile: Array) -> Array:
     """Return the section where the ridge has ended."""
     flat = profile.copy()
     flat[:, 1] = SURFACE + LIFT
@@ -153,9 +153,11 @@ def _inside(pairs: tuple[HolePair, ...]) -> Mesh:
     sections = []
     for pair in pairs:
         height = flank_height(pair, pair.entry)
-        inner = [_flank(hole, height, -WALL) for hole in (pair.entry, pair.exit)]
-        outer = [_flank(hole, height, LIFT) for hole in (pair.entry, pair.exit)]
-        sections.append(np.concatenate([inner[0], _crest(pair, height, -WALL, 1), inner[1][::-1]]))
+        inner = [flank_line(hole, height, -WALL) for hole in (pair.entry, pair.exit)]
+        outer = [flank_line(hole, height, LIFT) for hole in (pair.entry, pair.exit)]
+        sections.append(
+            np.concatenate([inner[0], crest_line(pair, height, -WALL, 1), inner[1][::-1]])
+        )
         for near, far in zip(outer, inner, strict=True):
             _add_walls(mesh, near[1:3], far[1:3], pair.entry.centre[1])
     # Column 1 of `_flank` is the lower edge of a hole: 1..2 on the left, 6..7 on the right of nine

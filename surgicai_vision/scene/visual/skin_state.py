@@ -1,0 +1,68 @@
+"""Skin state: what soft skin shows, as plain numbers in the phantom's frame.
+
+* pulls: places of the skin that are taken along, inwards by a needle or jaws that press, outwards
+  by a tip that lifts it from inside, sideways by a needle that is held there. The skin between
+  follows a bell of the pull's reach.
+* wounds: dark spots where it was pierced, longer where it tore. They stay.
+* which pair is to be sewn: its marks are larger and darker.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.scene.holes import Point
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pull:
+    """A place of the skin that is taken along.
+
+    Attributes:
+        place: on the undeformed skin [m].
+        way: from there [m].
+        reach: of the bell about it [m]: at this distance the skin follows by 1 / e.
+    """
+
+    place: Point
+    way: Point
+    reach: float
+
+
+@dataclass(frozen=True)
+class Wound:
+    """A wound from `start` to `end` on the undeformed skin [m]; of a puncture they are the same."""
+
+    start: Point
+    end: Point
+
+
+@dataclass(frozen=True)
+class SkinState:
+    """What the skin shows; see the module's docstring. `pair` is the index of the pair to sew."""
+
+    pair: int = 0
+    pulls: tuple[Pull, ...] = ()
+    wounds: tuple[Wound, ...] = ()
+
+
+def displaced(points: Array, pulls: tuple[Pull, ...]) -> Array:
+    """Return points where the pulls take them.
+
+    One pull takes its place all the way; of several near each other the stronger prevails: each
+    counts by its weight w, and the sum of w² × way is divided by that of w.
+    """
+    if not pulls:
+        return points
+    total = np.full(len(points), 1e-12)
+    moved = np.zeros_like(points)
+    for pull in pulls:
+        square = ((points - pull.place) ** 2).sum(axis=1)
+        weight = np.exp(-square / pull.reach**2)
+        total += weight
+        moved += (weight**2)[:, None] * pull.way
+    result: Array = points + moved / total[:, None]
+    return result
