@@ -98,7 +98,7 @@ class Skin:
             return []
         tip = self._point(self._simulation.tip_angle)
         height, normal = self._surface(tip)
-        if not 0.0 < height + AHEAD < 4 * AHEAD:
+        if not 0.0 < height + AHEAD < DENT:
             return []
         return [_along(tip, height, normal, height + AHEAD, LIFT_REACH)]
 
