@@ -63,6 +63,8 @@ class Options:
         appearance: Families of --looks: all, train, heldout, plain, or names.
         draws: Seeds of --looks.
         distractors: Most things that lie about in --looks, 0 to 5.
+        needles: Draw every needle that randomisation can draw instead, in the first view.
+        placements: Draw the phantom's places and pairs instead, in the first view.
     """
 
     task: Annotated[str, TASK] = "grasp"
@@ -79,6 +81,8 @@ class Options:
     appearance: Annotated[tuple[str, ...], LOOKS] = (ALL,)
     draws: Annotated[int, COUNT] = 2
     distractors: Annotated[int, AT_MOST_FIVE] = 0
+    needles: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
+    placements: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
     env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
@@ -96,6 +100,10 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         return _axes(options.axes, options, console)
     if options.looks:
         return _looks(options.looks, options, console)
+    if options.needles:
+        return _world(options.needles, "needles", options, console)
+    if options.placements:
+        return _world(options.placements, "placements", options, console)
     config = task_config(options.task, options.env)
     path = options.sheet or folders.OUTPUTS / f"scene-{options.task}.png"
     folders.check_file(path, "--sheet", FIGURE_SUFFIXES)
@@ -230,3 +238,19 @@ def _looks(path: Path, options: Options, console: Console) -> dict[str, object]:
     figure.savefig(path, dpi=80)
     console.say(f"sheet: {path}")
     return {"looks": [name for name, _ in rows], "sheet": str(path), "views": list(options.view)}
+
+
+def _world(path: Path, kind: str, options: Options, console: Console) -> dict[str, object]:
+    """Draw every needle, or the phantom at every place."""
+    from surgicai_vision.envs import contact_sheet, world_sheet
+
+    folders.check_file(path, f"--{kind}", FIGURE_SUFFIXES)
+    config = task_config(options.task, options.env)
+    view = options.view[0]
+    draw = {"needles": world_sheet.needle_rows, "placements": world_sheet.placement_rows}[kind]
+    with console.stage("rendering"):
+        rows, columns = draw(config.scene, view, options.seed, options.size, options.quality)
+    figure = contact_sheet.sheet(rows, columns, f"{kind} of a world that varies, seen by {view}")
+    figure.savefig(path, dpi=110)
+    console.say(f"sheet: {path}")
+    return {"sheet": str(path), "view": view, "seed": options.seed}

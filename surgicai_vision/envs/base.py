@@ -14,8 +14,9 @@
 * Truncation: `max_steps`.
 """
 
+from collections.abc import Mapping, Sequence
 from math import isfinite
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import gymnasium
 import mujoco
@@ -102,15 +103,23 @@ class SuturingEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, object] | None = None
     ) -> tuple[Observation, Info]:
-        """Draw a start state; `seed` makes it reproducible."""
+        """Draw a start state; `seed` makes it reproducible.
+
+        Args:
+            seed: of all that is drawn.
+            options: `randomisation`: axis → numbers in place of those that are drawn, as
+                `info["randomisation"]` reports them; the env must have some randomisation.
+        """
         super().reset(seed=seed)
+        given = cast(Mapping[str, Sequence[float]], (options or {}).get("randomisation", {}))
         simulation = self.simulation
         first = self._subtasks[0]
         axes = self.config.randomisation
-        if axes.on:
+        if axes.on or given:
             # Numbers of their own: a start is the same whatever is randomised, so that evaluations
             # can be paired.
-            simulation.randomise(randomisation.draw(axes, self.np_random.spawn(1)[0]))
+            draws = randomisation.draw(axes, self.np_random.spawn(1)[0])
+            simulation.randomise(randomisation.with_numbers(draws, given))
             self._meet_draws()
         for _ in range(START_DRAWS):
             simulation.reset()

@@ -6,7 +6,7 @@
   the smallest needle of every arc that may be drawn.
 * Reach: the joints of both arms along the needle's whole way, with nominal grasps, for the corners
   of the phantom's places. (A start whose own, imperfect grasp is out of reach is drawn again.)
-* View: with the phantom's place varied, both holes stay in the image of `VIEW`.
+* View: with the phantom's place varied, both holes stay in the images of `VIEWS`.
 
 Within the limits of `core.config` the layout `simple` with instrument 400006 passes the last two
 for every draw: the limits were chosen so (`tests/envs/test_feasibility.py`).
@@ -36,10 +36,12 @@ from surgicai_vision.envs.randomisation import TIP_ANGLES
 from surgicai_vision.envs.reach import extraction, insertion, joints_along
 from surgicai_vision.envs.starts import GRASP_ANGLES
 from surgicai_vision.scene import build_scene, needle
-from surgicai_vision.scene.holes import PAIRS, HolePair
+from surgicai_vision.scene.holes import PAIRS, HolePair, Point
 
-VIEW = "front"
-"""The camera in whose image the holes must stay: the endoscope."""
+Matrix = NDArray[np.float64]
+
+VIEWS = ("front", "endo_left", "endo_right")
+"""The cameras in whose images the holes must stay: the endoscopes."""
 
 
 def refuse_impossible(config: TaskConfig, through: bool) -> None:
@@ -159,32 +161,33 @@ def _refuse_hidden(scene: SceneConfig, axes: RandomisationConfig) -> None:
     """Refuse places of the phantom at which a hole leaves the endoscope's image."""
     for where in corners(scene, axes):
         pair = _placed(scene, where)
-        if all(_in_view(hole.centre) for hole in (pair.entry, pair.exit)):
-            continue
-        x, y = where.shift
-        raise InputError(
-            f"randomisation: with the phantom shifted by {x * 1e3:.1f}, {y * 1e3:.1f} mm "
-            f"and turned by {math.degrees(where.turn):.1f}° pair {where.pair + 1} is outside the "
-            f"image of camera '{VIEW}'. Allowed: a smaller phantom_shift or phantom_turn, "
-            "hole_pair 1 or 2, or pair: any, for which the phantom slides under the endoscope."
-        )
+        for view, hole in itertools.product(VIEWS, (pair.entry, pair.exit)):
+            if in_view(scene, view, hole.centre):
+                continue
+            x, y = where.shift
+            raise InputError(
+                f"randomisation: with the phantom shifted by {x * 1e3:.1f}, {y * 1e3:.1f} mm and "
+                f"turned by {math.degrees(where.turn):.1f}° pair {where.pair + 1} is outside the "
+                f"image of camera '{view}'. Allowed: a smaller phantom_shift or phantom_turn, "
+                "hole_pair 1 or 2, or pair: any, for which the phantom slides under the endoscope."
+            )
 
 
-@functools.cache
-def _view() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return the endoscope's place (3,), rotation (3, 3) and tangent of half its field of view."""
-    model = build_scene().model
+@functools.lru_cache(maxsize=32)
+def _camera(scene: SceneConfig, view: str) -> tuple[Matrix, Matrix, float]:
+    """Return a camera's place (3,), rotation (3, 3) and tangent of half its field of view."""
+    model = build_scene(scene).model
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
-    index = model.camera(VIEW).id
+    index = model.camera(view).id
     half = math.tan(math.radians(model.cam_fovy[index]) / 2)
     return data.cam_xpos[index].copy(), data.cam_xmat[index].reshape(3, 3).copy(), half
 
 
-def _in_view(point: tuple[float, float, float]) -> bool:
-    """Return True if a point of the world is in the endoscope's square image."""
-    place, rotation, half = _view()
+def in_view(scene: SceneConfig, view: str, point: Point) -> bool:
+    """Return True if a point of the world is in the square image of a camera."""
+    place, rotation, half = _camera(scene, view)
     x, y, z = rotation.T @ (np.asarray(point) - place)
     return bool(max(abs(x), abs(y)) < -z * half)
 

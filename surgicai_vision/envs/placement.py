@@ -6,9 +6,10 @@ centre in the scene's own model.
 
 Where the pair is drawn, the phantom first slides along the wound by `SLIDE` of the way that the
 drawn pair lies beyond the first. In place, pair 4 lies 72 mm beyond pair 1: outside the image of
-the endoscope `front`, and 104 mm from PSM1's start, for which the expert's hand-off takes 184 of
-its 200 steps. Slid by half of it, every pair is in view and at most 68 mm away
-(`tests/envs/test_world.py`). What lies on the phantom shifts and turns with it, but does not slide.
+every camera, and 104 mm from PSM1's start, for which the expert's hand-off takes 184 of its 200
+steps. Slid by two thirds of it, every pair is in view of the endoscopes and of the camera opposite,
+whatever the shift and the turn (`tests/envs/test_feasibility.py`), and at most 56 mm away. What
+lies on the phantom shifts and turns with it, but does not slide.
 """
 
 import dataclasses
@@ -23,7 +24,7 @@ from surgicai_vision.scene.phantom import ORIGIN
 
 PIVOT = (*ORIGIN, 0.0)
 """A point of the axis the phantom turns about [m, world]; the axis is vertical."""
-SLIDE = 0.5
+SLIDE = 2 / 3
 """Share of the drawn pair's way from the first by which the phantom slides back."""
 
 

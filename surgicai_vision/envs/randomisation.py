@@ -6,6 +6,7 @@ drawn whichever are on: turning one on leaves the others as they were.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from itertools import accumulate, pairwise
 from types import MappingProxyType
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import other_cameras
 from surgicai_vision.core.config import ANY, NEEDLE_ARCS, RandomisationConfig
+from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.envs import looks
 from surgicai_vision.envs.placement import SLIDE, Placement
 from surgicai_vision.scene import Scene, needle
@@ -113,6 +115,27 @@ def draw(config: RandomisationConfig, rng: np.random.Generator) -> Draws:
     values += looks.draw_appearance(config, rng).numbers
     values += looks.draw_litter(config, rng).numbers
     return tuple(value + 0.0 for value in values)  # no -0.0
+
+
+def with_numbers(draws: Draws, given: Mapping[str, Sequence[float]]) -> Draws:
+    """Return `draws` with the numbers of some axes replaced.
+
+    Args:
+        draws: one episode's numbers.
+        given: axis → its numbers, as `report` has them.
+
+    Raises:
+        UnknownName: no such axis.
+        InputError: not as many numbers as the axis has.
+    """
+    values = list(draws)
+    for axis, numbers in given.items():
+        place = _PLACES[check_name("axis of randomisation", axis, _PLACES)]
+        size = place.stop - place.start
+        if len(numbers) != size:
+            raise InputError(f"randomisation: {axis} has {size} numbers; {len(numbers)} are given.")
+        values[place] = [float(number) for number in numbers]
+    return tuple(values)
 
 
 def report(config: RandomisationConfig, draws: Draws) -> dict[str, Array | int]:

@@ -408,3 +408,11 @@ def test_scene_draws_looks(capsys, tmp_path):
     assert (tmp_path / "looks.png").read_bytes().startswith(b"\x89PNG")
     assert "'mucos'" in fails(capsys, *arguments, "--appearance", "mucos")
     assert "6" in fails(capsys, *arguments, "--distractors", "6")
+
+
+@pytest.mark.parametrize("kind", ["needles", "placements"])
+def test_scene_draws_a_world_that_varies(kind, capsys, tmp_path):
+    path = tmp_path / f"{kind}.png"
+    options = ["--view", "front", "--size", "32", "--quality", "fast"]
+    assert main(["scene", f"--{kind}", str(path), *options, "--json"]) == 0
+    assert path.read_bytes().startswith(b"\x89PNG")

@@ -80,8 +80,9 @@ def test_a_phantom_that_leaves_the_endoscopes_image_is_refused():
 @pytest.mark.parametrize("where", list(feasibility.corners(SceneConfig(), FURTHEST)))
 def test_in_every_corner_both_holes_are_in_view(where):
     pair = where.placed_pair(PAIRS["simple"][where.pair])
-    assert feasibility._in_view(pair.entry.centre)
-    assert feasibility._in_view(pair.exit.centre)
+    for view in (*feasibility.VIEWS, "back"):
+        for hole in (pair.entry, pair.exit):
+            assert feasibility.in_view(SceneConfig(), view, hole.centre)
 
 
 @pytest.mark.parametrize("where", list(feasibility.corners(SceneConfig(), FURTHEST)))
