@@ -187,6 +187,13 @@ class RandomisationConfig:
         axes = (*RANDOMISATION_LIMITS, *RANDOMISATION_CHOICES)
         return tuple(axis for axis in axes if getattr(self, axis))
 
+    @property
+    def shows_heldout(self) -> bool:
+        """Return True if episodes may look as one of the held-out families."""
+        return bool(
+            self.appearance in (names.HELDOUT, *names.HELDOUT_APPEARANCES) or self.appearance_shift
+        )
+
 
 @dataclass(frozen=True)
 class TaskConfig:

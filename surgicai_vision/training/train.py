@@ -176,6 +176,12 @@ def _check(task: _Task) -> None:
     """Refuse what cannot be trained, before any work."""
     if not isinstance(task.recipe, task.policy.recipe):
         raise InputError(f"Policy '{task.policy.name}' needs a {task.policy.recipe.__name__}.")
+    if task.features and task.dataset.config.randomisation.shows_heldout:
+        held = ", ".join(names.HELDOUT_APPEARANCES)
+        raise InputError(
+            f"The dataset shows looks that are held out for tests ({held}); record one with "
+            f"randomisation appearance: {names.TRAIN} and appearance_shift: 0."
+        )
     for entry in task.features:
         if (
             entry.manifest["dataset"] != task.dataset.fingerprint

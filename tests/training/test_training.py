@@ -14,6 +14,7 @@ from policies.base import Recipe
 from policies.bc import BC, BCPolicy
 from policies.layers import MapConvolutions, SpatialSoftmax
 from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
 from surgicai_vision.dataset.subset import with_frame_stride
 from surgicai_vision.training.checkpoint import (
@@ -272,6 +273,24 @@ def test_epoch_checkpoints_and_fine_tuning(tmp_path: Path) -> None:
     assert early.checkpoint.epoch == 5
     tuned = train(dataset, [], BC, QUICK, out=tmp_path / "b", start=load_policy(tmp_path / "a"))
     assert tuned.train_losses[0] < read_checkpoint(tmp_path / "a").train_losses[0]
+
+
+@pytest.mark.parametrize(
+    "axes", [{"appearance": "heldout"}, {"appearance": "liver"}, {"appearance_shift": 0.1}]
+)
+def test_held_out_looks_are_refused(tmp_path: Path, axes: dict[str, Any]) -> None:
+    """Images of them; a policy that sees none may train."""
+
+    def recorded(**axes: Any) -> FakeDataset:
+        randomisation = RandomisationConfig(**axes)
+        return FakeDataset(config=TaskConfig("grasp", randomisation=randomisation))
+
+    dataset = recorded(**axes)
+    with pytest.raises(InputError, match=r"held out.*appearance: train"):
+        train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "a")
+    train(dataset, [], BC, QUICK, out=tmp_path / "b")
+    shown = recorded(appearance="train")
+    train(shown, [features_of(shown)], BC, QUICK, out=tmp_path / "c")
 
 
 def test_wrong_inputs_are_refused(tmp_path: Path) -> None:
