@@ -1,7 +1,7 @@
 """Thread hold: soft tissue holds the thread where it goes in and where it comes out.
 
 Each of the scene's `THREAD_HOLDS` equalities ties a point of one capsule of the thread to an
-anchor. Across the thread it is the tissue's lateral spring. Along the thread, once a control step,
+anchor, by a soft spring. Along the thread, once a control step,
 the point slides as far as the force exceeds the friction; at the capsule's end the next capsule
 takes over at the same place. What is tied to what is in the model, so `write` follows every change
 and every restored state.
@@ -31,22 +31,20 @@ class ThreadHold:
         segment: the capsule it holds, `NOTHING` where it holds none.
         offset: of the held point from that capsule's start [m].
         anchor: in the phantom's frame [m].
-        yielded: displacement of the anchor that stayed [m].
         is_exit: it is the last bite's exit.
     """
 
     segment: int = NOTHING
     offset: float = 0.0
     anchor: Point = elements.HIDDEN
-    yielded: float = 0.0
     is_exit: bool = False
 
-    SIZE: ClassVar[int] = 7
+    SIZE: ClassVar[int] = 6
     """Numbers of a packed hold."""
 
     def pack(self) -> list[float]:
         """Return the hold as `SIZE` numbers."""
-        return [self.segment, self.offset, *self.anchor, self.yielded, self.is_exit]
+        return [self.segment, self.offset, *self.anchor, self.is_exit]
 
     @classmethod
     def unpack(cls, values: Sequence[float]) -> "ThreadHold":
@@ -55,8 +53,7 @@ class ThreadHold:
             segment=int(values[0]),
             offset=values[1],
             anchor=(values[2], values[3], values[4]),
-            yielded=values[5],
-            is_exit=bool(values[6]),
+            is_exit=bool(values[5]),
         )
 
 
@@ -67,7 +64,6 @@ class ThreadHolds:
         model: the simulation's own copy of its model.
         data: the simulation's.
         ridge: the phantom's frame.
-        forces: how the tissue resists.
         segments: capsules of the thread.
     """
 
@@ -79,13 +75,11 @@ class ThreadHolds:
         model: mujoco.MjModel,
         data: mujoco.MjData,
         ridge: Ridge,
-        forces: elements.TissueForces,
         segments: int,
     ):
         self._model = model
         self._data = data
         self._ridge = ridge
-        self._forces = forces
         self._bodies = [model.body(f"thread_{index}").id for index in range(segments)]
         self._pitch = thread.LENGTH / max(segments, 1)
         names = [f"thread_hold_{slot}" for slot in range(elements.THREAD_HOLDS if segments else 0)]
@@ -96,11 +90,8 @@ class ThreadHolds:
 
     def meet(self) -> None:
         """Follow a randomised model: the needle's mass, on which the thread's springs depend."""
-        stiffness = self._forces.lateral_stiffness
         weights = self._model.body_invweight0
-        self._springs = [
-            elements.spring(stiffness, float(weights[body, 0])) for body in self._bodies
-        ]
+        self._springs = [elements.thread_spring(float(weights[body, 0])) for body in self._bodies]
 
     def clear(self) -> None:
         """Let go of everything."""
@@ -112,7 +103,7 @@ class ThreadHolds:
         if self._holds:
             for hold in self._holds:
                 hold.is_exit = False
-            self._holds = [*self._holds[1:], ThreadHold(0, 0.0, anchor, 0.0, is_exit)]
+            self._holds = [*self._holds[1:], ThreadHold(0, 0.0, anchor, is_exit)]
             self.write()
 
     def drop(self) -> None:
@@ -121,54 +112,38 @@ class ThreadHolds:
             self._holds = [ThreadHold(), *self._holds[:-1]]
             self.write()
 
-    def follow(self, friction: float) -> tuple[float | None, int]:
-        """Let the thread slide through the holds, and their anchors give way.
+    def follow(self, friction: float) -> float | None:
+        """Let the thread slide through the holds.
 
         Args:
             friction: largest force along the thread at each hold [N].
 
         Returns:
-            The thread drawn out of the last bite's exit [m], None where it holds no thread, and how
-            often the tissue tore.
+            The thread drawn out of the last bite's exit [m]; None where it holds no thread.
         """
         drawn = None
-        tears = 0
-        slack = friction / self._forces.lateral_stiffness
+        slack = friction / elements.THREAD_STIFFNESS
         for slot, hold in enumerate(self._holds):
             if hold.segment == NOTHING:
                 continue
-            tears += self._give_way(slot, hold, slack)
+            stretch = self._stretch(hold)
+            if abs(stretch) > slack:
+                self._slide(hold, stretch - math.copysign(slack, stretch))
+                self._write(slot)
             if hold.is_exit:
                 drawn = hold.segment * self._pitch + hold.offset
             if hold.segment >= len(self._bodies):
                 self._holds[slot] = ThreadHold()
-                self._write(slot)
-        return drawn, tears
+        return drawn
 
-    def _give_way(self, slot: int, hold: ThreadHold, slack: float) -> bool:
-        """Slide the held point along the thread, the anchor across it; True where it tore."""
+    def _stretch(self, hold: ThreadHold) -> float:
+        """Return how far the anchor is from the held point, along the thread [m]."""
         body = self._bodies[hold.segment]
         x, y, z = self._ridge.to_world(hold.anchor)
         px, py, pz = self._data.xpos[body].tolist()
         _, _, a, _, _, b, _, _, c = self._data.xmat[body].tolist()
-        dx = x - px
-        dy = y - py
-        dz = z - pz
-        along = a * dx + b * dy + c * dz
-        dx -= along * a
-        dy -= along * b
-        dz -= along * c
-        beside = math.sqrt(dx * dx + dy * dy + dz * dz)
-        share, hold.yielded, is_torn = self._forces.give_way(beside, hold.yielded)
-        if share > 0.0:
-            hold.anchor = self._ridge.to_phantom((x - share * dx, y - share * dy, z - share * dz))
-        stretch = along - hold.offset
-        if abs(stretch) > slack:
-            self._slide(hold, stretch - math.copysign(slack, stretch))
-        elif share == 0.0:
-            return False
-        self._write(slot)
-        return is_torn
+        along: float = a * (x - px) + b * (y - py) + c * (z - pz)
+        return along - hold.offset
 
     def _slide(self, hold: ThreadHold, way: float) -> None:
         """Move the held point along the thread by `way` [m]."""

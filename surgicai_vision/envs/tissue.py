@@ -96,7 +96,7 @@ class Tissue:
         self._ridge = Ridge(config.layout)
         self._arc = NeedleArc(self._ridge)
         self._holds = NeedleHolds(model, data, self._ridge, self._arc, self.forces)
-        self._thread = ThreadHolds(model, data, self._ridge, self.forces, config.thread)
+        self._thread = ThreadHolds(model, data, self._ridge, config.thread)
         self._free = scene.needle_qpos
         self._needle_geoms = scene.needle_geoms
         self._scratch: mujoco.MjData | None = None
@@ -475,8 +475,7 @@ class Tissue:
     def _follow_thread(self) -> None:
         """Let the thread slide through the places that hold it."""
         length = self._passages[-1].length if self._passages else 0.0
-        drawn, tears = self._thread.follow(0.5 * self.forces.thread_friction * length)
-        self._count_tears(tears)
+        drawn = self._thread.follow(0.5 * self.forces.thread_friction * length)
         if drawn is not None:
             self.thread_drawn = drawn
 
