@@ -21,6 +21,11 @@ PLACES = 9
 """Places along the circle at which the joints are found."""
 OUT = math.radians(12.0)
 """How far past the exit the pull-out turns the needle's base [rad]."""
+ROOM = math.radians(5.0)
+"""What a way must leave of a turning joint's range [rad]: closing jaws may turn a needle by 4°
+(`envs.handoff.STRAIGHT`)."""
+TURNING = [index for index in range(len(kinematics.DVRK_JOINTS)) if index != kinematics.INSERTION]
+"""The joints that turn."""
 
 
 def insertion(stitch: Stitch, grasp: Matrix) -> list[Matrix]:
@@ -53,9 +58,11 @@ def joints_along(arm: str, way: Sequence[Matrix], instrument: str) -> list[Joint
 
 
 def is_followed(arm: str, way: Sequence[Matrix], instrument: str) -> bool:
-    """Return True if no joint limit of the arm is in the way."""
+    """Return True if no joint limit of the arm is in the way, nor as near to it as `ROOM`."""
     try:
-        joints_along(arm, way, instrument)
+        joints = joints_along(arm, way, instrument)
     except UnreachablePose:
         return False
-    return True
+    low, high = kinematics.limits(instrument)[TURNING].T
+    turns = np.array(joints)[:, TURNING]
+    return bool((turns > low + ROOM).all() and (turns < high - ROOM).all())
