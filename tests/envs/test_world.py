@@ -93,12 +93,14 @@ def test_an_arc_may_be_chosen(arc):
     assert env.simulation.radius == needle.RADIUS
 
 
-def test_a_state_is_restored_elsewhere_with_its_world():
-    one, other = made("insert"), made("insert")
+@pytest.mark.parametrize("tissue", names.TISSUES)
+def test_a_state_is_restored_elsewhere_with_its_world(tissue):
+    """In the middle of an insertion."""
+    one, other = (made("insert", SceneConfig(tissue=tissue)) for _ in range(2))
     one.reset(seed=2)
     other.reset(seed=9)
     expert = Expert(one)
-    for _ in range(30):
+    while not one.simulation.task_state.holes_passed:
         one.step(expert.action())
     other.set_state_vector(one.get_state())
     assert other.simulation.pair_index == one.simulation.pair_index
