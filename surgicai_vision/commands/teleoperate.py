@@ -89,9 +89,9 @@ class Options:
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Let a person drive and record, and print what was kept."""
     from surgicai_vision import envs
+    from surgicai_vision.core.pacer import Pacer
     from surgicai_vision.teleoperation.input_map import InputMapping
     from surgicai_vision.teleoperation.loop import EnvViews, run_session
-    from surgicai_vision.teleoperation.pacer import Pacer
     from surgicai_vision.teleoperation.recordings import open_recordings
     from surgicai_vision.teleoperation.session import Rules, Session
     from surgicai_vision.teleoperation.web import WebView
@@ -111,7 +111,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
                 rules,
             )
             views = EnvViews(env, options.view, options.size)
-            for line in page.invitation:
+            for line in page.server.invitation:
                 console.note(line)
             run_session(
                 session,

@@ -1,18 +1,15 @@
 """Loop: joins a session, an input device, a screen and the clock."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from surgicai_vision.core.pacer import Pacer
+from surgicai_vision.core.web.screen import Images
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.teleoperation.inputs import Device
-from surgicai_vision.teleoperation.pacer import Pacer
 from surgicai_vision.teleoperation.session import Session, Status
-
-Images = Mapping[str, NDArray[np.uint8]]
-"""View → image (size, size, 3)."""
 
 
 class Screen(Protocol):

@@ -12,11 +12,11 @@ from teleoperators import REST, SHORT, VIEWS, FakeMapping, Script, SessionEnv, e
 from surgicai_vision.commands.main import main
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, OutputExists, SurgicaiError
+from surgicai_vision.core.pacer import Pacer
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_marker
 from surgicai_vision.teleoperation.inputs import DISCARD, KEEP, START, STOP, VIEW, Input
 from surgicai_vision.teleoperation.keyboard import TABLE, key_names, key_table
 from surgicai_vision.teleoperation.loop import run_session
-from surgicai_vision.teleoperation.pacer import Pacer
 from surgicai_vision.teleoperation.recordings import open_recordings
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, STOPPED, WAITING, Rules, Session
 

@@ -20,16 +20,16 @@ from surgicai_vision import envs
 from surgicai_vision.commands.main import main
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.pacer import Pacer
+from surgicai_vision.core.web.server import MAX_INPUT_BYTES
 from surgicai_vision.demos.store import list_demos, read_demo
 from surgicai_vision.teleoperation.input_map import InputMapping
 from surgicai_vision.teleoperation.inputs import JAW, KEEP, START, Input
 from surgicai_vision.teleoperation.loop import run_session
-from surgicai_vision.teleoperation.pacer import Pacer
 from surgicai_vision.teleoperation.recordings import open_recordings
 from surgicai_vision.teleoperation.session import DRIVING, JUDGED, WAITING, Rules, Session
 from surgicai_vision.teleoperation.web import (
     FOLDER,
-    MAX_INPUT_BYTES,
     MAX_PAGES,
     SILENCE_S,
     PageInputs,
@@ -134,8 +134,10 @@ def web():
 
 def ask(web, path, method="GET", body=None, token=None, **headers):
     """Return status, headers and body of an answer."""
-    connection = http.client.HTTPConnection("127.0.0.1", web.port, timeout=10)
-    connection.request(method, f"/{web.token if token is None else token}/{path}", body, headers)
+    connection = http.client.HTTPConnection("127.0.0.1", web.server.port, timeout=10)
+    connection.request(
+        method, f"/{web.server.token if token is None else token}/{path}", body, headers
+    )
     answer = connection.getresponse()
     content = answer.read()
     connection.close()
@@ -267,14 +269,14 @@ def test_a_page_waits_for_the_next_image_and_asks_for_it(web):
 
 def test_a_port_in_use_is_said_in_one_line(web, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["teleoperate", "--port", str(web.port)]) == 2
+    assert main(["teleoperate", "--port", str(web.server.port)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"--port {web.port} is not free" in line
+    assert f"--port {web.server.port} is not free" in line
     assert not (tmp_path / "outputs" / "teleoperation" / "grasp").exists()
 
 
 def test_it_listens_on_loopback_alone(web):
-    assert web._server.server_address[0] == "127.0.0.1"
+    assert web.server.address == "127.0.0.1"
 
 
 def test_keys_that_came_by_http_grasp_the_needle(web, tmp_path):
@@ -284,14 +286,14 @@ def test_keys_that_came_by_http_grasp_the_needle(web, tmp_path):
         mapping = InputMapping(env)
         session = Session(env, mapping, recordings, VIEWS, Rules(episodes=1))
         person, numbers = KeyboardOperator(session, mapping), itertools.count()
-        connection = http.client.HTTPConnection("127.0.0.1", web.port, timeout=10)
+        connection = http.client.HTTPConnection("127.0.0.1", web.server.port, timeout=10)
         while not session.over:
             presses = {WAITING: ["Enter"], JUDGED: ["ArrowRight"]}.get(session.status().state, [])
             person.poll()
             held = list(person.keyboard._held) if session.status().state == DRIVING else []
             body = json.dumps(page_message(next(numbers), held, presses))
             connection.request(
-                "POST", f"/{web.token}/input", body, {"Content-Type": "application/json"}
+                "POST", f"/{web.server.token}/input", body, {"Content-Type": "application/json"}
             )
             assert connection.getresponse().read() == b""
             session.tick(web.poll())
@@ -385,7 +387,7 @@ def test_a_browser_drives_keeps_discards_and_stops(web, tmp_path):
         loop.start()
         try:
             with Browser(tmp_path / "profile") as browser:
-                browser.open(web.url)
+                browser.open(web.server.url)
                 assert browser.until(f"{state} === 'waiting'")
                 assert browser.until(f"{grey} > 30")
                 before = browser.value(grey)

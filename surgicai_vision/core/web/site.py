@@ -1,0 +1,67 @@
+"""Site: a page about images and a status that change.
+
+Below the server's token:
+
+    GET  .                  the page; its scripts and style sheets beside it
+    GET  status?after=N     JSON: the status and the number of the newest images; waits for a status
+                            after N
+    GET  view/NAME.jpg      the newest image of a view
+    POST input              JSON, for `receive`
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import parse_qs
+
+import jinja2
+
+from surgicai_vision.core.web.screen import PageScreen
+from surgicai_vision.core.web.server import BASE_CSS, Content, page_file
+
+
+@dataclass(frozen=True)
+class ScreenSite:
+    """One page with a screen; what `PageServer` serves.
+
+    Attributes:
+        html: the page.
+        files: name → a script or a style sheet beside it; `base.css` is there already.
+        screen: its images and its status.
+        receive: takes an input; raises `InputError` for what is none.
+        answers: address → what returns its JSON for the number in its query `after`.
+    """
+
+    html: bytes
+    files: Mapping[str, Path]
+    screen: PageScreen
+    receive: Callable[[object], None]
+    answers: Mapping[str, Callable[[int], object]] = field(default_factory=dict)
+
+    def answer(self, path: str, query: str) -> Content | None:
+        """Return what stands at an address below the token, or None."""
+        if path == "":
+            return self.html, "text/html; charset=utf-8"
+        if path == BASE_CSS.name:
+            return page_file(BASE_CSS)
+        if path in self.files:
+            return page_file(self.files[path])
+        answers = {"status": self.screen.status, **self.answers}
+        if path in answers:
+            after = parse_qs(query).get("after", ["0"])[0]
+            number = int(after) if after.isdecimal() else 0
+            return json.dumps(answers[path](number)).encode(), "application/json"
+        name = path.removeprefix("view/").removesuffix(".jpg")
+        image = self.screen.jpeg(name) if path == f"view/{name}.jpg" else None
+        return None if image is None else (image, "image/jpeg")
+
+
+def render_page(template: Path, **values: object) -> bytes:
+    """Return a page from its template; text is escaped, and nothing may be left out."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(template.parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    return environment.get_template(template.name).render(**values).encode()
