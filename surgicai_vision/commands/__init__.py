@@ -61,6 +61,7 @@ COMMANDS = MappingProxyType(
         "policies": "List the policies that come with the product.",
         "policy": "Share a trained policy.",
         "evaluate": "Run a policy from held-out starts and count successes.",
+        "watch": "Look at a policy while it acts, in the browser or in a window.",
         "robustness": "Run a policy while light, cameras, images or the arm shift.",
         "sweep": "Encode, train and evaluate every run of a grid.",
         "release": "Build the policies that come with the product, from nothing.",

@@ -8,7 +8,7 @@ from surgicai_vision.core import names
 MAX_CATCH_UP_TICKS = 5
 """Ticks that may be caught up; those beyond are dropped, since nobody can steer a burst."""
 MAX_TICKS_WITHOUT_IMAGE = 10
-"""Ticks after which an image is due even when late: five a second."""
+"""Ticks after which an image is due even when late: five a second at real time."""
 
 
 class Pacer:
@@ -16,6 +16,7 @@ class Pacer:
 
     Args:
         pace: share of real time; 0.5 is half speed.
+        patience: ticks after which an image is due even when late.
         clock: returns monotonic seconds.
         sleep: waits so many seconds.
     """
@@ -23,20 +24,26 @@ class Pacer:
     def __init__(
         self,
         pace: float = 1.0,
+        patience: int = MAX_TICKS_WITHOUT_IMAGE,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
         self._period = 1.0 / (names.FPS * pace)
+        self._patience = patience
         self._clock = clock
         self._sleep = sleep
         self._due = clock() + self._period
         self._ticks_without_image = 0
 
+    def set_pace(self, pace: float) -> None:
+        """Tick at another share of real time from the next tick on."""
+        self._period = 1.0 / (names.FPS * pace)
+
     def can_draw(self) -> bool:
         """Return True if there is time for an image, or the last one is too long ago."""
         self._ticks_without_image += 1
         is_late = self._clock() >= self._due
-        if is_late and self._ticks_without_image < MAX_TICKS_WITHOUT_IMAGE:
+        if is_late and self._ticks_without_image < self._patience:
             return False
         self._ticks_without_image = 0
         return True

@@ -16,7 +16,7 @@
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
-from typing import ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import gymnasium
 import mujoco
@@ -40,11 +40,15 @@ from surgicai_vision.envs.success import Info, Target, measure, meets_demands
 from surgicai_vision.scene import build_scene
 from surgicai_vision.scene.rendering import Frame
 
+if TYPE_CHECKING:
+    from surgicai_vision.envs.live.human import Human
+
 START_DRAWS = 60
 """Draws of a start state before giving up."""
 RENDER_CAMERA = "front"
 RENDER_SIZE = (480, 640)
 """Height and width of what `render` returns [px]."""
+RENDER_MODES = ("human", "rgb_array")
 
 Observation = NDArray[np.float32] | dict[str, Frame]
 
@@ -56,13 +60,13 @@ class SuturingEnv(gymnasium.Env):
         config: the task and its scene.
         subtasks: the subtasks of the task, in order.
         view: what it shows.
-        render_mode: None or "rgb_array".
+        render_mode: None, "rgb_array", or "human": it shows itself (`envs.live.human`).
         truncates: end episodes at `config.max_steps`; False where gymnasium's `TimeLimit` does.
     """
 
     # gymnasium declares no ClassVar
     metadata: ClassVar[dict[str, object]] = {  # type: ignore[misc]
-        "render_modes": ["rgb_array"],
+        "render_modes": list(RENDER_MODES),
         "render_fps": names.FPS,
     }
 
@@ -74,8 +78,8 @@ class SuturingEnv(gymnasium.Env):
         render_mode: str | None = None,
         truncates: bool = True,
     ):
-        if render_mode not in (None, "rgb_array"):
-            raise InputError(f"render_mode is '{render_mode}'; allowed: None, rgb_array.")
+        if render_mode is not None:
+            check_name("render mode", render_mode, RENDER_MODES)
         self.config = config
         self.view = view
         self.render_mode = render_mode
@@ -97,6 +101,7 @@ class SuturingEnv(gymnasium.Env):
         for camera in view.cameras if view.visual else ():
             self.calibration.window(camera, view.image_size)  # a crop that does not fit is refused
         self._images = Images(self.simulation, self.calibration)
+        self._human: Human | None = None
 
     # -- gymnasium ---------------------------------------------------------------------------------
 
@@ -135,6 +140,8 @@ class SuturingEnv(gymnasium.Env):
         info = self.measure()
         if axes.on:
             info["randomisation"] = randomisation.report(axes, simulation.draws)
+        if self.render_mode == "human":
+            self._shown().begin(info)
         return self.observe(), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
@@ -156,14 +163,27 @@ class SuturingEnv(gymnasium.Env):
         terminated = info["is_success"] or info["physics_error"]
         seen = self._observe(target)
         simulation.forget_reads()
+        if self.render_mode == "human":
+            self._shown().step(info)
         truncated = self._truncates and state.steps >= self.config.max_steps
         return seen, self.reward(info), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the front camera's image, (480, 640, 3) uint8, in render mode "rgb_array"."""
-        if self.render_mode is None:
+        """Return the front camera's image, (480, 640, 3) uint8, in render mode "rgb_array".
+
+        In render mode "human" every reset and step has shown itself already.
+        """
+        if self.render_mode != "rgb_array":
             return None
         return self.image(RENDER_CAMERA, RENDER_SIZE).astype(np.uint8, copy=False)
+
+    def _shown(self) -> "Human":
+        """Return what shows this env to a person, opened on first use."""
+        if self._human is None:
+            from surgicai_vision.envs.live.human import Human  # no other env needs a server
+
+            self._human = Human(self)
+        return self._human
 
     def image(
         self,
@@ -186,8 +206,11 @@ class SuturingEnv(gymnasium.Env):
         return self._images.frames(view, size, (modality,), quality)[modality]
 
     def close(self) -> None:
-        """Free the renderer."""
+        """Free the renderer, and end what a person sees."""
         self._images.close()
+        if self._human is not None:
+            self._human.close()
+            self._human = None
 
     # -- what it is --------------------------------------------------------------------------------
 

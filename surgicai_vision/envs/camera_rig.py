@@ -11,6 +11,7 @@ from surgicai_vision.envs.observation import ObservationConfig
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.envs.skin import Skin
 from surgicai_vision.scene.cameras import stand
+from surgicai_vision.scene.orbit import Orbit
 from surgicai_vision.scene.rendering import Frame, FrameRenderer
 
 
@@ -51,6 +52,10 @@ class Images:
         camera = self._stands[view]
         window = self._calibration.window(view, size) if camera != view else None
         return renderer.render_all(self._simulation.data, camera, modalities, window)
+
+    def free(self, orbit: Orbit, size: tuple[int, int], quality: str = "fast") -> Frame:
+        """Return what a free camera sees, (height, width, 3) uint8."""
+        return self._sized(size, quality).render(self._simulation.data, orbit)
 
     def close(self) -> None:
         """Free the renderer; the next image makes a new one."""

@@ -26,7 +26,8 @@ from surgicai_vision.core.video import SUFFIX, Image, write_video
 from surgicai_vision.evaluation.metrics import EpisodeMetrics
 
 if TYPE_CHECKING:
-    from surgicai_vision.evaluation.slot import Episode, Moment
+    from surgicai_vision.envs.moment import Moment
+    from surgicai_vision.evaluation.slot import Episode
 
 INDEX: Final = "videos.json"
 ALL: Final = "all"

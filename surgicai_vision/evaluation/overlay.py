@@ -26,8 +26,8 @@ from PIL import ImageDraw, ImageFont
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.video import Image
+from surgicai_vision.envs.moment import Moment
 from surgicai_vision.evaluation.filming import Look
-from surgicai_vision.evaluation.slot import Moment
 
 type Colour = tuple[int, int, int]
 

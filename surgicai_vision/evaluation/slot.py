@@ -7,7 +7,7 @@ take the same steps, so what is watched is what is counted.
     slot.begin(seed)
     while not slot.ended:
         slot.step(agent.act([0], [slot.env], [slot.observation])[0])
-    slot.moment, slot.states, slot.moments   # the present, and the whole episode so far
+    slot.states, slot.moments   # the whole episode so far, from the start on
     episode = slot.take()
 """
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import PhysicsError
+from surgicai_vision.envs.moment import Moment, present_moment
 from surgicai_vision.evaluation.agent import Agent, Env, Observation
 from surgicai_vision.evaluation.metrics import EpisodeMetrics, failure_kind
 
@@ -41,33 +42,6 @@ class Episode:
 
     row: EpisodeMetrics
     film: Film
-
-
-@dataclass(frozen=True)
-class Moment:
-    """What is measured when a control step has ended: what a person is shown of it.
-
-    Attributes:
-        step: control steps taken so far; 0 at the start.
-        subtask: the subtask that is on.
-        arm: its arm.
-        distance: from the goal [m].
-        angle: from the goal [rad].
-        contact: both pads of the active jaws touch the needle.
-        force: net force of needle and instruments on the tissue [N] (`EpisodeMonitor.force`).
-        stages: of the whole procedure, subtasks that succeeded so far in their order.
-        success: the task has succeeded.
-    """
-
-    step: int
-    subtask: str
-    arm: str
-    distance: float
-    angle: float
-    contact: bool
-    force: float
-    stages: int
-    success: bool
 
 
 def env_of(agent: Agent, config: TaskConfig) -> Env:
@@ -198,22 +172,8 @@ class Slot:
         if self.error:
             return
         self.states.append(np.asarray(self.env.get_state(), dtype=np.float64))
-        self.moments.append(self._moment())
-
-    def _moment(self) -> Moment:
-        """Return what is measured now."""
-        subtask = self.env.subtask
-        return Moment(
-            step=self.steps,
-            subtask=subtask.name,
-            arm=subtask.arm,
-            distance=float(self.info["d_trans"]),
-            angle=float(self.info["d_angle"]),
-            contact=bool(self.info["contact"]),
-            force=self.monitor.force,
-            stages=int(self.info.get("progress", 0)),
-            success=bool(self.info["is_success"]),
-        )
+        moment = present_moment(self.env, self.info, self.monitor, self.steps)
+        self.moments.append(moment)
 
     def _film(self) -> Film:
         if not self.states:

@@ -26,6 +26,7 @@ from surgicai_vision.core.names import DEPTH, MODALITIES, PARTS, RGB, SEGMENTATI
 from surgicai_vision.scene import opengl
 from surgicai_vision.scene.cameras import Window, camera_id, crop_of
 from surgicai_vision.scene.opengl import renderer_string
+from surgicai_vision.scene.orbit import Orbit
 from surgicai_vision.scene.visual import appearance
 
 __all__ = ["QUALITIES", "Frame", "FrameRenderer", "parts_of_geoms", "renderer_string"]
@@ -108,14 +109,18 @@ class FrameRenderer:
         self._target: _Target | None = _acquire(model, self.height, self.width, quality)
 
     def render(
-        self, data: mujoco.MjData, camera: str, modality: str = RGB, window: Window | None = None
+        self,
+        data: mujoco.MjData,
+        camera: str | Orbit,
+        modality: str = RGB,
+        window: Window | None = None,
     ) -> Frame:
         """Return one image of the state `data`, an array of its own.
 
         Args:
             data: a state that has been through `mj_forward`.
-            camera: name of a camera of the model; the image of a crop is that of its camera in a
-                window.
+            camera: name of a camera of the model, or a free one; the image of a crop is that of its
+                camera in a window.
             modality: "rgb" → (H, W, 3) uint8; "depth" → (H, W, 1) float32 [m] along the camera's
                 axis, the far plane where nothing stands; "segmentation" → (H, W, 1) uint8, an index
                 of `names.PARTS`.
@@ -130,7 +135,7 @@ class FrameRenderer:
     def render_all(
         self,
         data: mujoco.MjData,
-        camera: str,
+        camera: str | Orbit,
         modalities: Iterable[str],
         window: Window | None = None,
     ) -> dict[str, Frame]:
@@ -144,6 +149,8 @@ class FrameRenderer:
             raise InputError("This FrameRenderer is closed; make a new one.")
         if target.lost:  # a forked child of the process that made it
             target = self._target = _acquire(self.model, self.height, self.width, self.quality)
+        if isinstance(camera, Orbit):
+            return target.draw(data, camera.view(), wanted, area)
         view = self._cameras.get(camera) or self._view(camera)
         return target.draw(data, view, wanted, area, self._skin)
 

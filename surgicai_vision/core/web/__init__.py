@@ -2,5 +2,5 @@
 
 * `server`: a server on loopback behind a random token.
 * `screen`: the newest images and status, handed from the thread that works to those that serve.
-* `base.css`: what all pages look like.
+* `site`: a page about both, with `base.css` and `screen.js`, which all such pages load.
 """

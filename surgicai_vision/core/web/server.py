@@ -25,7 +25,6 @@ HOST_NAMES = ("127.0.0.1", "localhost")
 """Names under which a browser, here or at the end of a tunnel, may address the server."""
 MAX_INPUT_BYTES = 4096
 """Size of an input, at most [byte]."""
-BASE_CSS = Path(__file__).parent / "base.css"
 KINDS = MappingProxyType({".js": "text/javascript", ".css": "text/css"})
 HEADERS = MappingProxyType(
     {

@@ -18,7 +18,11 @@ from urllib.parse import parse_qs
 import jinja2
 
 from surgicai_vision.core.web.screen import PageScreen
-from surgicai_vision.core.web.server import BASE_CSS, Content, page_file
+from surgicai_vision.core.web.server import Content, page_file
+
+FOLDER = Path(__file__).parent
+SHARED = {name: FOLDER / name for name in ("base.css", "screen.js")}
+"""What every such page loads: how it looks, and how images and status come in."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,7 @@ class ScreenSite:
 
     Attributes:
         html: the page.
-        files: name → a script or a style sheet beside it; `base.css` is there already.
+        files: name → a script or a style sheet beside it; `SHARED` is there already.
         screen: its images and its status.
         receive: takes an input; raises `InputError` for what is none.
         answers: address → what returns its JSON for the number in its query `after`.
@@ -43,10 +47,9 @@ class ScreenSite:
         """Return what stands at an address below the token, or None."""
         if path == "":
             return self.html, "text/html; charset=utf-8"
-        if path == BASE_CSS.name:
-            return page_file(BASE_CSS)
-        if path in self.files:
-            return page_file(self.files[path])
+        files = {**SHARED, **self.files}
+        if path in files:
+            return page_file(files[path])
         answers = {"status": self.screen.status, **self.answers}
         if path in answers:
             after = parse_qs(query).get("after", ["0"])[0]

@@ -2,7 +2,6 @@
 "use strict";
 
 const HEARTBEAT = 100; // ms between messages while something is held: the server lets go after 500 ms of silence
-const element = (id) => document.getElementById(id);
 const buttons = [...document.querySelectorAll("button[data-code]")];
 const codes = new Set(["ShiftRight", "KeyX", "KeyZ", "Enter", ...buttons.map((button) => button.dataset.code)]);
 const client = Array.from(crypto.getRandomValues(new Uint8Array(12)), (byte) => byte.toString(16)).join("");
@@ -106,17 +105,6 @@ setInterval(send, 20);
 
 // -- status and images ---------------------------------------------------------------------------------------------------
 
-async function draw(figure, number) {
-  const view = figure.dataset.view;
-  const answer = await fetch(`view/${view}.jpg?n=${number}`);
-  if (!answer.ok) return;
-  const image = await createImageBitmap(await answer.blob());
-  const canvas = figure.querySelector("canvas");
-  if (canvas.width !== image.width) { canvas.width = image.width; canvas.height = image.height; }
-  canvas.getContext("2d").drawImage(image, 0, 0);
-  image.close();
-}
-
 function showStatus(status) {
   const text = {
     episode: status.episode, seed: status.seed, subtask: `${status.subtask}, ${status.arm}`,
@@ -125,7 +113,7 @@ function showStatus(status) {
     counts: `${status.kept} / ${status.discarded}`, text: status.message,
     state: status.fine ? `${status.state}, fine` : status.state,
   };
-  for (const [id, value] of Object.entries(text)) if (element(id).textContent !== String(value)) element(id).textContent = value;
+  for (const [id, value] of Object.entries(text)) setText(id, value);
   element("message").className = status.state === "judged" ? (status.success ? "good" : "bad") : status.state;
   document.body.className = status.state;
   const [before, lead] = [document.querySelector("#lead figure"), document.querySelector(`figure[data-view="${status.view}"]`)];
@@ -136,26 +124,10 @@ function showStatus(status) {
   stopped = status.state === "stopped";
 }
 
-async function watch() {
-  let seen = 0, shown = 0;
-  while (!stopped) {
-    try {
-      const status = await (await fetch(`status?after=${seen}`)).json();
-      if (status.state && status.number !== seen) {
-        seen = status.number;
-        showStatus(status);
-        if (status.image !== shown) {
-          await Promise.all([...document.querySelectorAll("figure")].map((figure) => draw(figure, status.image)));
-          shown = status.image;
-        }
-      }
-    } catch (error) {
-      element("message").className = "lost";
-      element("state").textContent = "no connection";
-      element("text").textContent = "The session has ended, or the line is down.";
-      await new Promise((resolve) => setTimeout(resolve, 1000));
-    }
-  }
+function showLost() {
+  element("message").className = "lost";
+  setText("state", "no connection");
+  setText("text", "The session has ended, or the line is down.");
 }
 
-watch();
+follow(showStatus, showLost);

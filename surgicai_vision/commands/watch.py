@@ -1,0 +1,139 @@
+"""`watch`: look at a policy while it acts."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.evaluate import open_given
+from surgicai_vision.commands.options import (
+    ACCEPT_LICENCE,
+    COUNT,
+    DIRECTORY,
+    FILE_ONLY,
+    NOT_NEGATIVE,
+    TASK,
+    VIEWS,
+    WEIGHTS,
+    default_text,
+    within,
+)
+from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_names
+from surgicai_vision.features.encoders import WeightsSource
+
+if TYPE_CHECKING:
+    from surgicai_vision.evaluation.metrics import EpisodeMetrics
+
+app = App(
+    name="watch",
+    help_epilogue="""\
+example:
+  surgicai-vision watch expert --task suture
+
+Open the address that it prints. On the page: space plays and pauses, → takes one step, N goes to
+the next start, R back to this one's beginning; drag in the view "free" to turn it. Esc ends.""",
+)
+WEB_PORT = 8766
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `watch`.
+
+    Attributes:
+        policy: A checkpoint folder, a hierarchical.yaml, module:factory, or expert, replay, random
+            or zero.
+        task: The task.
+        seed: Seed of the first start; the next ones follow.
+        episodes: End after so many episodes.
+        go_on: The next start begins by itself.
+        paused: Wait at the first start.
+        window: MuJoCo's own viewer in place of the page; needs a display.
+        port: Port of the page on this machine's loopback, 0 for any.
+        view: Views shown at first; the first leads.
+        size: Height and width of images [px].
+        dataset: Dataset whose mean demonstration replay plays.
+        expert_swap: For a hierarchical policy, the subtask that the expert does.
+    """
+
+    policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
+    task: Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")] = None
+    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    episodes: Annotated[int | None, COUNT, default_text("go on until Esc")] = None
+    go_on: bool = False
+    paused: bool = False
+    window: bool = False
+    port: Annotated[int, within(0, 65535)] = WEB_PORT
+    view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
+    size: Annotated[int, within(64, 960), Parameter(metavar="PX")] = 448
+    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
+    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    expert_swap: Annotated[str | None, Parameter(choices=names.SUBTASKS, metavar="SUBTASK")] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+
+
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
+    """Play episodes for a person to watch, and print how each ended."""
+    from surgicai_vision.envs.live.browser import LivePage
+    from surgicai_vision.envs.live.views import LiveViews
+    from surgicai_vision.envs.live.window import Window, check_display
+    from surgicai_vision.evaluation.filming import outcome_of
+    from surgicai_vision.evaluation.watch import Player, watch_in_window, watch_on_page
+
+    if options.window:
+        check_display()
+    spec = open_given(
+        options.policy,
+        options.task,
+        options.env,
+        options.dataset,
+        WeightsSource.parse(options.weights, options.accept_licence),
+        options.expert_swap,
+    )
+
+    def tell(row: "EpisodeMetrics") -> None:
+        console.say(f"start {row.seed}: {outcome_of(row)}")
+
+    def player_for(page: LivePage | None) -> Player:
+        return Player(
+            spec.make_agent(),
+            spec.config,
+            options.seed,
+            options.episodes,
+            go_on=options.go_on,
+            playing=not options.paused,
+            curves=page,
+            told=tell,
+        )
+
+    if options.window:
+        player = player_for(None)
+        with Window(player.env.model, player.env.data) as window:
+            watch_in_window(player, window)
+    else:
+        title = f"{spec.name}: {spec.config.task}"
+        with LivePage(title, camera_names(), controls=True, port=options.port) as page:
+            player = player_for(page)
+            views = LiveViews(player.env, options.view, options.size)
+            for line in page.server.invitation:
+                console.note(line)
+            watch_on_page(player, page, views)
+            views.close()
+    player.close()
+    successes = sum(row.success for row in player.rows.values())
+    console.say(f"{successes} of {len(player.rows)} episodes succeeded.")
+    return {
+        "policy": spec.name,
+        "task": spec.config.task,
+        "successes": successes,
+        "episodes": [
+            {"seed": row.seed, "success": row.success, "failure": row.failure, "steps": row.steps}
+            for row in player.rows.values()
+        ],
+    }

@@ -1,0 +1,228 @@
+"""Browser: the page on which an env is watched.
+
+`core.web` serves it. Besides the status and the images there is
+
+    GET  curves?after=N     JSON: {"episode", "points": [[mm, N], …], "next"}; points after the Nth
+                            of all that were ever shown, and of the present episode alone
+    POST input              JSON: {"command": name, "numbers": [float], "views": [name]}
+
+A page sends commands and changes nothing by itself: who steps the env takes them (`commands`) and
+what became of them is in the next status. `VIEW_COMMANDS` are about what is seen, `PLAY_COMMANDS`
+about what runs.
+"""
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import final
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.web.screen import PageScreen
+from surgicai_vision.core.web.server import PageServer
+from surgicai_vision.core.web.site import ScreenSite, render_page
+from surgicai_vision.envs.moment import Moment
+
+PLAYING = "playing"
+PAUSED = "paused"
+ENDED = "ended"
+STOPPED = "stopped"
+SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+"""Shares of real time."""
+FREE = "free"
+"""The view of the free camera."""
+MAX_VIEWS = 6
+"""Views shown at the same time."""
+VIEW_COMMANDS = MappingProxyType({"views": 0, "turn": 2, "shift": 2, "zoom": 1, "home": 0})
+"""Command → how many numbers it has."""
+PLAY_COMMANDS = MappingProxyType(
+    {
+        "play": 0,
+        "pause": 0,
+        "step": 0,
+        "again": 0,
+        "next": 0,
+        "speed": 1,
+        "go_on": 1,
+        "stop": 0,
+    }
+)
+FOLDER = Path(__file__).parent / "page"
+WAITING = 256
+"""Commands that wait at most; what comes then is dropped."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """What a page asks for.
+
+    Attributes:
+        name: of `VIEW_COMMANDS` or `PLAY_COMMANDS`.
+        numbers: "turn": right and down [deg]; "shift": right and down [share of the image]; "zoom":
+            factor of the distance; "speed": one of `SPEEDS`; "go_on": 1 or 0.
+        views: "views": those shown from now on, the leading one first.
+    """
+
+    name: str
+    numbers: tuple[float, ...] = ()
+    views: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class LiveStatus:
+    """What a page shows of an env.
+
+    Attributes:
+        state: "playing", "paused", "ended" or "stopped".
+        message: what happened and what to do, one line.
+        views: shown, the leading one first.
+        episode: number of the episode, from 1 on.
+        seed: its start.
+        limit: control steps it may take.
+        is_procedure: the task is all five subtasks in a row.
+        moment: what is measured now.
+        speed: share of real time.
+        go_on: the next start begins by itself.
+        successes, episodes: counts of the episodes that have ended.
+        points: points of the curves shown so far, in all episodes.
+    """
+
+    state: str
+    message: str
+    views: tuple[str, ...]
+    episode: int
+    seed: int
+    limit: int
+    is_procedure: bool
+    moment: Moment
+    speed: float
+    go_on: bool
+    successes: int
+    episodes: int
+    points: int
+
+
+@final
+class LivePage:
+    """The page's server. Use it as a context manager.
+
+    Args:
+        title: what is watched, in a few words.
+        views: all that may be shown; the free camera comes besides.
+        controls: whether somebody takes `PLAY_COMMANDS`; else the page has no buttons for them.
+        port: to listen at; 0 takes any.
+
+    Raises:
+        InputError: the port is not free.
+    """
+
+    def __init__(self, title: str, views: Sequence[str], controls: bool, port: int = 0):
+        self.views = (*views, FREE)
+        self.screen = PageScreen()
+        self._allowed = {**VIEW_COMMANDS, **(PLAY_COMMANDS if controls else {})}
+        self._lock = threading.Lock()
+        self._waiting: list[Command] = []
+        self._episode = 0
+        self._begin = 0
+        self._points: list[tuple[float, float]] = []
+        html = render_page(
+            FOLDER / "live.html.j2",
+            title=title,
+            views=self.views,
+            controls=controls,
+            speeds=SPEEDS,
+            subtasks=names.SUBTASKS,
+        )
+        files = {name: FOLDER / name for name in ("live.js", "live.css")}
+        site = ScreenSite(html, files, self.screen, self.receive, {"curves": self.curves})
+        self.server = PageServer(site, port)
+
+    def __enter__(self) -> "LivePage":
+        self.server.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let open pages fetch the last status, then shut the server down."""
+        if self.screen.watched:
+            time.sleep(0.5)
+        self.server.stop()
+
+    @property
+    def points(self) -> int:
+        """Return the number of points of the curves, of all episodes."""
+        with self._lock:
+            return self._begin + len(self._points)
+
+    def begin(self, episode: int) -> None:
+        """Begin the curves of another episode."""
+        with self._lock:
+            self._begin += len(self._points)
+            self._points = []
+            self._episode = episode
+
+    def add_point(self, distance: float, force: float) -> None:
+        """Append to the curves: the distance to the goal [m] and the force on the tissue [N]."""
+        with self._lock:
+            self._points.append((round(1e3 * distance, 3), round(force, 4)))
+
+    def curves(self, after: int) -> dict[str, object]:
+        """Return the present episode's points after the `after`th of all."""
+        with self._lock:
+            points = self._points[max(0, after - self._begin) :]
+            total = self._begin + len(self._points)
+            return {"episode": self._episode, "points": points, "next": total}
+
+    def commands(self) -> list[Command]:
+        """Return what pages have asked for since the last call."""
+        with self._lock:
+            waiting = self._waiting
+            self._waiting = []
+            return waiting
+
+    def receive(self, content: object) -> None:
+        """Take a page's command.
+
+        Raises:
+            InputError: it is none.
+        """
+        command = read_command(content, self._allowed, self.views)
+        with self._lock:
+            if len(self._waiting) < WAITING:
+                self._waiting.append(command)
+
+
+def read_command(content: object, allowed: Mapping[str, int], views: Sequence[str]) -> Command:
+    """Return a checked command, or raise `InputError`.
+
+    Args:
+        content: {"command": name, "numbers": [float], "views": [name]}.
+        allowed: command → how many numbers it has.
+        views: all that may be shown.
+    """
+    if not isinstance(content, dict):
+        raise InputError("A command must be a table.")
+    name = content.get("command")
+    numbers = content.get("numbers", [])
+    shown = content.get("views", [])
+    if (
+        not isinstance(name, str)
+        or name not in allowed
+        or not isinstance(numbers, list)
+        or len(numbers) != allowed[name]
+        or not all(isinstance(number, (int, float)) for number in numbers)
+        or not all(-1000 < number < 1000 for number in numbers)
+        or not isinstance(shown, list)
+        or not all(isinstance(view, str) and view in views for view in shown)
+        or len(set(shown)) != len(shown)
+        or len(shown) > MAX_VIEWS
+        or (name == "views") != bool(shown)
+    ):
+        raise InputError(f"A command must be one of {', '.join(allowed)}, with its numbers.")
+    if name == "speed" and numbers[0] not in SPEEDS:
+        raise InputError(f"The speed must be one of {SPEEDS}.")
+    if name == "zoom" and not 0.1 <= numbers[0] <= 10:
+        raise InputError("A zoom's factor must be 0.1 to 10.")
+    return Command(name, tuple(map(float, numbers)), tuple(shown))
