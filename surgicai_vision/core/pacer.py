@@ -16,17 +16,17 @@ class Pacer:
 
     Args:
         pace: share of real time; 0.5 is half speed.
-        patience: ticks after which an image is due even when late.
         clock: returns monotonic seconds.
         sleep: waits so many seconds.
+        patience: ticks after which an image is due even when late.
     """
 
     def __init__(
         self,
         pace: float = 1.0,
-        patience: int = MAX_TICKS_WITHOUT_IMAGE,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
+        patience: int = MAX_TICKS_WITHOUT_IMAGE,
     ):
         self._period = 1.0 / (names.FPS * pace)
         self._patience = patience

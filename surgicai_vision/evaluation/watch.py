@@ -225,7 +225,7 @@ def watch_on_page(player: Player, page: LivePage, views: LiveViews) -> None:
         page: takes commands and shows images and status; it is served already.
         views: draws the images.
     """
-    pacer = Pacer(player.speed, PATIENCE)
+    pacer = Pacer(player.speed, patience=PATIENCE)
     images = views.render()
     drawn: tuple[object, ...] = ()
     shown: LiveStatus | None = None

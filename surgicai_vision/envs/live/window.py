@@ -6,18 +6,23 @@ F1 show its menus and its keys.
 
 import os
 import threading
+import warnings
 from types import MappingProxyType
 from typing import final
 
+import glfw
 import mujoco
+from mujoco import viewer
 
-from surgicai_vision.core.errors import InputError, first_line
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.scene.orbit import Orbit
 
 KEYS = MappingProxyType(
     {32: "play", 262: "step", ord("N"): "next", ord("R"): "again", 45: "slower", 61: "faster"}
 )
 """GLFW's key codes → what they ask of a player: space, →, N, R, − and =."""
+CLOSING_S = 5.0
+"""Time that the viewer gets to close [s]."""
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
@@ -27,17 +32,36 @@ def has_display() -> bool:
 
 
 def check_display() -> None:
-    """Raise `InputError` where there is no display for a window."""
+    """Raise `InputError` where there is no display for a window, or none opens on it."""
     if not has_display():
         raise InputError(
             f"A window needs a display, and none of {', '.join(DISPLAYS)} is set; leave --window "
             "out to watch in a browser, also from another machine."
+        )
+    # The viewer's thread would fail alone, and its caller wait for ever.
+    with warnings.catch_warnings(action="ignore"):
+        opens = glfw.init()
+        if opens:
+            glfw.window_hint(glfw.VISIBLE, False)
+            probe = glfw.create_window(16, 16, "", None, None)
+            opens = bool(probe)
+            if probe:
+                glfw.destroy_window(probe)
+            glfw.default_window_hints()
+    if not opens:
+        shown = ", ".join(f"{name}={os.environ[name]}" for name in DISPLAYS if name in os.environ)
+        raise InputError(
+            f"No window opens on the display {shown}; leave --window out to watch in a browser, "
+            "also from another machine."
         )
 
 
 @final
 class Window:
     """MuJoCo's viewer of one env. Use it as a context manager.
+
+    It shows a copy of the env's data: opening it and dragging bodies with the mouse change nothing
+    of an episode.
 
     Args:
         model: the env's.
@@ -49,19 +73,17 @@ class Window:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
         check_display()
-        from mujoco import viewer  # it loads GLFW, which complains without a display
-
         self._lock = threading.Lock()
         self._pressed: list[str] = []
-        try:
-            self._viewer = viewer.launch_passive(
-                model, data, key_callback=self._press, show_left_ui=False, show_right_ui=False
-            )
-        except Exception as error:  # GLFW's errors have many types
-            raise InputError(
-                f"MuJoCo's viewer does not open here ({first_line(error)}); leave --window out to "
-                "watch in a browser."
-            ) from None
+        self._model = model
+        self._data = data
+        self._copy = mujoco.MjData(model)
+        mujoco.mj_copyData(self._copy, model, data)
+        before = set(threading.enumerate())
+        self._viewer = viewer.launch_passive(
+            model, self._copy, key_callback=self._press, show_left_ui=False, show_right_ui=False
+        )
+        self._threads = set(threading.enumerate()) - before
         orbit = Orbit()
         with self._viewer.lock():
             self._viewer.cam.lookat[:] = orbit.target
@@ -82,6 +104,8 @@ class Window:
 
     def draw(self) -> None:
         """Show the env's present state."""
+        with self._viewer.lock():
+            mujoco.mj_copyData(self._copy, self._model, self._data)
         self._viewer.sync()
 
     def pressed(self) -> list[str]:
@@ -92,8 +116,10 @@ class Window:
             return pressed
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the window, and wait for its thread: GLFW breaks if the process ends before."""
         self._viewer.close()
+        for thread in self._threads:
+            thread.join(CLOSING_S)
 
     def _press(self, key: int) -> None:
         if key in KEYS:

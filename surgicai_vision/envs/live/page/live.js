@@ -169,9 +169,15 @@ async function fetchCurves() {
   }
   curves.points.push(...answer.points);
   curves.next = answer.next;
+  drawCurves();
+}
+
+function drawCurves() {
   drawCurve("distance-curve", 0, "--distance", 5);
   drawCurve("force-curve", 1, "--force", 0.5);
 }
+
+addEventListener("resize", drawCurves);
 
 function drawCurve(id, column, colour, least) {
   const canvas = element(id);
