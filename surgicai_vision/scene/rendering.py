@@ -150,8 +150,9 @@ class FrameRenderer:
         if target.lost:  # a forked child of the process that made it
             target = self._target = _acquire(self.model, self.height, self.width, self.quality)
         if isinstance(camera, Orbit):
-            return target.draw(data, camera.view(), wanted, area)
-        view = self._cameras.get(camera) or self._view(camera)
+            view = camera.view()
+        else:
+            view = self._cameras.get(camera) or self._view(camera)
         return target.draw(data, view, wanted, area, self._skin)
 
     def _area(self, window: Window | None) -> mujoco.MjrRect:

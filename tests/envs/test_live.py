@@ -236,7 +236,7 @@ def test_human_shows_what_is_stepped_and_changes_nothing(monkeypatch, capsys):
                 env.step(actions[0])
                 status = live.screen.status(0)
             assert status["moment"]["step"] == env.unwrapped.simulation.task_state.steps
-            assert status["views"] == ["back"]
+            assert status["views"] == ("back",)
             image = cv2.imdecode(np.frombuffer(live.screen.jpeg("back"), np.uint8), 1)[..., ::-1]
             truth = env.unwrapped.image("back", (human.SIZE, human.SIZE))
             assert np.abs(image.astype(int) - truth).mean() < 8
