@@ -333,7 +333,7 @@ def test_the_command_records_stops_and_sums_up(tmp_path):
         )
         assert connection.getresponse().read() == b""
         now = status()
-        while now["state"] != state or (state == DRIVING and now["steps"] < 3):
+        while now.get("state") != state or (state == DRIVING and now["steps"] < 3):
             now = status(after=now["number"])
         assert now["kept"] == kept
     out, error = process.communicate(timeout=30)
