@@ -23,6 +23,11 @@ NOTHING = -1
 """The segment of a hold that holds none."""
 
 
+AHEAD = 1.5
+"""A held point slides this much further than the force asks for: the thread goes on sliding until
+the next control step, and the force should be right in the middle of that time."""
+
+
 @dataclass
 class ThreadHold:
     """A place that may hold the thread.
@@ -128,7 +133,7 @@ class ThreadHolds:
                 continue
             stretch = self._stretch(hold)
             if abs(stretch) > slack:
-                self._slide(hold, stretch - math.copysign(slack, stretch))
+                self._slide(hold, AHEAD * (stretch - math.copysign(slack, stretch)))
                 self._write(slot)
             if hold.is_exit:
                 drawn = hold.segment * self._pitch + hold.offset

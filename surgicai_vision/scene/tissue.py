@@ -48,14 +48,13 @@ CARRIER_DAMPING = 2e-7
 """[N·m·s/rad]; below 2 I / dt, as the scene's damping is explicit."""
 THREAD_HOLDS = 4
 """Places that can hold the thread: entry and exit of the last two bites."""
-THREAD_STIFFNESS = 400.0
+THREAD_STIFFNESS = 200.0
 """Of a hold of the thread [N/m]."""
-THREAD_REACH = 0.0095
+THREAD_REACH = 0.0083
 THREAD_SLIP = 0.05
-"""At this distance [m] a hold of the thread is softer by this factor; it holds with 0.8 N at most,
-3 mm off. Where the thread slides is found once in 20 ms, and a jerk must not pull harder meanwhile:
-a thread of 10 segments is stable at 2 ms under 1 N, where the explicit torque of its tension on a
-segment of 9.5 mm reaches 4/dt² times its armature."""
+"""At this distance [m] a hold of the thread is softer by this factor; it holds with 0.35 N at most,
+2.5 mm off. Where the thread slides is found once in 20 ms, and what pulls at two holds meanwhile
+must not exceed 0.9 N: a taut thread of 10 segments swings faster than 2 ms can follow beyond."""
 HIDDEN = (0.0, 0.0, -0.1)
 """Where anchors stay that hold nothing [m, world]."""
 Spring = tuple[tuple[float, float], tuple[float, float, float, float, float]]
