@@ -9,6 +9,7 @@ is where its joints report it, kinematic error included. A camera that was moved
 it takes the image, and the window stays where the nominal calibration puts it.
 """
 
+import functools
 import math
 
 import mujoco
@@ -33,7 +34,6 @@ class Calibration:
     def __init__(self, simulation: Simulation):
         self._simulation = simulation
         self._model = simulation.scene.model
-        self._nominal = mujoco.MjData(self._model)
         self._standing: dict[str, Pose] = {}
 
     def intrinsics(self, view: str, size: tuple[int, int]) -> Array:
@@ -71,18 +71,24 @@ class Calibration:
         """Return a camera's pose in world, of one that stands still without computing it anew."""
         if camera in self._standing:
             return self._standing[camera]
-        self._put_nominal()
-        pose = poses.flat(cameras.extrinsics(self._model, self._nominal, camera))
+        pose = poses.flat(cameras.extrinsics(self._model, self._put_nominal(), camera))
         if self._model.cam_bodyid[cameras.camera_id(self._model, camera)] == 0:
             self._standing[camera] = pose
         return pose
 
-    def _put_nominal(self) -> None:
-        """Put the nominal scene's bodies where the reported joints say."""
+    @functools.cached_property
+    def _nominal(self) -> mujoco.MjData:
+        """Return a state of the scene without randomisation; most envs never need one."""
+        return mujoco.MjData(self._model)
+
+    def _put_nominal(self) -> mujoco.MjData:
+        """Return the nominal scene with its bodies where the reported joints say."""
         simulation = self._simulation
-        self._nominal.qpos[:] = simulation.data.qpos
+        nominal = self._nominal
+        nominal.qpos[:] = simulation.data.qpos
         for arm in names.ARMS:
-            self._nominal.qpos[simulation.scene.arms[arm].qpos] = simulation.reported_joints(arm)
-        mujoco.mj_kinematics(self._model, self._nominal)
-        mujoco.mj_comPos(self._model, self._nominal)
-        mujoco.mj_camlight(self._model, self._nominal)
+            nominal.qpos[simulation.scene.arms[arm].qpos] = simulation.reported_joints(arm)
+        mujoco.mj_kinematics(self._model, nominal)
+        mujoco.mj_comPos(self._model, nominal)
+        mujoco.mj_camlight(self._model, nominal)
+        return nominal
