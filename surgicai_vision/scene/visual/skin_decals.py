@@ -23,7 +23,7 @@ ARM = (0.0012, 0.0018)
 """Half the length of a mark's two strokes [m], others and of the pair to be sewn."""
 STROKE = (0.0002, 0.0003)
 """Half of their width [m]."""
-STROKE_PARTS = 6
+STROKE_PARTS = 4
 """Parts of a stroke, which bends with the skin."""
 WOUNDS = 16
 """Wounds that can be shown: two for each bite that soft tissue remembers."""

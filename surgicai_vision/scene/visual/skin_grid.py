@@ -32,7 +32,7 @@ OVER = 5
 """Points over the crest."""
 FLAT_ROWS = 5
 """Rows of points before and behind the ridge."""
-FINE = (-2.0, -1.4, -1.0, -0.7, -0.4, -0.15, 0.15, 0.4, 0.7, 1.0, 1.4, 2.0)
+FINE = (-2.0, -1.3, -0.8, -0.45, -0.15, 0.15, 0.45, 0.8, 1.3, 2.0)
 """Lines about a pull, in its reaches."""
 FOCI = 2
 """Pulls that get lines of their own across the skin; those along it are the largest one's. Entry
