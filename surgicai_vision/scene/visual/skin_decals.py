@@ -16,14 +16,14 @@ MARK_LIFT = 0.00006
 """Of the ink above the skin [m]."""
 WOUND_LIFT = 0.00012
 """Of wounds above the skin [m]; of the reddened skin about them halfway between."""
-RISE = 0.08
+RISE = 0.12
 """Further lift of ink and wounds, per displacement of the skin: between its lines the drawn skin is
 flat, and would hide what follows its bell exactly."""
 ARM = (0.0012, 0.0018)
 """Half the length of a mark's two strokes [m], others and of the pair to be sewn."""
 STROKE = (0.0002, 0.0003)
 """Half of their width [m]."""
-STROKE_PARTS = 4
+STROKE_PARTS = 8
 """Parts of a stroke, which bends with the skin."""
 WOUNDS = 16
 """Wounds that can be shown: two for each bite that soft tissue remembers."""
