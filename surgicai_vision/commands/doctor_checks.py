@@ -259,9 +259,13 @@ def finish_probe(process: subprocess.Popen[str]) -> Finding:
 
 def probe_gl() -> Finding:
     """Open a GL context, then render the grasp scene in it and time that."""
+    from surgicai_vision.core.errors import SurgicaiError
     from surgicai_vision.scene.rendering import renderer_string
 
-    finding: Finding = {"renderer": renderer_string()}
+    try:
+        finding: Finding = {"renderer": renderer_string()}
+    except SurgicaiError as error:
+        return {"error": str(error)}
     try:
         finding["frames_per_second"] = rendering_speed()
     except Exception as error:  # reported as a line of its own; the context above was made

@@ -75,8 +75,9 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Record demonstrations if none are given, render them and print where the dataset is."""
-    from surgicai_vision.core.executor import RunContext, open_engine
+    from surgicai_vision.core.executor import LOCAL, RunContext, open_engine
     from surgicai_vision.dataset import render_demos
+    from surgicai_vision.scene.opengl import check_opengl
 
     # Everything that can be wrong is found before any work.
     context = RunContext(options.workers, open_engine(options.executor), console.stage)
@@ -87,6 +88,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     task = folders.demos_task(options.demos[0]) if options.demos else options.task or "grasp"
     out = options.out or folders.dataset_folder(task)
     folders.check_folder(out, names.META_FILE)
+    if context.engine == LOCAL:  # elsewhere it is the workers that must draw
+        check_opengl()
     demos = options.demos or [_record(options, task, console)]
     summary = render_demos(
         demos,

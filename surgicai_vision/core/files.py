@@ -21,6 +21,7 @@ from surgicai_vision import __version__
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists
 
 CACHE_VARIABLE = "SURGICAI_VISION_CACHE"
+CACHE_HERE = Path("outputs") / "cache"
 TEMPORARY = ".partial-"
 """Prefix of temporary names; anything so named may be deleted when no process writes."""
 
@@ -208,8 +209,26 @@ def code_version(*stages: str) -> str:
 
 
 def cache_root() -> Path:
-    """Return $SURGICAI_VISION_CACHE, or ~/.cache/surgicai-vision."""
-    return Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "surgicai-vision")
+    """Return $SURGICAI_VISION_CACHE, or ~/.cache/surgicai-vision.
+
+    Where the home folder cannot be written, or there is none, as for some users of a container, it
+    is `outputs/cache` in the current folder.
+    """
+    given = os.environ.get(CACHE_VARIABLE)
+    if given:
+        return Path(given)
+    try:
+        at_home = Path.home() / ".cache" / "surgicai-vision"
+    except RuntimeError:  # neither $HOME nor an entry for this user
+        return CACHE_HERE
+    return at_home if is_writable(at_home) else CACHE_HERE
+
+
+def is_writable(path: Path) -> bool:
+    """Return True if `path`, or the first folder above it that exists, can be written."""
+    while not path.exists() and path != path.parent:
+        path = path.parent
+    return path.is_dir() and os.access(path, os.W_OK | os.X_OK)
 
 
 def configs_folder() -> Path:

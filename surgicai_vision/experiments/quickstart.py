@@ -31,6 +31,7 @@ from surgicai_vision.experiments.quickstart_config import Quickstart
 from surgicai_vision.experiments.run import train_run
 from surgicai_vision.features import encoders
 from surgicai_vision.report import write_report
+from surgicai_vision.scene.opengl import check_opengl
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import CARD
 from surgicai_vision.training.run_config import RunConfig, Starts
@@ -56,6 +57,7 @@ def run_quickstart(
 
     Raises:
         MissingWeights: an encoder's weights are not at hand; before any work.
+        InputError: this machine draws no image; before any work.
         UnknownName: a recipe that does not exist; before any work.
         OutputExists: `out` holds something else.
     """
@@ -63,6 +65,7 @@ def run_quickstart(
         policies.recipe_of(run)
         if run.encoder:
             encoders.find_weights(run.encoder)
+    check_opengl()
     sewer = find_sewer(plan.procedure) if plan.procedure else None
     state = _open_state(plan, out)
     sewn: Row | None = None
@@ -133,14 +136,21 @@ def _finding(plan: Quickstart, results: Sequence[Row]) -> dict[str, str]:
     (run, shown), *others = trained
     low, high = shown["ci95"]
     beside = ", ".join(f"{_words(other)} {result['successes']}" for other, result in others)
-    details = "; ".join(f"{result['policy']} {_count(result)}" for result in results[1:])
-    inputs = f"{run.encoder} on {' + '.join(run.views)}" if run.encoder else run.inputs
+    details = "; ".join(
+        (
+            *(f"{_words(other)} {_count(result)}{_seen(other)}" for other, result in others),
+            *(
+                f"the scripted {result['policy']} {_count(result)}"
+                for result in results[len(trained) :]
+            ),
+        )
+    )
     return {
         "headline": f"{plan.task.capitalize()}, {_words(run)}: {shown['successes']} of "
         f"{shown['episodes']} held-out starts" + (f"; {beside}" if beside else ""),
-        "lead": f"{plan.demonstrations} demonstrations; {inputs}: {100 * shown['success_rate']:.0f}"
-        f" %, 95 % interval {100 * low:.0f}–{100 * high:.0f} %. Beside it, from the same "
-        f"demonstrations and on the same starts: {details}.",
+        "lead": f"Trained on {plan.demonstrations} demonstrations{_seen(run)}; 95 % interval "
+        f"{100 * low:.0f}–{100 * high:.0f} %. Beside it, from the same demonstrations and on the "
+        f"same starts: {details}.",
     }
 
 
@@ -152,18 +162,22 @@ def _words(run: RunConfig) -> str:
     return "by the paper's recipe" if recipe == "paper" else f"from images by recipe {recipe}"
 
 
+def _seen(run: RunConfig) -> str:
+    """Return what a policy sees and with what, in brackets; nothing for proprioception alone."""
+    return f" ({run.encoder} on {' + '.join(run.views)})" if run.encoder else ""
+
+
 def _count(result: Row) -> str:
     return f"{result['successes']}/{result['episodes']}"
 
 
 def _video(sewn: Row) -> Row:
     """Return what the report shows of the first act."""
-    how = "from images" if not sewn["why"] and "images" in sewn["who"] else "from the state"
     return {
         "file": f"{PROCEDURE}/{VIDEO}",
         "poster": f"{PROCEDURE}/{POSTER}",
         "strip": f"{PROCEDURE}/{STRIP}",
-        "title": f"One whole procedure, sewn {how} by {sewn['policy']}",
+        "title": f"One whole procedure by {sewn['who']}",
         "text": sewn["text"],
     }
 

@@ -41,6 +41,7 @@ from surgicai_vision.experiments.release_config import (
 from surgicai_vision.experiments.run import train_run
 from surgicai_vision.features import encoders
 from surgicai_vision.scene import build_scene
+from surgicai_vision.scene.opengl import check_opengl
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import CARD, WEIGHTS, Checkpoint, read_checkpoint
 from surgicai_vision.training.released import (
@@ -75,7 +76,8 @@ def run_release(
 
     Raises:
         UnknownName: a policy, view, encoder or recipe that does not exist; before any work.
-        InputError: a folder that cannot be written; before any work.
+        InputError: a folder that cannot be written, or a machine that draws no image; before any
+            work.
         MissingWeights: the encoder's weights are not at hand; before any work.
         OutputExists: `out` holds the work of another plan.
     """
@@ -86,6 +88,7 @@ def run_release(
     for policy in plan.policies:
         policies.recipe_of(plan.run(policy))
     _check_writable(released_folder())
+    check_opengl()
     scene = build_scene(plan.task_config(names.SUTURE).scene).hash
     build = _Build(plan, out / scene[:12], scene, context)
     build.claim()

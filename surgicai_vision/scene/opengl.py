@@ -70,11 +70,31 @@ def _new_context() -> _Context:
     try:
         return cast(_Context, importlib.import_module(module).GLContext(64, 64))
     except (ImportError, AttributeError, OSError, RuntimeError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
-            f"No OpenGL through '{backend}' ({reason}). On Debian or Ubuntu: apt-get install "
-            f"libegl1 libgl1; or set MUJOCO_GL to another of: {', '.join(BACKENDS)}."
+            f"No image can be drawn: '{backend}' gives no OpenGL ({_reason(error)}). On Debian or "
+            "Ubuntu run: sudo apt-get install --yes --no-install-recommends libegl1 libgl1 (Mesa; "
+            "`make setup` does it too). $MUJOCO_GL takes another of: "
+            f"{', '.join(BACKENDS)}. Recording and the expert's evaluations need no images."
         ) from error
+
+
+def _reason(error: Exception) -> str:
+    """Return why a backend gives no context, in one sentence.
+
+    PyOpenGL leaves None in the place of a library that it cannot load.
+    """
+    if isinstance(error, AttributeError):
+        return "its library is not on this machine"
+    return (str(error) or type(error).__name__).splitlines()[0].split(". ")[0].rstrip(".")
+
+
+def check_opengl() -> None:
+    """Refuse a machine that draws no image, before the work that ends in images.
+
+    Raises:
+        InputError: no OpenGL on this machine; says what to install.
+    """
+    make_current()
 
 
 def _close() -> None:

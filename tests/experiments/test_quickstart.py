@@ -94,7 +94,7 @@ def test_the_first_act_is_a_whole_procedure_by_whom_the_page_names(folder):
     frames = read_video(folder / "out/procedure/procedure.mp4")
     assert len(frames) > 25 * sewn["subtasks"][-1]["end_s"] and frames[0].any()
     page = (folder / "out/report.html").read_text()
-    assert "sewn from the state by expert" in page
+    assert "One whole procedure by the scripted expert, which reads the simulator" in page
 
 
 def test_a_first_act_by_what_cannot_sew_is_refused_before_any_work(folder, monkeypatch, capsys):
