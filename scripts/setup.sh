@@ -10,6 +10,8 @@ tools=$root/.venv-tools
 stamp=$venv/.surgicai-vision-setup
 minimum_gb=8
 
+: "${HOME:=/nonexistent}"
+
 say() { printf 'setup: %s\n' "$*"; }
 stop() { printf 'setup: %s\n' "$*" >&2; exit 1; }
 
@@ -95,6 +97,17 @@ install_uv() {
     stop "python3 has neither pip nor venv; install uv by any means and run this again"
 }
 
+# uv keeps what it downloads at home; where nothing can be written there, beside itself.
+keep_cache_here() {
+    [ -z "${UV_CACHE_DIR:-}" ] || return 0
+    if [ -d "$HOME" ] && mkdir -p "${XDG_CACHE_HOME:-$HOME/.cache}/uv" 2>/dev/null &&
+        [ -w "${XDG_CACHE_HOME:-$HOME/.cache}/uv" ]; then
+        return 0
+    fi
+    say "the home folder cannot be written: downloads are kept in .venv-tools"
+    export UV_CACHE_DIR="$tools/cache" UV_PYTHON_INSTALL_DIR="$tools/python"
+}
+
 check_gl() {
     python3 scripts/gl_probe.py >/dev/null 2>&1 && return 0
     apt_install "no OpenGL renders here ($(python3 scripts/gl_probe.py 2>&1 | tail -n 1))" libegl1 libgl1
@@ -137,6 +150,7 @@ fi
 
 python=$(find_python) || python=
 uv=$(find_uv) || { install_uv; uv=$tools/bin/uv; }
+keep_cache_here
 make_venv
 rm -f "$stamp"
 install_packages

@@ -218,10 +218,11 @@ def cache_root() -> Path:
     if given:
         return Path(given)
     try:
-        at_home = Path.home() / ".cache" / "surgicai-vision"
+        home = Path.home()
     except RuntimeError:  # neither $HOME nor an entry for this user
         return CACHE_HERE
-    return at_home if is_writable(at_home) else CACHE_HERE
+    at_home = home / ".cache" / "surgicai-vision"
+    return at_home if home.is_dir() and is_writable(at_home) else CACHE_HERE
 
 
 def is_writable(path: Path) -> bool:

@@ -18,6 +18,9 @@ def test_then_the_home_folder_if_it_can_be_written(
     monkeypatch.delenv(files.CACHE_VARIABLE)
     monkeypatch.setenv("HOME", str(tmp_path))
     assert files.cache_root() == tmp_path / ".cache" / "surgicai-vision"
+    monkeypatch.setenv("HOME", str(tmp_path / "nowhere"))
+    assert files.cache_root() == files.CACHE_HERE
+    monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(files.os, "access", lambda path, mode: False)
     assert files.cache_root() == files.CACHE_HERE
 
