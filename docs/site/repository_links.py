@@ -1,0 +1,56 @@
+"""Sphinx extension: what pages name in code spans becomes a link where the site has its page.
+
+`docs/envs.md` links to that page, `surgicai_vision/envs/base.py` and `surgicai_vision.envs.base` to
+the reference, `examples/environment.py` to the example, `surgicai-vision train` to the verb. The
+pages stay readable in the repository, where the same words are paths.
+"""
+
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+from sphinx.transforms.post_transforms import SphinxPostTransform
+
+from surgicai_vision.commands import COMMANDS, PROGRAM
+
+
+class LinkCodeSpans(SphinxPostTransform):
+    """Replace code spans that name a page by links to it."""
+
+    default_priority = 4  # before Sphinx resolves references
+
+    def run(self, **arguments: object) -> None:
+        """Visit the code spans of one document."""
+        python = {
+            name: (entry.docname, entry.node_id)
+            for name, entry in self.env.domains.python_domain.objects.items()
+        }
+        for node in list(self.document.findall(nodes.literal)):
+            if isinstance(node.parent, nodes.reference | addnodes.pending_xref | nodes.title):
+                continue
+            text = node.astext()
+            module = text.removesuffix("/").removesuffix(".py").replace("/", ".")
+            page, anchor = python.get(module, (page_of(text), ""))
+            if page in self.env.all_docs and page != self.env.docname:
+                address = self.app.builder.get_relative_uri(self.env.docname, page)
+                address += f"#{anchor}" if anchor else ""
+                link = nodes.reference("", "", internal=True, refuri=address)
+                node.replace_self(link)
+                link += node
+
+
+def page_of(text: str) -> str:
+    """Return the page that a code span stands for, or nothing."""
+    if text.startswith("docs/") and text.endswith(".md"):
+        return text.removeprefix("docs/").removesuffix(".md")
+    if text.startswith("examples/"):
+        return "generated/" + text.removesuffix(".py").removesuffix(".ipynb")
+    words = text.split()
+    if len(words) > 1 and words[0] == PROGRAM and words[1] in COMMANDS:
+        return f"generated/commands/{words[1]}"
+    return ""
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Add the transform."""
+    app.add_post_transform(LinkCodeSpans)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
