@@ -1,0 +1,60 @@
+"""From demonstrations to a counted success rate, without the command line.
+
+python examples/train_in_python.py --task place --demonstrations 50 --episodes 20
+"""
+
+import argparse
+from pathlib import Path
+
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.executor import RunContext
+from surgicai_vision.core.names import TEST_SEED
+from surgicai_vision.core.progress import silent_stage
+from surgicai_vision.dataset import open_dataset
+from surgicai_vision.evaluation.policy_spec import open_policy
+from surgicai_vision.evaluation.run import evaluate_into
+from surgicai_vision.experiments.prepare import prepare_dataset
+from surgicai_vision.experiments.run import train_run
+from surgicai_vision.training.run_config import RunConfig, with_epochs
+
+
+def main() -> None:
+    """Do all of it in the folder `--out`; what is there already is not done again."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--task", default="place")
+    parser.add_argument("--demonstrations", type=int, default=50)
+    parser.add_argument("--epochs", type=int, help="default: the recipe's")
+    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--workers", type=int, help="processes; default: one a core")
+    parser.add_argument("--out", type=Path, default=Path("outputs/train_in_python"))
+    arguments = parser.parse_args()
+
+    folder = prepare_dataset(
+        TaskConfig(arguments.task),
+        arguments.out,
+        RunContext(arguments.workers),
+        demonstrations=arguments.demonstrations,
+        views=("front",),
+        size=224,
+        depth=False,
+    )
+    dataset = open_dataset(folder)
+
+    # A run is data. Two of them differ in one thing here: whether the policy sees.
+    changes = with_epochs((), arguments.epochs)
+    sees = RunConfig(dataset.config, "imagenet-lite", ("front",), recipe="paper", changes=changes)
+    blind = RunConfig(dataset.config, recipe="paper", changes=changes)
+
+    # Held-out starts: training draws its seeds elsewhere, so they never meet.
+    starts = range(TEST_SEED, TEST_SEED + arguments.episodes)
+    for run in (sees, blind):
+        checkpoint = arguments.out / "policies" / run.name
+        train_run(run, dataset, checkpoint, silent_stage)  # features first, from the cache
+        spec = open_policy(checkpoint)
+        result = evaluate_into(arguments.out / "evaluations" / run.name, spec, starts)
+        low, high = result["ci95"]
+        print(f"{run.name}: {result['successes']}/{result['episodes']} ({low:.2f}–{high:.2f})")
+
+
+if __name__ == "__main__":  # workers are spawned: they import this file
+    main()
