@@ -17,19 +17,19 @@ from surgicai_vision.demos.rollout import Disturbance
 
 
 def main() -> None:
-    """Do all of it in the folder `--out`; what is there already is not done again."""
+    """Do all of it in one folder; what is there already is not done again."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="insert")
     parser.add_argument("--episodes", type=int, default=5)
     parser.add_argument("--size", type=int, default=224, help="side of an image [px]")
     parser.add_argument("--workers", type=int, help="processes; default: one a core")
-    parser.add_argument("--out", type=Path, default=Path("outputs/record_and_render"))
     arguments = parser.parse_args()
+    out = Path("outputs/record_and_render")
     context = RunContext(arguments.workers)  # the result does not depend on how many
 
     # A demonstration is states and actions, no images. The noise shows how to recover (DART):
     # the executed actions are disturbed, the recorded labels are the expert's own.
-    demos = arguments.out / "demos"
+    demos = out / "demos"
     record(
         TaskConfig(arguments.task),
         episodes=arguments.episodes,
@@ -40,7 +40,7 @@ def main() -> None:
 
     # The same demonstrations in two looks: two views with depth, and every fifth frame of a crop
     # that follows the arm. Both are LeRobot v3 datasets.
-    both, few = arguments.out / "two_views", arguments.out / "every_fifth"
+    both, few = out / "two_views", out / "every_fifth"
     shared = {"size": arguments.size, "context": context}
     render_demos(demos, both, views=("front", "back"), depth=True, **shared)
     render_demos(demos, few, views=("back_psm2",), frame_stride=5, **shared)

@@ -19,39 +19,39 @@ from surgicai_vision.training.run_config import RunConfig, with_epochs
 
 
 def main() -> None:
-    """Do all of it in the folder `--out`; what is there already is not done again."""
+    """Do all of it in one folder; what is there already is not done again."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="place")
     parser.add_argument("--demonstrations", type=int, default=50)
+    parser.add_argument("--encoder", default="imagenet-lite")
     parser.add_argument("--epochs", type=int, help="default: the recipe's")
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--workers", type=int, help="processes; default: one a core")
-    parser.add_argument("--out", type=Path, default=Path("outputs/train_in_python"))
     arguments = parser.parse_args()
 
-    folder = prepare_dataset(
+    out = Path("outputs/train_in_python")
+    folder = prepare_dataset(  # records and renders
         TaskConfig(arguments.task),
-        arguments.out,
+        out,
         RunContext(arguments.workers),
         demonstrations=arguments.demonstrations,
         views=("front",),
         size=224,
         depth=False,
     )
-    dataset = open_dataset(folder)
 
-    # A run is data. Two of them differ in one thing here: whether the policy sees.
+    # A run is data. These two differ in one thing: whether the policy sees.
     changes = with_epochs((), arguments.epochs)
-    sees = RunConfig(dataset.config, "imagenet-lite", ("front",), recipe="paper", changes=changes)
-    blind = RunConfig(dataset.config, recipe="paper", changes=changes)
+    dataset = open_dataset(folder)
+    sees = RunConfig(dataset.config, arguments.encoder, ("front",), changes=changes)
+    blind = RunConfig(dataset.config, changes=changes)
 
     # Held-out starts: training draws its seeds elsewhere, so they never meet.
     starts = range(TEST_SEED, TEST_SEED + arguments.episodes)
     for run in (sees, blind):
-        checkpoint = arguments.out / "policies" / run.name
+        checkpoint = out / "policies" / run.name
         train_run(run, dataset, checkpoint, silent_stage)  # features first, from the cache
-        spec = open_policy(checkpoint)
-        result = evaluate_into(arguments.out / "evaluations" / run.name, spec, starts)
+        result = evaluate_into(out / "evaluations" / run.name, open_policy(checkpoint), starts)
         low, high = result["ci95"]
         print(f"{run.name}: {result['successes']}/{result['episodes']} ({low:.2f}–{high:.2f})")
 

@@ -2,13 +2,14 @@
 
 import runpy
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import gymnasium
 import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from surgicai_vision.core.plugins import Registry
 from surgicai_vision.core.tasks import TASKS
 from surgicai_vision.features.encoders import ENCODERS
 
@@ -21,7 +22,8 @@ SMALL = {
     "environment": ["--task", "pullout"],
     "record_and_render": ["--task", "pullout", "--episodes", "1", "--size", "32", *HERE],
     "train_in_python": [
-        *("--task", "pullout", "--demonstrations", "2", "--epochs", "1", "--episodes", "1", *HERE)
+        *("--task", "pullout", "--demonstrations", "2", "--encoder", "random-conv"),
+        *("--epochs", "1", "--episodes", "1", *HERE),
     ],
     "own_encoder": ["--demonstrations", "2", "--epochs", "1", "--episodes", "1", *HERE],
     "own_task": [],
@@ -40,6 +42,7 @@ SAYS = {
 SETTINGS = """\
 TASK = "pullout"
 DEMONSTRATIONS = 2
+ENCODER = "random-conv"
 EPOCHS = 1
 EPISODES = 1
 SIZE = 32
@@ -50,8 +53,14 @@ STRENGTHS = (0.0, 1.0)
 
 
 @pytest.fixture
-def forgets() -> None:
-    """Whatever an example registers is forgotten after the test."""
+def _forget() -> Iterator[None]:
+    """Forget afterwards whatever an example registers."""
+    tables = [TASKS._targets, ENCODERS._targets, gymnasium.registry]
+    before = [dict(table) for table in tables]
+    yield
+    for table, entries in zip(tables, before, strict=True):
+        table.clear()
+        table.update(entries)
 
 
 def scripts() -> list[str]:
@@ -62,14 +71,13 @@ def test_every_script_is_run() -> None:
     assert scripts() == sorted(SMALL)
 
 
+@pytest.mark.usefixtures("_forget")
 @pytest.mark.parametrize("name", SMALL)
 def test_a_script_runs_as_it_stands(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [f"{name}.py", *SMALL[name]])
-    for registry in (TASKS, ENCODERS):
-        monkeypatch.setattr(registry, "_targets", dict(registry._targets))
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     assert SAYS[name] in capsys.readouterr().out
 
