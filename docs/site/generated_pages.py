@@ -127,7 +127,7 @@ def command_page(words: str, text: str, command: App, level: int) -> str:
     example = (command.help_epilogue or "").partition("\n")[2]
     if example.strip():
         lines = "\n".join(line.removeprefix("  ") for line in example.splitlines())
-        parts.append(f"For example:\n\n```sh\n{lines.strip()}\n```")
+        parts.append(f"For example:\n\n```text\n{lines.strip()}\n```")
     shown = options_of(command.assemble_argument_collection(parse_docstring=True))
     if shown:
         parts += [f"{'#' * (level + 1)} Options", shown]
