@@ -5,6 +5,7 @@
 # make check        lint, format, types, import rule, tests
 # make figures      count what CONTRIBUTING.md asks of the sources
 # make format       rewrite the sources in the house's format
+# make docs         build the documentation as a site: build/docs/index.html
 # make lock         rewrite requirements.lock (UPGRADE=1: newest versions allowed)
 
 BIN := .venv/bin
@@ -12,7 +13,7 @@ BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
-.PHONY: setup quickstart released test lint check figures format lock
+.PHONY: setup quickstart released test lint check figures docs format lock
 .NOTPARALLEL:
 
 setup:
@@ -38,6 +39,10 @@ check: lint test
 
 figures:
 	@$(BIN)/python scripts/figures.py
+
+docs: setup
+	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/docs
+	@echo "docs: build/docs/index.html"
 
 format: setup
 	$(BIN)/ruff check --fix-only --exit-zero .

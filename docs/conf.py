@@ -46,6 +46,7 @@ toc_object_entries = False  # a module a line; each copy of the contents is time
 html_theme = "furo"
 html_title = f"surgicai-vision {__version__}"
 html_static_path = ["static"]
+html_favicon = html_logo = "static/needle.svg"
 html_css_files = ["site.css"]
 html_copy_source = False
 html_theme_options = {

@@ -81,7 +81,10 @@ def command_pages() -> Iterator[tuple[str, str]]:
     rows = "\n".join(
         f"| [`{verb}`]({verb}.md) | {markdown(text)} |" for verb, text in COMMANDS.items()
     )
-    shared = options_of(argument for argument in command_line.meta.assemble_argument_collection(parse_docstring=True))
+    shared = options_of(
+        argument
+        for argument in command_line.meta.assemble_argument_collection(parse_docstring=True)
+    )
     yield (
         "commands/index.md",
         f"""\

@@ -26,6 +26,7 @@ PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs/recipes").glob("*.md")),
 ]
 COMMAND = re.compile(rf"^(?:\s{{4,}}|\| `|`){PROGRAM} ([a-z][^`|#\n]*)", re.MULTILINE)
 FILE = re.compile(

@@ -55,12 +55,14 @@ STRENGTHS = (0.0, 1.0)
 @pytest.fixture
 def _forget() -> Iterator[None]:
     """Forget afterwards whatever an example registers."""
-    tables = [TASKS._targets, ENCODERS._targets, gymnasium.registry]
-    before = [dict(table) for table in tables]
+    known = {registry: registry.names() for registry in (TASKS, ENCODERS)}
+    ids = set(gymnasium.registry)
     yield
-    for table, entries in zip(tables, before, strict=True):
-        table.clear()
-        table.update(entries)
+    for registry, names in known.items():
+        for name in set(registry.names()) - set(names):
+            registry.unregister(name)
+    for new in set(gymnasium.registry) - ids:
+        del gymnasium.registry[new]
 
 
 def scripts() -> list[str]:

@@ -1,0 +1,36 @@
+"""docs/recipes: the Python of the page on Stable-Baselines3 runs, in small settings."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from surgicai_vision.commands.main import main
+
+SMALL = {
+    "learning_starts=1_000": "learning_starts=201",  # HER begins after a whole episode
+    "buffer_size=20_000": "buffer_size=300",
+    "learn(100_000)": "learn(202)",
+    "n_envs=8": "n_envs=2",
+}
+"""What stands on the page → what makes it small."""
+
+
+def test_stable_baselines_learns_and_is_evaluated(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (root / "docs/recipes/sb3.md").read_text()
+    *blocks, agent = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    code = "\n".join(blocks)
+    for large, small in SMALL.items():
+        assert large in code, large
+        code = code.replace(large, small)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    exec(compile(code, "docs/recipes/sb3.md", "exec"), {})
+    assert agent.startswith("# my_agent.py\n")
+    Path("my_agent.py").write_text(agent)
+    (line,) = re.findall(r"^    PYTHONPATH=\. surgicai-vision (.*)$", text, re.MULTILINE)
+    words = line.replace("--episodes 50", "--episodes 1").split()
+    assert main([*words, "--workers", "1"]) == 0
+    assert "on place: 0/1" in capsys.readouterr().out
