@@ -2,8 +2,8 @@
 
 `refuse_impossible(config, through)` looks at the corners of what a task's randomisation may draw:
 
-* Room for PSM2's jaws at the end of the insertion (`geometry`): every pair that may be sewn, with
-  the smallest needle of every arc that may be drawn.
+* Room for PSM2's jaws at the end of the insertion, and for the needle's tip when its base comes out
+  (`geometry`): every pair that may be sewn, with the smallest needle of every arc.
 * Reach: the joints of both arms along the needle's whole way, with nominal grasps, for the corners
   of the phantom's places. (A start whose own, imperfect grasp is out of reach is drawn again.)
 * View: with the phantom's place varied, both holes stay in the images of `VIEWS`.
@@ -57,10 +57,11 @@ def refuse_impossible(config: TaskConfig, through: bool) -> None:
     if through:
         _refuse_narrow(config)
     axes = config.randomisation
-    if axes.phantom_shift or axes.phantom_turn or axes.pair or axes.needle_arc:
+    moves = bool(axes.phantom_shift or axes.phantom_turn)
+    if moves:
         _refuse_hidden(config.scene, axes)
-        if through and all(Stitch.of(*case).possible for case in _cases(config.scene, axes)):
-            _refuse_unreachable(config.scene, axes)
+    if through and (moves or axes.pair or axes.needle_arc):
+        _refuse_unreachable(config.scene, axes)
 
 
 def _arcs(axes: RandomisationConfig) -> tuple[str, ...]:
@@ -71,15 +72,6 @@ def _arcs(axes: RandomisationConfig) -> tuple[str, ...]:
 def _pairs(scene: SceneConfig, axes: RandomisationConfig) -> tuple[int, ...]:
     """Return the indices of the pairs that may be sewn."""
     return (0, 1, 2, 3) if axes.pair == ANY else (scene.hole_pair - 1,)
-
-
-def _cases(
-    scene: SceneConfig, axes: RandomisationConfig
-) -> Iterator[tuple[HolePair, float, float]]:
-    """Yield the pairs that may be sewn with the smallest needle of each arc that may be drawn."""
-    smallest = needle.RADIUS * (1.0 - axes.needle_size)
-    for index, arc in itertools.product(_pairs(scene, axes), _arcs(axes)):
-        yield PAIRS[scene.layout][index], smallest, TIP_ANGLES[arc]
 
 
 # -- room for the jaws -----------------------------------------------------------------------------
@@ -114,15 +106,26 @@ def _refuse_narrow(config: TaskConfig) -> None:
     layout = config.scene.layout
     for index, arc in itertools.product(_pairs(config.scene, axes), _arcs(axes)):
         pair = PAIRS[layout][index]
+        smallest = needle.RADIUS * (1.0 - axes.needle_size)
+        if has_room(pair, smallest, TIP_ANGLES[arc]):
+            if Stitch.of(pair, smallest, TIP_ANGLES[arc]).comes_out:
+                continue
+            raise InputError(
+                f"randomisation: a needle of {arc} circle makes '{config.task}' impossible in "
+                f"layout '{layout}': when its base leaves the exit of pair {index + 1}, its tip "
+                "has come round to the flank. Allowed: a shorter needle_arc, or a smaller "
+                "needle_size."
+            )
         allowed = largest_size(pair, TIP_ANGLES[arc])
-        if axes.needle_size <= allowed:
-            continue
         why = (
             f"the holes of pair {index + 1} are {pair.gap * 1e3:.1f} mm apart, too far for this "
             "needle"
         )
         if allowed >= 0:
-            limit = min(largest_size(*case[::2]) for case in _cases(config.scene, axes))
+            limit = min(
+                largest_size(PAIRS[layout][one], TIP_ANGLES[other])
+                for one, other in itertools.product(_pairs(config.scene, axes), _arcs(axes))
+            )
             raise InputError(
                 f"randomisation: needle_size {axes.needle_size} makes '{config.task}' impossible "
                 f"in layout '{layout}': {why}, an arc of {arc} circle, when it is smallest: PSM2's "

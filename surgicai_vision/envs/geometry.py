@@ -51,6 +51,8 @@ Matrix = NDArray[np.float64]
 GRASP_SIGNS = {PSM1: -1.0, PSM2: 1.0}
 INSERT_ANGLE = math.radians(100.0)
 """The point of a 120° needle that the insertion brings beyond the exit (released code)."""
+COME_ROUND = math.radians(10.0)
+"""What must be left of the turn that would bring a long needle's tip to the exit's plane."""
 INSERT_DEPTH = 0.002
 """How far beyond the exit it brings it [m]."""
 EXTRA = 0.0014
@@ -226,6 +228,15 @@ class Stitch:
         Where they do not, only grasp and place can be done.
         """
         return self.last_grasp >= self.first_grasp
+
+    @property
+    def comes_out(self) -> bool:
+        """Return True if the tip has not come round to the exit's plane when the base is out.
+
+        A point at α from the circle's bottom is R (cos(half + tilt) - cos(α + tilt)) over that
+        plane; the tip is then at half + tip_angle.
+        """
+        return self.tip_angle + COME_ROUND < 2 * (math.pi - self.half - abs(self.pair.exit.tilt))
 
     def grasps(self, low: float, high: float) -> tuple[float, float]:
         """Return the range of grasp angles [rad] on this needle for one on a 120° needle.

@@ -63,11 +63,28 @@ def test_the_derived_limit_is_that_of_the_room_for_the_jaws(size):
         assert has_room == (size <= allowed + 5e-4)
 
 
-def test_a_longer_arc_makes_the_wide_layout_possible():
+def test_the_wide_layouts_narrowest_pair_needs_a_longer_arc():
     """3dmed is for a needle of 133° (the surgical robotics challenge's)."""
-    scene = SceneConfig(layout="3dmed")
+    scene = SceneConfig(layout="3dmed", hole_pair=4)
     assert "Allowed there: grasp, place" in refused(scene=scene)
-    assert refused(scene=scene, needle_arc="1/2") == ""
+    assert refused(scene=scene, needle_arc="3/8") == ""
+
+
+@pytest.mark.parametrize("layout", ["3dmed", "3dmed_straight"])
+def test_a_half_circle_comes_round_to_a_steep_flank(layout):
+    message = refused("pullout", SceneConfig(layout=layout), needle_arc="1/2")
+    assert "come round" in message and "1/2" in message
+
+
+@pytest.mark.parametrize("pair", PAIRS["simple"])
+def test_a_needle_that_comes_out_lies_beyond_the_exits_plane(pair):
+    """The rule is that of the points: with the base in the exit all others are beyond its plane."""
+    for radius, tip_angle in ((0.0086, math.pi), (0.0122, math.pi), (0.0102, 2.9), (0.0086, 3.6)):
+        stitch = Stitch.of(pair, radius, tip_angle)
+        pose = stitch.on_arc(-2 * stitch.half)
+        points = needle.polyline(60, radius, tip_angle)[1:] @ pose[:3, :3].T + pose[:3, 3]
+        clear = min(pair.exit.height(tuple(point)) for point in points) > 0.0
+        assert clear or not stitch.comes_out
 
 
 def test_a_phantom_that_leaves_the_endoscopes_image_is_refused():
