@@ -41,7 +41,7 @@ def completed(script, *words):
     ("words", "offered"),
     [
         (["tr"], ["train"]),
-        (["re"], ["record-demos", "render-demos", "report"]),
+        (["re"], ["record-demos", "render-demos", "release", "report"]),
         (["dataset", ""], ["check", "convert", "push", "pull"]),
         (["dataset", "check", "--j"], ["--json"]),
         (["evaluate", "expert", "--task", "p"], ["place", "pullout"]),

@@ -7,12 +7,14 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers import RecordVideo
 from stable_baselines3.common.env_checker import check_env
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.tasks import env_id
+from surgicai_vision.core.video import read_video
 
 
 def run(code, tmp_path):
@@ -81,3 +83,18 @@ def test_an_episode_ends_at_the_limit_that_its_spec_says(limit):
 def test_two_limits_are_refused(make):
     with pytest.raises(InputError, match="max_episode_steps=7"):
         make(env_id("grasp"), max_steps=7)
+
+
+def test_gymnasium_records_videos(tmp_path):
+    pytest.importorskip("moviepy", reason="no moviepy here: it comes with the extra video")
+    env = gymnasium.make(env_id("handoff"), render_mode="rgb_array")
+    filmed = RecordVideo(env, str(tmp_path), name_prefix="random")
+    filmed.reset(seed=0)
+    shown = [filmed.render()]
+    for _ in range(5):
+        filmed.step(np.zeros(7, np.float32))
+        shown.append(filmed.render())
+    filmed.close()
+    video = read_video(tmp_path / "random-episode-0.mp4")
+    assert video.shape == (6, *shown[0].shape)
+    assert np.abs(video.astype(int) - np.stack(shown)).mean() < 6
