@@ -114,7 +114,9 @@ def probe(
             )
     index = np.asarray(dataset.episode_index)
     rows = spread(index, FRAMES)
-    tables = [np.asarray(entry.rows[rows], np.float64).reshape(len(rows), -1) for entry in features]
+    tables: list[NDArray[np.float64]] = [
+        np.asarray(entry.rows[rows], np.float64).reshape(len(rows), -1) for entry in features
+    ]
     if proprioception:
         tables.append(np.asarray(dataset.columns()[names.STATE][rows], np.float64))
     scale = np.sqrt(max(table.shape[1] for table in tables))

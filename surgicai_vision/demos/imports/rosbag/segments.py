@@ -33,6 +33,7 @@ from surgicai_vision.envs import hole_crossing, poses
 from surgicai_vision.envs.geometry import Stitch, needle_frame
 from surgicai_vision.envs.insert import START_SHIFT, START_TURN
 from surgicai_vision.envs.task_state import TaskState
+from surgicai_vision.envs.tissue import Tissue
 from surgicai_vision.scene import kinematics, needle
 from surgicai_vision.scene.arm import GRASP_DEPTH
 from surgicai_vision.scene.holes import HolePair
@@ -227,6 +228,7 @@ class _NeedleAlone:
 
     radius = needle.RADIUS
     tip_angle = needle.TIP_ANGLE
+    tissue: Tissue | None = None
 
     def __init__(self, pose: Pose):
         self._pose = pose
