@@ -73,7 +73,8 @@ def find_sewer(given: str) -> Sewer:
     except InputError as error:
         if not is_released(given):
             raise
-        return Sewer(open_policy("expert", task=names.SUTURE), expert, str(error))
+        why = str(error).removeprefix(given).removeprefix(":").strip()
+        return Sewer(open_policy("expert", task=names.SUTURE), expert, why)
     return Sewer(spec, f"{given}, a policy that sees images" if spec.run.views else given)
 
 

@@ -72,7 +72,7 @@ def run_quickstart(
     if sewer is not None:
         say(f"Act 1. A whole procedure by {sewer.who}.")
         if sewer.why:
-            say(f"  It stands in for {plan.procedure}: {sewer.why}")
+            say(f"  In the place of {plan.procedure}, which cannot: {sewer.why}")
         with timed(context.stage, state["seconds"]) as measured:
             sewn = sew(sewer, out / PROCEDURE, say, measured)
         state["video"] = _video(sewn)

@@ -25,6 +25,8 @@ from surgicai_vision.core.config import digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, check_name
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import open_dataset
+from surgicai_vision.dataset.protocol import Dataset
+from surgicai_vision.dataset.subset import of_subtask
 from surgicai_vision.demos.rollout import Disturbance
 from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
@@ -129,9 +131,10 @@ class _Build:
         recorded = self.plan.recorded(policy)
         folder = self.out / "policies" / policy.name
         if not (folder / CARD).exists():
-            dataset = open_dataset(self._dataset(recorded))
-            run = self.plan.run(policy)
-            train_run(run, dataset, folder, self.context.stage, subtask=policy.subtask)
+            dataset: Dataset = open_dataset(self._dataset(recorded))
+            if policy.subtask:  # before the encoding: no other frame is encoded
+                dataset = of_subtask(dataset, policy.subtask)
+            train_run(self.plan.run(policy), dataset, folder, self.context.stage)
         checkpoint = read_checkpoint(folder)
         whose = f"the {policy.subtask} of " if policy.subtask else ""
         card = ReleaseCard(

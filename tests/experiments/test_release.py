@@ -189,9 +189,10 @@ def test_the_plan_that_is_released_is_whole():
 
 
 SHIPPED = sorted(path.parent.name for path in (PACKAGE / "released").glob(f"*/{released.CARD}"))
+NONE = [pytest.param("", marks=pytest.mark.skip("no policy is released yet: `make released`"))]
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", SHIPPED or NONE)
 def test_a_shipped_policy_is_what_its_card_says(name, monkeypatch):
     monkeypatch.delenv(released.VARIABLE)
     card = released.read_card(name)
@@ -207,7 +208,7 @@ def test_a_shipped_policy_is_what_its_card_says(name, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in SHIPPED if name != "hlp"])
+@pytest.mark.parametrize("name", [name for name in SHIPPED if name != "hlp"] or NONE)
 def test_a_shipped_policy_solves_five_of_five_starts(name, monkeypatch):
     monkeypatch.delenv(released.VARIABLE)
     card = released.read_card(name)

@@ -67,6 +67,8 @@ def test_wheel_holds_the_three_packages_and_nothing_else(
         if path.is_file()
     }
     assert configs <= set(contents)
+    released = (root / "surgicai_vision" / "released").glob("*/*")
+    assert {f"{path.relative_to(root)}" for path in released} <= set(contents)
 
 
 def test_sdist_ships_neither_data_nor_tests(built: tuple[Path, Path]) -> None:
