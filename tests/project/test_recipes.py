@@ -11,7 +11,10 @@ SMALL = {
     "learning_starts=1_000": "learning_starts=201",  # HER begins after a whole episode
     "buffer_size=20_000": "buffer_size=300",
     "learn(100_000)": "learn(202)",
+    "image_size=84": "image_size=36",
+    "image_size = 84": "image_size = 36",
     "n_envs=8": "n_envs=2",
+    "--episodes 50": "--episodes 1 --workers 1",
 }
 """What stands on the page → what makes it small."""
 
@@ -19,18 +22,18 @@ SMALL = {
 def test_stable_baselines_learns_and_is_evaluated(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = (root / "docs/recipes/sb3.md").read_text()
-    *blocks, agent = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    code = "\n".join(blocks)
+    text = (root / "docs/recipes/sb3.md").read_text(encoding="utf-8")
     for large, small in SMALL.items():
-        assert large in code, large
-        code = code.replace(large, small)
+        assert large in text, large
+        text = text.replace(large, small)
+    *blocks, agent = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    (line,) = re.findall(r"^    PYTHONPATH=\. surgicai-vision (.*)$", text, re.MULTILINE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    exec(compile(code, "docs/recipes/sb3.md", "exec"), {})
+
+    exec(compile("\n".join(blocks), "docs/recipes/sb3.md", "exec"), {})
+
     assert agent.startswith("# my_agent.py\n")
-    Path("my_agent.py").write_text(agent)
-    (line,) = re.findall(r"^    PYTHONPATH=\. surgicai-vision (.*)$", text, re.MULTILINE)
-    words = line.replace("--episodes 50", "--episodes 1").split()
-    assert main([*words, "--workers", "1"]) == 0
+    Path("my_agent.py").write_text(agent, encoding="utf-8")
+    assert main(line.split()) == 0
     assert "on place: 0/1" in capsys.readouterr().out
