@@ -13,7 +13,7 @@ from surgicai_vision.envs.handoff import STRAIGHT, inserted_needle
 from surgicai_vision.envs.place import draw_psm2_grasp
 from surgicai_vision.envs.reach import extraction, is_followed
 from surgicai_vision.envs.simulation import Simulation
-from surgicai_vision.envs.starts import draw_grasp_error, grasp_pose, hold_needle
+from surgicai_vision.envs.starts import draw_grasp_error, grasp_pose, hold_needle, stands_free
 from surgicai_vision.envs.subtask import Demands, Subtask, Tolerance
 from surgicai_vision.scene.kinematics import Pose
 
@@ -54,7 +54,8 @@ class Pullout(Subtask):
         if not is_followed(PSM1, way, simulation.scene.config.instrument):
             return False
         held = hold_needle(simulation, PSM1, needle_pose, grasp, STRAIGHT)
-        return held and not simulation.touches_phantom(needle=False)
+        free = held and stands_free(simulation, PSM2)
+        return free and not simulation.touches_phantom(needle=False)
 
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the needle's frame at the handoff's angle and where it ends."""

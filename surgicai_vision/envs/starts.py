@@ -26,6 +26,8 @@ REST_SPEED = 0.010
 """A held needle faster than this [m/s] is slipping out, as after one closing of the jaws in 150."""
 REST_TURN = 1.0
 """The same for its rotation [rad/s]."""
+PUSHED = 0.0005
+"""An arm that is this far from where it was put has been pushed [m]."""
 CLOSED_JAW = (needle.BODY_RADIUS - PAD_OFFSET) / GRASP_DEPTH
 """Finger angle [rad] at which the pads touch the needle."""
 GRASP_ANGLES = (math.radians(5.0), math.radians(20.0))
@@ -104,6 +106,16 @@ def hold_needle(
     wanted = poses.flat(needle_pose)
     near = poses.distance(now, wanted) < 0.002 and poses.angle(now, wanted) < turn
     return near and simulation.holds(arm) and _at_rest(simulation)
+
+
+def stands_free(simulation: Simulation, arm: str) -> bool:
+    """Return True if an arm stands where it was put: nothing has pushed it out of itself.
+
+    One that was put into the tissue is off by some millimetres once it has settled, touches
+    nothing, and strikes the tissue when it comes back.
+    """
+    wanted = simulation.true_pose(arm, simulation.commands[arm])
+    return poses.distance(simulation.to_base(arm, simulation.tip(arm)), wanted) < PUSHED
 
 
 def _at_rest(simulation: Simulation) -> bool:

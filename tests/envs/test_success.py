@@ -11,9 +11,12 @@ import pytest
 from episodes import make, play
 from needle_polyline import crosses
 
+from surgicai_vision import envs
 from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.envs import hole_crossing, poses
+from surgicai_vision.envs.force_plate import ForcePlate
 from surgicai_vision.envs.geometry import HANDOFF_ANGLE, grasp_in_needle
 from surgicai_vision.scene import compose, holes, needle
 from surgicai_vision.scene.arm import GRASP_DEPTH, PAD_OFFSET
@@ -407,3 +410,16 @@ def test_divergence_is_an_error_and_never_a_success(task, attack, after, monkeyp
     assert np.isfinite(env.get_state()).all()
     again, fresh = make(task), env.reset(seed=7)
     assert np.array_equal(fresh[0], again.reset(seed=7)[0]) and not fresh[1]["physics_error"]
+
+
+def test_no_arm_is_pushed_out_of_the_tissue_at_the_start_of_a_pullout():
+    """Starts that put PSM2 into it are drawn again: it would strike when it comes back."""
+    env = envs.make(TaskConfig("pullout"))
+    plate = ForcePlate(env.model)
+    for seed in (500_013, 500_018):  # the first draws of these are pushed
+        env.reset(seed=seed)
+        forces = []
+        for _ in range(10):
+            env.step(np.zeros(7, np.float32))
+            forces.append(plate.force(env.data))
+        assert max(forces) < 0.1
