@@ -38,6 +38,14 @@ MEASURED = (
     "slip_mm",
     "slip_deg",
     "tissue_force_n",
+    "bite_depth_mm",
+    "bite_length_mm",
+    "entry_deg",
+    "exit_deg",
+    "tissue_impulse_ns",
+    "tears",
+    "thread_mm",
+    "paper_success",
 )
 """Columns of an episode that a change of the house must leave as they are."""
 

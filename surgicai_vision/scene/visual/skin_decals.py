@@ -19,9 +19,9 @@ WOUND_LIFT = 0.00012
 RISE = 0.12
 """Further lift of ink and wounds, per displacement of the skin: between its lines the drawn skin is
 flat, and would hide what follows its bell exactly."""
-ARM = (0.0012, 0.0018)
+ARM = (0.0014, 0.0022)
 """Half the length of a mark's two strokes [m], others and of the pair to be sewn."""
-STROKE = (0.0002, 0.0003)
+STROKE = (0.00025, 0.0004)
 """Half of their width [m]."""
 STROKE_PARTS = 8
 """Parts of a stroke, which bends with the skin."""
