@@ -20,6 +20,15 @@ from surgicai_vision.commands import COMMANDS, PROGRAM
 from surgicai_vision.commands.main import app as command_line
 from surgicai_vision.commands.main import main
 
+ORDER = (
+    "environment",
+    "record_and_render",
+    "train_in_python",
+    "compare_policies",
+    "own_encoder",
+    "own_task",
+)
+"""Scripts in the order to read them; another one comes after them."""
 INNER = (
     "surgicai_vision.scene.visual.",
     "surgicai_vision.demos.imports.",
@@ -67,10 +76,10 @@ def write_pages(app: Sphinx) -> None:
             path.write_text(text, encoding="utf-8")
 
 
-def toctree(entries: Iterable[str], depth: int = 1) -> str:
-    """Return a table of contents in MyST."""
+def toctree(entries: Iterable[str]) -> str:
+    """Return the entries of the sidebar in MyST; the page itself has them in a table."""
     lines = "\n".join(entries)
-    return f"```{{toctree}}\n:maxdepth: {depth}\n\n{lines}\n```\n"
+    return f"```{{toctree}}\n:hidden:\n\n{lines}\n```\n"
 
 
 # ---- the command line
@@ -270,7 +279,7 @@ def automodule(module: str) -> str:
 
 def example_pages() -> Iterator[tuple[str, str]]:
     """Yield (path, text) of a page for each example, and of the page that lists them."""
-    scripts = sorted((ROOT / "examples").glob("*.py"))
+    scripts = sorted((ROOT / "examples").glob("*.py"), key=place)
     notebooks = sorted((ROOT / "examples").glob("*.ipynb"))
     titles = {}
     for path in scripts:
@@ -300,6 +309,12 @@ Short programs against the public Python API; the tests run each of them. They s
 
 {toctree(path.stem for path in titles)}""",
     )
+
+
+def place(path: Path) -> tuple[int, str]:
+    """Return where a script stands among the examples: from easy to special, then by name."""
+    known = path.stem in ORDER
+    return (ORDER.index(path.stem) if known else len(ORDER), path.stem)
 
 
 def cell_text(cell: dict[str, object]) -> str:

@@ -1,8 +1,9 @@
 """Sphinx extension: what pages name in code spans becomes a link where the site has its page.
 
-`docs/envs.md` links to that page, `surgicai_vision/envs/base.py` and `surgicai_vision.envs.base` to
-the reference, `examples/environment.py` to the example, `surgicai-vision train` to the verb. The
-pages stay readable in the repository, where the same words are paths.
+`docs/envs.md` becomes that page's title; `surgicai_vision/envs/base.py` and
+`surgicai_vision.envs.base` link to the reference, `examples/environment.py` to the example,
+`surgicai-vision train` to the verb. The pages stay readable in the repository, where the same words
+are paths.
 """
 
 from docutils import nodes
@@ -29,17 +30,20 @@ class LinkCodeSpans(SphinxPostTransform):
                 continue
             text = node.astext()
             module = text.removesuffix("/").removesuffix(".py").replace("/", ".")
-            page, anchor = python.get(module, (page_of(text), ""))
+            page, anchor = page_of(text, self.env.docname), ""
+            if "." in module and not page:
+                page, anchor = python.get(module, ("", ""))
             if page in self.env.all_docs and page != self.env.docname:
                 address = self.app.builder.get_relative_uri(self.env.docname, page)
                 address += f"#{anchor}" if anchor else ""
                 link = nodes.reference("", "", internal=True, refuri=address)
                 node.replace_self(link)
-                link += node
+                is_page = text.startswith("docs/")
+                link += nodes.Text(self.env.titles[page].astext()) if is_page else node
 
 
-def page_of(text: str) -> str:
-    """Return the page that a code span stands for, or nothing."""
+def page_of(text: str, seen_from: str) -> str:
+    """Return the page that a code span on another page stands for, or nothing."""
     if text.startswith("docs/") and text.endswith(".md"):
         return text.removeprefix("docs/").removesuffix(".md")
     if text.startswith("examples/"):
@@ -47,6 +51,8 @@ def page_of(text: str) -> str:
     words = text.split()
     if len(words) > 1 and words[0] == PROGRAM and words[1] in COMMANDS:
         return f"generated/commands/{words[1]}"
+    if text in COMMANDS and seen_from.startswith("generated/commands/"):
+        return f"generated/commands/{text}"
     return ""
 
 
