@@ -30,6 +30,10 @@ app = App(
 )
 QUALITIES = ("fast", "high")
 FILM_FRAMES = 6
+ANIMATION_EVERY = 4
+"""Control steps from one image of an animation to the next."""
+ANIMATION_SPEED = 2.0
+"""Of the world in an animation."""
 FIGURE_SUFFIXES = (".png", ".jpg", ".pdf", ".svg")
 ALL = "all"
 PLAIN = "plain"
@@ -58,6 +62,7 @@ class Options:
         quality: fast (as datasets are rendered) or high.
         sheet: File to write.
         film: Draw a film strip of the expert in every subtask instead, in the first view.
+        animation: Draw the expert's episode as a moving picture instead, in the first view.
         axes: Draw every axis of `robustness` at every strength instead, in the first view.
         looks: Draw families of looks instead, a row each: every view at seeds from --seed on.
         appearance: Families of --looks: all, train, heldout, plain, or names.
@@ -76,6 +81,7 @@ class Options:
         Path | None, Parameter(metavar="FILE.png"), default_text("outputs/scene-<task>.png")
     ] = None
     film: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
+    animation: Annotated[Path | None, Parameter(metavar="FILE.webp")] = None
     axes: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
     looks: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
     appearance: Annotated[tuple[str, ...], LOOKS] = (ALL,)
@@ -96,6 +102,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
 
     if options.film:
         return _film(options.film, options, console)
+    if options.animation:
+        return _animation(options.animation, options, console)
     if options.axes:
         return _axes(options.axes, options, console)
     if options.looks:
@@ -179,6 +187,38 @@ def _film(path: Path, options: Options, console: Console) -> dict[str, object]:
     figure.savefig(path, dpi=110)
     console.say(f"film: {path}")
     return {"film": str(path), "view": options.view[0], "seed": options.seed, "subtasks": outcomes}
+
+
+def _animation(path: Path, options: Options, console: Console) -> dict[str, object]:
+    """Draw the expert's whole episode as an animated WebP."""
+    from surgicai_vision import envs
+    from surgicai_vision.core.video import ANIMATION, write_animation
+    from surgicai_vision.demos.expert import Expert
+    from surgicai_vision.envs import contact_sheet
+
+    folders.check_file(path, "--animation", (ANIMATION,))
+    config = task_config(options.task, options.env)
+    view = options.view[0]
+    env = envs.make(config, obs_type="state")
+    env.reset(seed=options.seed)
+    expert = Expert(env)
+    images = []
+    info: dict[str, object] = {}
+    size = (options.size, options.size)
+    with console.stage(f"filming the expert of {options.task}", "steps") as progress:
+        for step in range(config.max_steps):
+            if step % ANIMATION_EVERY == 0:
+                image = env.image(view, size, names.RGB, options.quality)
+                images.append(contact_sheet.coloured(image, names.RGB))
+            _, _, terminated, truncated, info = env.step(expert.action())
+            progress(step + 1, config.max_steps)
+            if terminated or truncated:
+                break
+    env.close()
+    fps = names.FPS / ANIMATION_EVERY * ANIMATION_SPEED
+    count = write_animation(path, images, fps)
+    console.say(f"animation: {path}")
+    return {"animation": str(path), "images": count, "success": info.get("is_success")}
 
 
 def _axes(path: Path, options: Options, console: Console) -> dict[str, object]:

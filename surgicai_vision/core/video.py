@@ -2,6 +2,7 @@
 
     write_video(path, frames, fps=25)   # frames: any iterable of (height, width, 3) uint8 RGB
     read_video(path)                    # (n, height, width, 3)
+    write_animation(path, frames, fps)  # an animated WebP, for a README
 
 H.264 by PyAV, in one thread and with no date inside: the same frames give the same bytes. (A
 dataset's videos are another matter: `dataset.video` reads them at random.)
@@ -23,6 +24,7 @@ Image = NDArray[np.uint8]
 """RGB, (height, width, 3)."""
 
 SUFFIX: Final = ".mp4"
+ANIMATION: Final = ".webp"
 PIXELS: Final = "yuv420p"
 """The only pixel format of H.264 that every browser plays; it needs even sides."""
 OPTIONS: Final = {"crf": "20", "preset": "veryfast", "threads": "1", "g": "50"}
@@ -91,3 +93,36 @@ def read_video(path: Path) -> NDArray[np.uint8]:
     except (OSError, av.FFmpegError, IndexError) as error:
         raise BadFile(f"{path} cannot be decoded ({first_line(error)}).") from None
     return np.asarray(np.stack(frames), np.uint8)
+
+
+def write_animation(path: Path, frames: Iterable[Image], fps: float, quality: int = 60) -> int:
+    """Write frames as an animated WebP, which pages show without a player, and count them.
+
+    Args:
+        path: the file, `*.webp`; its folder is made where it is missing.
+        frames: RGB images (height, width, 3) uint8 of one size.
+        fps: frames a second.
+        quality: of the images, 0 to 100.
+
+    Raises:
+        InputError: no frames, or a path that is no `.webp`.
+    """
+    from PIL import Image as Pillow
+
+    if path.suffix != ANIMATION:
+        raise InputError(f"{path} is no {ANIMATION} file; animations are written as WebP.")
+    images = [Pillow.fromarray(np.ascontiguousarray(frame)) for frame in frames]
+    if not images:
+        raise InputError(f"{path}: there are no frames to write.")
+    with files.whole_file(path) as temporary:
+        images[0].save(
+            temporary,
+            format="WEBP",
+            save_all=True,
+            append_images=images[1:],
+            duration=round(1000 / fps),
+            loop=0,
+            quality=quality,
+            method=6,
+        )
+    return len(images)

@@ -9,7 +9,7 @@ Of two sets of first episodes the smaller lies within the larger, so a learning 
 
 A frame stride is worth its name because neighbouring frames of 50 a second say nearly the same,
 while every episode brings a needle that lies elsewhere: for the same time of encoding and training,
-few frames of many episodes teach more than all frames of few (docs/results/best.md).
+few frames of many episodes teach more than all frames of few (docs/results/scene-0.1.md).
 
 A low-level policy is better trained on a subtask's frames of whole procedures than on
 demonstrations of the subtask alone, which end at the first success: in a whole procedure the

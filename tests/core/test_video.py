@@ -3,9 +3,10 @@
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from surgicai_vision.core.errors import BadFile, InputError
-from surgicai_vision.core.video import read_video, write_video
+from surgicai_vision.core.video import read_video, write_animation, write_video
 
 
 def moving(count, height=64, width=96):
@@ -71,3 +72,23 @@ def test_what_is_no_video_is_said(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"no video")
     with pytest.raises(BadFile, match="cannot be decoded"):
         read_video(tmp_path / "a.mp4")
+
+
+def test_an_animation_holds_its_frames_in_order_and_runs_for_ever(tmp_path):
+    frames = moving(6)
+    assert write_animation(tmp_path / "a.webp", frames, 10) == 6
+    with Image.open(tmp_path / "a.webp") as animation:
+        assert animation.n_frames == 6 and animation.info["loop"] == 0
+        for index, frame in enumerate(frames):
+            animation.seek(index)
+            assert animation.info.get("duration", 100) == 100
+            shown = np.asarray(animation.convert("RGB"), np.int16)
+            assert np.abs(shown - frame).mean() < 6
+
+
+def test_what_cannot_be_an_animation_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no .webp file"):
+        write_animation(tmp_path / "a.gif", moving(2), 10)
+    with pytest.raises(InputError, match="no frames"):
+        write_animation(tmp_path / "a.webp", [], 10)
+    assert not list(tmp_path.iterdir())

@@ -292,7 +292,7 @@ def test_what_the_encoder_gave_is_told_and_stands_not_beside_the_papers_number(t
 
 
 def test_results_of_another_version_are_refused_in_one_line(tmp_path, root, capsys):
-    for folder in (root / "docs/results", root / "docs/results/chain"):
+    for folder in (root / "docs/results/scene-0.1", root / "docs/results/scene-0.1/chain"):
         assert main(["report", str(folder), "--out", str(tmp_path / "report.html")]) == 2
         (error,) = capsys.readouterr().err.strip().splitlines()
         assert "of another version" in error
