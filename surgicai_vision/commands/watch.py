@@ -45,8 +45,8 @@ class Options:
     """Options of `watch`.
 
     Attributes:
-        policy: A checkpoint folder, a hierarchical.yaml, module:factory, or expert, replay, random
-            or zero.
+        policy: A checkpoint folder, a hierarchical.yaml, released:NAME (see `policies`),
+            module:factory, or expert, replay, random or zero.
         task: The task.
         seed: Seed of the first start; the next ones follow.
         episodes: End after so many episodes.

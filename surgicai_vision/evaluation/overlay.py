@@ -73,6 +73,10 @@ class Overlay:
         self.height = look.size + BAND
         self._millimetres = np.array([1e3 * moment.distance for moment in moments])
         self._newtons = np.array([moment.force for moment in moments])
+        self._tops = (
+            max(LEAST_MM, float(np.nanmax(self._millimetres))),
+            max(LEAST_N, float(np.nanmax(self._newtons))),
+        )
 
     def frame(self, images: Mapping[str, Image], index: int, outcome: str = "") -> Image:
         """Return one image of the video, (height, width, 3).
@@ -124,18 +128,23 @@ class Overlay:
             right = self.width - EDGE
             pen.text((right, y), value, ink, _font(17, bold=True), anchor="ra")
             pen.text((right, y + 21), label, SOFT, _font(11), anchor="ra")
+        for row, (top_value, unit) in enumerate(zip(self._tops, ("mm", "N"), strict=True)):
+            place = (int(self.width * TEXT_SHARE), top + 42 * row - 4)
+            pen.text(place, f"{top_value:.2g} {unit}", SOFT, _font(10))
 
     def _curves(self, canvas: NDArray[np.uint8], index: int) -> None:
         """Draw both curves up to `index`."""
         left = int(self.width * TEXT_SHARE)
         right = self.width - EDGE - 92
-        for row, (values, least, colour) in enumerate(
-            ((self._millimetres, LEAST_MM, DISTANCE), (self._newtons, LEAST_N, FORCE))
+        for row, (values, top, colour) in enumerate(
+            (
+                (self._millimetres, self._tops[0], DISTANCE),
+                (self._newtons, self._tops[1], FORCE),
+            )
         ):
             low = self._look.size + 8 + 42 * row + 36
-            high = low - 32
+            high = low - 26
             cv2.line(canvas, (left, low), (right, low), RULE, 1)
-            top = max(least, float(np.nanmax(values)))
             steps = np.arange(index + 1)
             x = left + (right - left) * steps / max(1, len(values) - 1)
             share = np.clip(np.nan_to_num(values[: index + 1]) / top, 0.0, 1.0)

@@ -2,6 +2,7 @@
 "use strict";
 
 const PER_DEGREE = 3; // pixels of a drag for a degree
+const HEADROOM = 1.3; // of the curves, whose label stands above them
 const buttons = [...document.querySelectorAll("button[data-command]")];
 const choices = [...document.querySelectorAll("button[data-view-choice]")];
 const curves = { episode: -1, next: 0, points: [] };
@@ -185,14 +186,14 @@ function drawCurve(id, column, colour, least) {
   if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
   const pen = canvas.getContext("2d");
   const values = curves.points.map((point) => point[column]);
-  const top = Math.max(least, ...values) * 1.08;
+  const top = Math.max(least, ...values) * HEADROOM;
   const length = Math.max(100, values.length - 1);
   const style = getComputedStyle(document.documentElement);
   const edge = 3 * devicePixelRatio;
   pen.clearRect(0, 0, width, height);
   pen.font = `${10 * devicePixelRatio}px system-ui, sans-serif`;
   pen.fillStyle = style.getPropertyValue("--soft");
-  pen.fillText(`${(top / 1.08).toPrecision(2)} ${column ? "N" : "mm"}`, edge, 11 * devicePixelRatio);
+  pen.fillText(`${(top / HEADROOM).toPrecision(2)} ${column ? "N" : "mm"}`, edge, 11 * devicePixelRatio);
   pen.strokeStyle = pen.fillStyle = style.getPropertyValue(colour);
   pen.lineWidth = 1.5 * devicePixelRatio;
   pen.beginPath();
