@@ -49,9 +49,9 @@ RELEASE_JAW = 0.1
 """How far its jaw opens a step [rad], to 0.5 rad."""
 RELEASE_SHIFT = 0.001
 """How far it is then drawn back a step [m]."""
-BESIDE = 0.015
-"""How far beside the exit PSM1 starts at least [m], 27 mm in the scene's own place. Draws of its
-start and of the phantom that would put it nearer, in the way of PSM2, are moved out."""
+BESIDE = 0.0115
+"""How far beside the exit PSM1 starts at least [m]; its home is 27 mm beside that of pair 1. A
+start that the draws of robot and phantom would put nearer, in PSM2's way, is moved out."""
 
 
 _COMMANDS = TaskState.SIZE

@@ -1,6 +1,7 @@
 """A world that varies: phantom, pair, needle and robot start, together with all that follows."""
 
 import dataclasses
+import itertools
 import math
 
 import mujoco
@@ -339,3 +340,16 @@ def test_the_limits_of_the_axes_are_those_of_the_world():
     for axis, value in dataclasses.asdict(WORLD).items():
         if axis in RANDOMISATION_LIMITS and axis in AXES and axis != "needle_size":
             assert value == RANDOMISATION_LIMITS[axis]
+
+
+@pytest.mark.parametrize("signs", list(itertools.product((-1.0, 1.0), repeat=3)))
+def test_every_corner_of_the_arms_starts_is_reached(signs):
+    env = made(robot_start=15.0)
+    limit = RANDOMISATION_LIMITS["robot_start"] / 1e3
+    given = {"robot_start": [limit * sign for sign in signs] * len(ARMS)}
+    env.reset(seed=0, options={"randomisation": given})
+    for arm in ARMS:
+        home = (base_in_world(arm) @ start_in_base(arm))[:3, 3]
+        shift = np.array(env.simulation.tip(arm)[:3]) - home
+        np.testing.assert_allclose(shift, limit * np.array(signs), atol=5e-4)
+    assert not env.simulation.touches_phantom(needle=False)
