@@ -95,7 +95,8 @@ def test_the_first_act_is_a_whole_procedure_by_whom_the_page_names(folder):
     frames = read_video(folder / "out/procedure/procedure.mp4")
     assert len(frames) > 25 * sewn["subtasks"][-1]["end_s"] and frames[0].any()
     with PIL.Image.open(folder / "out/procedure/procedure.webp") as moving:
-        assert moving.n_frames >= len(frames) // 2 and moving.info["loop"] == 0
+        # Half of the video's 25 images a second; those at the end, all alike, are one.
+        assert moving.n_frames > 12 * sewn["subtasks"][-1]["end_s"] and moving.info["loop"] == 0
     assert (folder / "out/procedure/procedure.webp").stat().st_size < 3e6
     page = (folder / "out/report.html").read_text()
     assert "One whole procedure by the scripted expert, which reads the simulator" in page
