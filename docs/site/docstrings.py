@@ -52,7 +52,7 @@ def rewrite_docstring(
         name = name.rpartition(".")[0]
     lines[:] = as_rest(lines, name)
     if what in ("attribute", "data", "property"):
-        lines.insert(0, "")  # else napoleon takes what stands before a colon for the type
+        lines[:0] = ["..", ""]  # else napoleon takes what stands before a colon for the type
 
 
 def as_rest(lines: Iterable[str], module: str) -> list[str]:

@@ -33,8 +33,8 @@ type JSON = bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | Non
 STEPS: Mapping[str, tuple[float, float, float]] = types.MappingProxyType(
     {"paper": (0.5e-3, 2.0, 0.05), "released": (1.0e-3, 3.0, 0.05), "shipped": (1.5e-3, 3.0, 0.05)}
 )
-"""Step preset → translation [m], rotation [deg], jaw [rad] of an action of 1 (facts.md §1: the
-image evaluation, the RL training script, the trajectories shipped with the release)."""
+"""Step preset → translation [m], rotation [deg], jaw [rad] of an action of 1. Sources:
+SurgicAI's image evaluation, its RL training script, the trajectories shipped with its release."""
 
 DWELL = 15
 """Control steps a subtask's success must hold, in a whole procedure, before the next one begins."""
