@@ -1,5 +1,6 @@
-"""docs/recipes: the Python of the page on Stable-Baselines3 runs, in small settings."""
+"""docs/recipes: what a reader copies from them is accepted, or runs in small settings."""
 
+import json
 import re
 from pathlib import Path
 
@@ -37,3 +38,16 @@ def test_stable_baselines_learns_and_is_evaluated(
     Path("my_agent.py").write_text(agent, encoding="utf-8")
     assert main(line.split()) == 0
     assert "on place: 0/1" in capsys.readouterr().out
+
+
+def test_the_grid_of_a_comparison_is_a_sweep(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (root / "docs/recipes/compare.md").read_text(encoding="utf-8")
+    (grid,) = re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    (line,) = re.findall(r"^    surgicai-vision (sweep .* --dry-run)$", text, re.MULTILINE)
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text(grid, encoding="utf-8")
+    assert main([*line.split(), "--json"]) == 0
+    planned = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert planned["runs"] == 2 * 5 + 5  # two encoders and proprioception, five seeds each
