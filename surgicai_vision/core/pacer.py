@@ -10,6 +10,9 @@ MAX_CATCH_UP_TICKS = 5
 MAX_TICKS_WITHOUT_IMAGE = 10
 """Ticks after which an image is due even when late: five a second at real time."""
 
+MEMORY_TICKS = 25
+"""Ticks over which the pace that was reached is averaged."""
+
 
 class Pacer:
     """Keeps the time of a loop that ticks and draws.
@@ -33,6 +36,8 @@ class Pacer:
         self._clock = clock
         self._sleep = sleep
         self._due = clock() + self._period
+        self._last = clock()
+        self._length = self._period
         self._ticks_without_image = 0
 
     def set_pace(self, pace: float) -> None:
@@ -56,3 +61,11 @@ class Pacer:
         elif now > self._due + MAX_CATCH_UP_TICKS * self._period:
             self._due = now
         self._due += self._period
+        ended = self._clock()
+        self._length += (ended - self._last - self._length) / MEMORY_TICKS
+        self._last = ended
+
+    @property
+    def reached(self) -> float:
+        """Return the share of real time at which the last ticks really went."""
+        return 1.0 / (names.FPS * max(self._length, 1e-6))

@@ -144,12 +144,13 @@ class Player:
             if self._rest >= REST_TICKS:
                 self._begin(self.seed + 1, PLAYING)
 
-    def status(self, views: tuple[str, ...], points: int) -> LiveStatus:
+    def status(self, views: tuple[str, ...], points: int, reached: float = 0.0) -> LiveStatus:
         """Return what a page shows.
 
         Args:
             views: those that are shown.
             points: of the page's curves.
+            reached: share of real time at which it plays.
         """
         return LiveStatus(
             state=self.state,
@@ -161,6 +162,7 @@ class Player:
             is_procedure=self._config.task == names.SUTURE,
             moment=self.moment,
             speed=self.speed,
+            reached=round(reached, 2) if self.state == PLAYING else 0.0,
             go_on=self._go_on,
             successes=sum(row.success for row in self.rows.values()),
             episodes=len(self.rows),
@@ -236,7 +238,7 @@ def watch_on_page(player: Player, page: LivePage, views: LiveViews) -> None:
         pacer.set_pace(player.speed)
         player.tick()
         if page.screen.wants_image() and pacer.can_draw():
-            status = player.status(views.shown, page.points)
+            status = player.status(views.shown, page.points, pacer.reached)
             # Images are drawn anew only where something that they show has changed.
             now = (player.number, status.moment.step, views.shown, views.orbit)
             if now != drawn:

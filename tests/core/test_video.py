@@ -87,7 +87,7 @@ def test_an_animation_holds_its_frames_in_order_and_runs_for_ever(tmp_path):
 
 
 def test_what_cannot_be_an_animation_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no .webp file"):
+    with pytest.raises(InputError, match=r"no \.webp file"):
         write_animation(tmp_path / "a.gif", moving(2), 10)
     with pytest.raises(InputError, match="no frames"):
         write_animation(tmp_path / "a.webp", [], 10)

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import os
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ import cv2
 import gymnasium
 import numpy as np
 import pytest
+from browser import CHROMIUM, Browser
 
 from surgicai_vision import envs
 from surgicai_vision.core.cameras import camera_names
@@ -245,6 +247,39 @@ def test_human_shows_what_is_stepped_and_changes_nothing(monkeypatch, capsys):
         env.close()
     np.testing.assert_array_equal(states[None], states["human"])
     assert f"Open {live.server.url}" in capsys.readouterr().err
+
+
+HUMAN = """
+import gymnasium, surgicai_vision
+env = gymnasium.make("surgicai_vision/Handoff-v0", render_mode="human")
+for seed in range(40):
+    env.reset(seed=seed)
+    for _ in range(100):
+        env.step(env.action_space.sample())
+"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here: apt-get install chromium")
+def test_a_browser_sees_what_another_program_steps(tmp_path):
+    bare = {key: value for key, value in os.environ.items() if not key.endswith("DISPLAY")}
+    code = [sys.executable, "-c", HUMAN]
+    process = subprocess.Popen(code, stderr=subprocess.PIPE, text=True, env=bare)
+    try:
+        address = next(word for line in process.stderr for word in line.split() if "//" in word)
+        with Browser(tmp_path / "profile", 420, 800) as browser:
+            browser.open(address)
+            step = "Number(document.getElementById('step').textContent.split(' ')[0])"
+            assert browser.until(f"{step} > 2", 60)
+            assert browser.value("document.querySelectorAll('[data-command]').length") == 0
+            assert browser.until("document.querySelector('#lead canvas').width === 448")
+            browser.key("Escape", True)
+            episode = browser.value("document.getElementById('episode').textContent")
+            assert browser.until(f"document.getElementById('episode').textContent !== '{episode}'")
+            assert browser.until("curves.points.length > 5")
+            assert browser.complaints == []
+    finally:
+        process.kill()
+        process.wait()
 
 
 def test_without_a_display_there_is_no_window(monkeypatch):

@@ -84,7 +84,8 @@ class LiveStatus:
         limit: control steps it may take.
         is_procedure: the task is all five subtasks in a row.
         moment: what is measured now.
-        speed: share of real time.
+        speed: share of real time that is asked for.
+        reached: share of real time at which it really plays; 0 where it does not play.
         go_on: the next start begins by itself.
         successes, episodes: counts of the episodes that have ended.
         points: points of the curves shown so far, in all episodes.
@@ -99,6 +100,7 @@ class LiveStatus:
     is_procedure: bool
     moment: Moment
     speed: float
+    reached: float
     go_on: bool
     successes: int
     episodes: int

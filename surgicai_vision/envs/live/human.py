@@ -115,6 +115,7 @@ class _PageOfEnv:
             is_procedure=self._env.task == names.SUTURE,
             moment=moment,
             speed=1.0,
+            reached=0.0,
             go_on=True,
             successes=0,
             episodes=0,

@@ -134,6 +134,12 @@ function arrange(views) {
   }
 }
 
+// What is asked for, and what this machine reaches where that is less.
+function pace() {
+  const asked = status.speed === 1 ? status.state : `${status.state}, ${status.speed}×`;
+  return status.reached && status.reached < 0.85 * status.speed ? `${asked} (here ${status.reached.toPrecision(1)}×)` : asked;
+}
+
 // -- status and curves ------------------------------------------------------------------------------------------------
 
 function showStatus(next) {
@@ -143,7 +149,7 @@ function showStatus(next) {
     episode: status.episode, seed: status.seed < 0 ? "–" : status.seed, time: `${(now.step / 50).toFixed(2)} s`, step: `${now.step} of ${status.limit}`,
     subtask: now.subtask, angle: `${(now.angle * 180 / Math.PI).toFixed(0)}°`, contact: now.contact ? "yes" : "no",
     counts: status.episodes ? `${status.successes} of ${status.episodes}` : "–", distance: `${(now.distance * 1000).toFixed(1)} mm`,
-    force: `${now.force.toFixed(2)} N`, state: status.speed === 1 ? status.state : `${status.state}, ${status.speed}×`, text: status.message,
+    force: `${now.force.toFixed(2)} N`, state: pace(), text: status.message,
   };
   for (const [id, value] of Object.entries(text)) setText(id, value);
   element("message").className = status.state === "ended" ? (now.success ? "good" : "bad") : status.state;
