@@ -1,10 +1,12 @@
 """Thread hold: soft tissue holds the thread where it goes in and where it comes out.
 
-Each of the scene's `THREAD_HOLDS` equalities ties a point of one capsule of the thread to an
-anchor, by a soft spring. Along the thread, once a control step,
-the point slides as far as the force exceeds the friction; at the capsule's end the next capsule
-takes over at the same place. What is tied to what is in the model, so `write` follows every change
-and every restored state.
+Each of the scene's `THREAD_HOLDS` equalities ties a point of one capsule of the thread to a slider.
+Across the thread that is a spring. Along it the slider glides with the thread, by friction, through
+an anchor in the tissue; the sliders of a bite's entry and exit glide the same way. Once a control
+step the slider is put back into its anchor, and the held point as far back along the thread; at the
+end of a capsule the next one takes over at the same place. So the thread goes through, and nothing
+jumps. What is tied to what is in the model, so `write` follows every change and every restored
+state.
 """
 
 import math
@@ -21,11 +23,9 @@ from surgicai_vision.scene.holes import Point
 
 NOTHING = -1
 """The segment of a hold that holds none."""
-
-
-AHEAD = 1.5
-"""A held point slides this much further than the force asks for: the thread goes on sliding until
-the next control step, and the force should be right in the middle of that time."""
+NEAREST = 0.001
+"""Nearest to the needle that the thread is held [m]: a hold at the very joint could not turn a
+thread that trails off the wrong way."""
 
 
 @dataclass
@@ -36,20 +36,22 @@ class ThreadHold:
         segment: the capsule it holds, `NOTHING` where it holds none.
         offset: of the held point from that capsule's start [m].
         anchor: in the phantom's frame [m].
-        is_exit: it is the last bite's exit.
+        is_exit: it is a bite's exit; the hold before it is the same bite's entry.
+        friction: along the thread [N].
     """
 
     segment: int = NOTHING
     offset: float = 0.0
     anchor: Point = elements.HIDDEN
     is_exit: bool = False
+    friction: float = 0.0
 
-    SIZE: ClassVar[int] = 6
+    SIZE: ClassVar[int] = 7
     """Numbers of a packed hold."""
 
     def pack(self) -> list[float]:
         """Return the hold as `SIZE` numbers."""
-        return [self.segment, self.offset, *self.anchor, self.is_exit]
+        return [self.segment, self.offset, *self.anchor, self.is_exit, self.friction]
 
     @classmethod
     def unpack(cls, values: Sequence[float]) -> "ThreadHold":
@@ -59,6 +61,7 @@ class ThreadHold:
             offset=values[1],
             anchor=(values[2], values[3], values[4]),
             is_exit=bool(values[5]),
+            friction=values[6],
         )
 
 
@@ -75,80 +78,116 @@ class ThreadHolds:
     SIZE: ClassVar[int] = elements.THREAD_HOLDS * ThreadHold.SIZE
     """Numbers of all packed holds."""
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        ridge: Ridge,
-        segments: int,
-    ):
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, ridge: Ridge, segments: int):
         self._model = model
         self._data = data
         self._ridge = ridge
         self._bodies = [model.body(f"thread_{index}").id for index in range(segments)]
         self._pitch = thread.LENGTH / max(segments, 1)
-        names = [f"thread_hold_{slot}" for slot in range(elements.THREAD_HOLDS if segments else 0)]
-        self._equalities = [model.equality(name).id for name in names]
-        self._mocaps = [int(model.body(name).mocapid[0]) for name in names]
-        self._holds = [ThreadHold() for _ in names]
+        slots = range(elements.THREAD_HOLDS if segments else 0)
+        self._equalities = [model.equality(f"thread_hold_{slot}").id for slot in slots]
+        self._mocaps = [int(model.body(f"thread_hold_{slot}").mocapid[0]) for slot in slots]
+        self._couplings = [model.equality(f"thread_bite_{slot}").id for slot in slots[:-1]]
+        sliders = [model.joint(f"thread_slider_{slot}") for slot in slots]
+        self._slides = [int(slider.qposadr[0]) for slider in sliders]
+        self._dofs = [int(slider.dofadr[0]) for slider in sliders]
+        self._holds = [ThreadHold() for _ in slots]
         self._springs: list[elements.Spring] = []
 
     def meet(self) -> None:
         """Follow a randomised model: the needle's mass, on which the thread's springs depend."""
-        weights = self._model.body_invweight0
-        self._springs = [elements.thread_spring(float(weights[body, 0])) for body in self._bodies]
+        if not self._bodies:
+            return
+        weights = self._model.body_invweight0[:, 0]
+        slider = float(weights[self._model.body("thread_slider_0").id])
+        self._springs = [
+            elements.thread_spring(float(weights[body]) + slider) for body in self._bodies
+        ]
 
     def clear(self) -> None:
         """Let go of everything."""
         self._holds = [ThreadHold() for _ in self._holds]
         self.write()
 
-    def take(self, anchor: Point, *, is_exit: bool) -> None:
-        """Hold the thread's beginning at an anchor; the oldest hold makes room."""
-        if self._holds:
-            for hold in self._holds:
-                hold.is_exit = False
-            self._holds = [*self._holds[1:], ThreadHold(0, 0.0, anchor, is_exit)]
-            self.write()
+    def take(self, anchor: Point, friction: float, *, is_exit: bool) -> None:
+        """Hold the thread's beginning at an anchor; the oldest hold makes room.
+
+        Args:
+            anchor: in the phantom's frame [m].
+            friction: along the thread [N].
+            is_exit: it is a bite's exit; its entry then holds what lies straight behind it.
+        """
+        if not self._holds:
+            return
+        self._shift(ThreadHold(0, NEAREST, anchor, is_exit, friction), newest=True)
+        entry = self._holds[-2]
+        if is_exit and entry.segment != NOTHING:
+            place = NEAREST + math.dist(entry.anchor, anchor)
+            entry.segment = min(int(place / self._pitch), len(self._bodies) - 1)
+            entry.offset = place - entry.segment * self._pitch
+        self.write()
 
     def drop(self) -> None:
         """Let go of what was taken last."""
         if self._holds:
-            self._holds = [ThreadHold(), *self._holds[:-1]]
+            self._shift(ThreadHold(), newest=False)
             self.write()
 
-    def follow(self, friction: float) -> float | None:
-        """Let the thread slide through the holds.
+    def _shift(self, hold: ThreadHold, *, newest: bool) -> None:
+        """Add a hold at one end of the list, and take the one at the other end away."""
+        slides = [
+            (float(self._data.qpos[slide]), float(self._data.qvel[dof]))
+            for slide, dof in zip(self._slides, self._dofs, strict=True)
+        ]
+        turns = [self._data.mocap_quat[mocap].tolist() for mocap in self._mocaps]
+        still = (0.0, 0.0)
+        none = [1.0, 0.0, 0.0, 0.0]
+        if newest:
+            self._holds = [*self._holds[1:], hold]
+            slides = [*slides[1:], still]
+            turns = [*turns[1:], none]
+        else:
+            self._holds = [hold, *self._holds[:-1]]
+            slides = [still, *slides[:-1]]
+            turns = [none, *turns[:-1]]
+        for slot, ((place, speed), turn) in enumerate(zip(slides, turns, strict=True)):
+            self._data.qpos[self._slides[slot]] = place
+            self._data.qvel[self._dofs[slot]] = speed
+            self._data.mocap_quat[self._mocaps[slot]] = turn
 
-        Args:
-            friction: largest force along the thread at each hold [N].
+    def follow(self) -> float | None:
+        """Let the thread go on through the holds.
 
         Returns:
-            The thread drawn out of the last bite's exit [m]; None where it holds no thread.
+            The thread drawn out of the last exit [m]; None where no exit holds it.
         """
         drawn = None
-        slack = friction / elements.THREAD_STIFFNESS
-        for slot, hold in enumerate(self._holds):
+        slides = [float(self._data.qpos[slide]) for slide in self._slides]
+        for slot in range(len(self._holds) - 1):
+            if self._is_bite(slot):
+                slides[slot] = slides[slot + 1] = (slides[slot] + slides[slot + 1]) / 2
+        for slot, (hold, slid) in enumerate(zip(self._holds, slides, strict=True)):
             if hold.segment == NOTHING:
                 continue
-            stretch = self._stretch(hold)
-            if abs(stretch) > slack:
-                self._slide(hold, AHEAD * (stretch - math.copysign(slack, stretch)))
-                self._write(slot)
+            self._slide(hold, -slid)
             if hold.is_exit:
                 drawn = hold.segment * self._pitch + hold.offset
             if hold.segment >= len(self._bodies):
                 self._holds[slot] = ThreadHold()
+            else:
+                # The slider's way is along the capsule.
+                turn = self._data.xquat[self._bodies[hold.segment]]
+                self._data.mocap_quat[self._mocaps[slot]] = turn
+            self._data.qpos[self._slides[slot]] = 0.0
+            self._write(slot)
         return drawn
 
-    def _stretch(self, hold: ThreadHold) -> float:
-        """Return how far the anchor is from the held point, along the thread [m]."""
-        body = self._bodies[hold.segment]
-        x, y, z = self._ridge.to_world(hold.anchor)
-        px, py, pz = self._data.xpos[body].tolist()
-        _, _, a, _, _, b, _, _, c = self._data.xmat[body].tolist()
-        along: float = a * (x - px) + b * (y - py) + c * (z - pz)
-        return along - hold.offset
+    def _is_bite(self, slot: int) -> bool:
+        """Return True if a hold and the next one are the entry and the exit of one bite."""
+        entry = self._holds[slot]
+        leave = self._holds[slot + 1]
+        is_held = entry.segment != NOTHING and leave.segment != NOTHING
+        return is_held and leave.is_exit and not entry.is_exit
 
     def _slide(self, hold: ThreadHold, way: float) -> None:
         """Move the held point along the thread by `way` [m]."""
@@ -159,7 +198,8 @@ class ThreadHolds:
         elif hold.offset < 0.0 and hold.segment > 0:
             hold.segment -= 1
             hold.offset += self._pitch
-        hold.offset = min(max(hold.offset, 0.0), self._pitch)
+        nearest = NEAREST if hold.segment == 0 else 0.0
+        hold.offset = min(max(hold.offset, nearest), self._pitch)
 
     def write(self) -> None:
         """Write all holds to the model and the data."""
@@ -168,17 +208,26 @@ class ThreadHolds:
 
     def _write(self, slot: int) -> None:
         """Write one hold to the model and the data."""
+        model = self._model
+        data = self._data
         hold = self._holds[slot]
         equality = self._equalities[slot]
+        dof = self._dofs[slot]
         is_held = 0 <= hold.segment < len(self._bodies)
-        self._data.eq_active[equality] = is_held
-        place = self._ridge.to_world(hold.anchor) if is_held else elements.HIDDEN
-        self._data.mocap_pos[self._mocaps[slot]] = place
-        if is_held:
-            model = self._model
-            model.eq_obj1id[equality] = self._bodies[hold.segment]
-            model.eq_data[equality, :6] = (0.0, 0.0, hold.offset, 0.0, 0.0, 0.0)
-            model.eq_solref[equality], model.eq_solimp[equality] = self._springs[hold.segment]
+        data.eq_active[equality] = is_held
+        for first in (slot - 1, slot):
+            if 0 <= first < len(self._couplings):
+                data.eq_active[self._couplings[first]] = self._is_bite(first)
+        model.dof_frictionloss[dof] = hold.friction if is_held else 0.0
+        if not is_held:
+            data.mocap_pos[self._mocaps[slot]] = elements.HIDDEN
+            data.qpos[self._slides[slot]] = 0.0
+            data.qvel[dof] = 0.0
+            return
+        data.mocap_pos[self._mocaps[slot]] = self._ridge.to_world(hold.anchor)
+        model.eq_obj1id[equality] = self._bodies[hold.segment]
+        model.eq_data[equality, :6] = (0.0, 0.0, hold.offset, 0.0, 0.0, 0.0)
+        model.eq_solref[equality], model.eq_solimp[equality] = self._springs[hold.segment]
 
     def pack(self) -> list[float]:
         """Return all holds as `SIZE` numbers."""

@@ -25,8 +25,8 @@ Once a control step, before positions are computed for it, `update` looks where 
 * A hold is an elastic spring up to the yield force; beyond it a part of the displacement stays
   (isotropic hardening). At the tear force the tissue tears: the anchor follows until the yield
   force is left, and `tears` counts.
-* The thread is held where it goes in, and where it comes out, by holds whose place on the thread
-  slides when the force along it exceeds the friction.
+* The thread is held where it goes in and where it comes out (`thread_hold`), and slides through
+  when the force along it exceeds the friction.
 
 Geometry is in the phantom's frame, in plain floats: the phantom may be shifted and turned about z.
 Everything is packed into MuJoCo's user data, so a state restored in the middle of an insertion goes
@@ -425,7 +425,7 @@ class Tissue:
             self.stage = TRAILING
             self._front = max(length, SPACING)
             self._entry_anchor = self._holds.anchor(0)
-            self._thread.take(self._entry_anchor, is_exit=False)
+            self._take_thread(self._entry_anchor, is_exit=False)
             self._trail()
             return
         half = 0.5 * self.forces.friction * max(length, 0.0)
@@ -444,7 +444,7 @@ class Tissue:
         """Follow a needle whose base is inside."""
         left = self._arc.radius * self._holds.angle(1)
         if left < LEAVING:
-            self._thread.take(self._holds.anchor(1), is_exit=True)
+            self._take_thread(self._holds.anchor(1), is_exit=True)
             self._leave()
             return
         if left > self._front + LEAVING:
@@ -473,11 +473,15 @@ class Tissue:
             distance -= SPACING
 
     def _follow_thread(self) -> None:
-        """Let the thread slide through the places that hold it."""
-        length = self._passages[-1].length if self._passages else 0.0
-        drawn = self._thread.follow(0.5 * self.forces.thread_friction * length)
+        """Let the thread go on through the places that hold it."""
+        drawn = self._thread.follow()
         if drawn is not None:
             self.thread_drawn = drawn
+
+    def _take_thread(self, anchor: Point, *, is_exit: bool) -> None:
+        """Hold the thread behind the needle's base, with half of the bite's friction."""
+        friction = 0.5 * self.forces.thread_friction * self._passages[-1].length
+        self._thread.take(anchor, friction, is_exit=is_exit)
 
     def _leave(self) -> None:
         """End the bite: the needle is outside."""

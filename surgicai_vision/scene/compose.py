@@ -157,7 +157,12 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     )
     body = needle.add_needle(spec, {"contype": SURFACES | GRIP, "conaffinity": 0})
     thread.add_thread(
-        spec, body, needle.point(0.0).tolist(), config.thread, {"contype": THREAD, "conaffinity": 0}
+        spec,
+        body,
+        needle.point(0.0).tolist(),
+        config.thread,
+        {"contype": THREAD, "conaffinity": 0},
+        thread.HELD_ARMATURE if is_soft else thread.ARMATURE,
     )
     if is_soft:
         spec.nuserdata += tissue.SOFT_DATA

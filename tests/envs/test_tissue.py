@@ -426,7 +426,7 @@ def test_the_thread_follows_through_the_needles_path_and_is_held_there():
             fastest = max(fastest, float(np.abs(env.data.qvel[first : first + 30]).max()))
         if len(drawn) > 40 or step > 150:
             break
-    assert np.all(np.diff(drawn) > -1e-4) and drawn[-1] > 0.010, "more and more is drawn out"
+    assert np.all(np.diff(drawn) > -3e-4) and drawn[-1] > 0.010, "more and more is drawn out"
     assert fastest < 60.0, "nothing kicks it"
     bite = tissue.bites[-1]
     starts = np.array([env.data.body(f"thread_{index}").xpos for index in range(10)])
@@ -434,6 +434,56 @@ def test_the_thread_follows_through_the_needles_path_and_is_held_there():
         assert distance_to_polyline(np.array(point), starts) < 0.0015
     base = env.simulation.needle_point(0.0)
     assert tissue.thread_drawn == pytest.approx(math.dist(base, bite.exit), abs=0.004)
+
+
+def test_the_thread_runs_through_two_stitches_in_their_order():
+    """From the needle: the second bite's exit and entry, then the first's, a bite apart."""
+    simulation = driven(dataclasses.replace(SOFT, thread=20))
+    circles = [Circle(*points(pair), simulation.radius) for pair in PAIRS["simple"][:2]]
+    first, last = at_start(simulation, circles[0])
+    drive(simulation, circles[0], first, last)
+    around(simulation, *circles, last, first)
+    drive(simulation, circles[1], first, last)
+    bites = simulation.tissue.bites
+    assert len(bites) == 2 and all(bite.is_done for bite in bites)
+    # Clear of the ridge, so that the thread is drawn taut.
+    for lift in np.arange(0.0, 0.015, 5e-4):
+        pose = circles[1].pose(last)
+        pose[2, 3] += lift
+        move(simulation, pose)
+        drive_still(simulation)
+    starts = np.array([simulation.data.body(f"thread_{index}").xpos for index in range(20)])
+    ways = [
+        place_on_polyline(np.array(point), starts)
+        for bite in bites[::-1]
+        for point in (bite.exit, bite.entry)
+    ]
+    assert ways == sorted(ways)
+    for exit_way, entry_way, bite in ((ways[0], ways[1], bites[1]), (ways[2], ways[3], bites[0])):
+        assert entry_way - exit_way == pytest.approx(bite.length, abs=0.003)
+
+
+def around(simulation, before, after, last, first):
+    """Bring the needle from the end of one circle to the start of another, high over the ridge."""
+    steps = 120
+    high = np.concatenate([np.linspace(0, 1, 30), np.ones(steps - 60), np.linspace(1, 0, 30)])
+    for share, lift in zip(np.linspace(0.0, 1.0, steps), high, strict=True):
+        pose = after.pose(last + share * (first - last))
+        pose[:3, 3] = (1.0 - share) * before.centre + share * after.centre
+        pose[2, 3] += 0.02 * lift
+        move(simulation, pose)
+        drive_still(simulation)
+
+
+def place_on_polyline(point, line):
+    """Return how far along a polyline (N, 3) the place nearest to a point is [m]."""
+    ways = np.diff(line, axis=0)
+    lengths = np.linalg.norm(ways, axis=1)
+    share = np.clip(((point - line[:-1]) * ways).sum(1) / lengths**2, 0.0, 1.0)
+    apart = np.linalg.norm(line[:-1] + share[:, None] * ways - point, axis=1)
+    nearest = int(apart.argmin())
+    assert apart[nearest] < 0.004
+    return float(lengths[:nearest].sum() + share[nearest] * lengths[nearest])
 
 
 def distance_to_polyline(point, line):
