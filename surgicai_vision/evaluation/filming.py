@@ -145,6 +145,9 @@ class Filming:
         """
         if not states or not self.wants(row):
             return
+        # An evaluation that was killed may have left one of another outcome.
+        for earlier in self.folder.glob(f"{row.task}-{row.seed}-*{SUFFIX}"):
+            earlier.unlink()
         title = f"{self.title or row.policy}, start {row.seed}"
         frames = video_frames(config, states, moments, title, outcome_of(row), self.look)
         write_video(self.folder / video_name(row), frames, self.look.fps)

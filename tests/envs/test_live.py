@@ -14,7 +14,7 @@ from browser import CHROMIUM, Browser
 
 from surgicai_vision import envs
 from surgicai_vision.core.cameras import camera_names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.envs.live import human
 from surgicai_vision.envs.live.browser import FREE, SPEEDS, Command, LivePage
@@ -96,6 +96,23 @@ def test_a_named_camera_is_drawn_as_before(env):
     assert list(views.render()) == ["back"]
     assert not views.handle(Command("play"))
     views.close()
+
+
+def test_who_watches_changes_nothing_of_what_the_env_observes():
+    """Not even where views and observations have one size and the needle changes its shape."""
+    config = TaskConfig("handoff", randomisation=RandomisationConfig(needle_size=0.2))
+    seen = []
+    for watched in (False, True):
+        env = envs.make(config, obs_type="pixels", cameras=("back",), image_size=64)
+        views = LiveViews(env, ("back", FREE), 64)
+        for seed in (1, 2, 3):
+            seen.append(env.reset(seed=seed)[0]["back"])
+            if watched:
+                views.render()
+        views.close()
+        env.close()
+    for plain, watched in zip(seen[:3], seen[3:], strict=True):
+        np.testing.assert_array_equal(plain, watched)
 
 
 # -- the page --------------------------------------------------------------------------------------

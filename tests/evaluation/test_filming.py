@@ -82,8 +82,11 @@ def test_rows_and_videos_depend_on_neither_filming_nor_workers(tmp_path):
 def test_filming_again_replaces_what_was_filmed_and_touches_nothing_else(tmp_path):
     evaluate(ZeroAgent, SHORT, [1], workers=1, filming=Filming(tmp_path, look=SMALL))
     (tmp_path / "mine.txt").write_text("kept")
+    (tmp_path / "handoff-2-success.mp4").write_text("of a run that was killed")
     evaluate(ZeroAgent, SHORT, [2], workers=1, filming=Filming(tmp_path, look=SMALL))
-    assert [name.split("-")[1] for name in names_in(tmp_path)] == ["2"]
+    (name,) = names_in(tmp_path)
+    assert name.startswith("handoff-2-")
+    assert name != "handoff-2-success.mp4"
     assert (tmp_path / "mine.txt").read_text() == "kept"
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "a.mp4").write_text("somebody's")

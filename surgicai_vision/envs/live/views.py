@@ -30,6 +30,9 @@ class LiveViews:
         self.shown = shown
         self.orbit = Orbit()
         self._env = env
+        if (size, size) == env.view.image_size:
+            # Renderers of one size share their GPU objects, and so the needle of an episode before.
+            size += 2
         self._size = (size, size)
         self._rig = Rig(env.simulation, env.calibration)
         self._draws = env.simulation.draws
