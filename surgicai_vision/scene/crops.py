@@ -28,7 +28,9 @@ from surgicai_vision.scene.cameras import (
 
 SPAN = 0.050
 """Height of what a crop shows at the holes [m]: at 224 × 224 pixels 0.22 mm a pixel, where "front"
-and "back" have 0.43 and 0.47; two and a half needles, and the jaws at their middle."""
+and "back" have 0.43 and 0.47; two and a half needles, and the jaws at their middle. Of 50, 30 and
+20 mm it is the one from which a probe reads the needle's tip best (`benchmarks/crop_span.py`,
+docs/envs.md)."""
 CROPPED = (0.0, 0.050, 0.075)
 """Point in world [m] at whose distance that holds: between the holes and the needle's home."""
 LARGEST = 16384
