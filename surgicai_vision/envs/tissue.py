@@ -9,8 +9,9 @@
   again), `TRAILING` (the needle's base has gone in).
 * `tears`: how often the tissue tore in this episode.
 * `force_on_needle() -> (3,)`: force of the tissue on the needle in world [N].
-* `thread_drawn`: thread that was drawn out of the last bite's exit [m].
+* `thread_drawn`: thread that was drawn out of the last exit that it passed [m].
 * `passed(pair) -> int`: what `TaskState.holes_passed` is.
+* `passages`, `ridge`, `held_at_skin()`: the same in the phantom's frame, to draw the skin.
 
 Once a control step, before positions are computed for it, `update` looks where the needle is:
 
