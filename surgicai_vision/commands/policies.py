@@ -63,7 +63,7 @@ def run(*, console: Console) -> dict[str, object]:
         (line.policy, line.task, line.successes, line.sees, _scene(line), line.licence)
         for line in lines
     ]
-    for text in aligned([head, *rows]):
+    for text in aligned([head, *rows]) if rows else ():
         console.say(text)
     for line in lines:
         if line.problem:
