@@ -91,7 +91,7 @@ SITUATIONS = {
     "another-user-without-home": Situation(
         command=AS_NOBODY, variables={"HOME": "/root"}, needs=needs_root
     ),
-    "c-locale": Situation(variables={"LC_ALL": "C", "LANG": None, "PYTHONUTF8": "0"}),
+    "c-locale": Situation(variables={"LC_ALL": "C", "LANG": None}),
     "no-opengl": Situation(
         variables={"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}, refused=NO_OPENGL
     ),
