@@ -57,6 +57,12 @@ def test_every_verb_has_its_page_with_its_options(site: Path) -> None:
     assert all(f"dataset-{inner}" in text for inner in dataset.COMMANDS)
 
 
+def test_the_reference_has_every_package_but_the_commands(site: Path, root: Path) -> None:
+    packages = {path.parent.name for path in root.glob("surgicai_vision/*/__init__.py")}
+    pages = {path.stem for path in (site / "generated/api").glob("surgicai_vision.*.html")}
+    assert pages == {f"surgicai_vision.{name}" for name in packages - {"commands"}}
+
+
 def test_the_reference_has_what_docstrings_say(site: Path) -> None:
     text = (site / "generated/api/surgicai_vision.evaluation.html").read_text(encoding="utf-8")
     assert 'id="surgicai_vision.evaluation.statistics.mcnemar"' in text
