@@ -35,7 +35,7 @@ SAYS = {
     "record_and_render": "1 episodes",
     "train_in_python": "proprioception-paper+epochs=1: ",
     "own_encoder": "thumbnail-front-paper+epochs=1: ",
-    "own_task": "start 2: 19 steps, success: True",
+    "own_task": "steps, success: True\nstart 2: ",
     "compare_policies": "expert against zero: 1 : 0 starts, p = 1 (Holm)",
 }
 """Script → what it prints."""
