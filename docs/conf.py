@@ -25,7 +25,7 @@ extensions = [
     "docstrings",
     "repository_links",
 ]
-exclude_patterns = ["site", "results/*/*"]
+exclude_patterns = ["site", "results/*/**"]
 suppress_warnings = [
     "ref.python"
 ]  # an annotation's bare name, such as Plugin, may be of two modules
