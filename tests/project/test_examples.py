@@ -69,8 +69,11 @@ def scripts() -> list[str]:
     return sorted(path.stem for path in EXAMPLES.glob("*.py"))
 
 
-def test_every_script_is_run() -> None:
+def test_every_script_is_run_and_every_example_listed() -> None:
     assert scripts() == sorted(SMALL)
+    listed = (EXAMPLES / "README.md").read_text(encoding="utf-8")
+    examples = [*EXAMPLES.glob("*.py"), *EXAMPLES.glob("*.ipynb")]
+    assert not [path.name for path in examples if f"| `{path.name}` |" not in listed]
 
 
 @pytest.mark.usefixtures("_forget")
