@@ -26,7 +26,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.features.encoders import WeightsSource
 
 if TYPE_CHECKING:
-    from surgicai_vision.evaluation.filming import Filming
+    from surgicai_vision.evaluation.films import Filming
     from surgicai_vision.evaluation.policy_spec import PolicySpec
 
 app = App(
@@ -127,7 +127,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
 def _filming(options: Options) -> "Filming | None":
     """Return which episodes become videos; None without --video."""
-    from surgicai_vision.evaluation.filming import INDEX, Filming, Look
+    from surgicai_vision.evaluation.films import INDEX, Filming, Look
 
     if options.video is None:
         return None

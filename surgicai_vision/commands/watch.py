@@ -83,7 +83,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     from surgicai_vision.envs.live.browser import LivePage
     from surgicai_vision.envs.live.views import LiveViews
     from surgicai_vision.envs.live.window import Window, check_display
-    from surgicai_vision.evaluation.filming import outcome_of
+    from surgicai_vision.evaluation.films import outcome_of
     from surgicai_vision.evaluation.watch import Player, watch_in_window, watch_on_page
 
     if options.window:

@@ -12,7 +12,7 @@ Letters are DejaVu's, which matplotlib brings along: the same on every machine.
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -26,8 +26,9 @@ from PIL import ImageDraw, ImageFont
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.video import Image
+from surgicai_vision.envs import contact_sheet
 from surgicai_vision.envs.moment import Moment
-from surgicai_vision.evaluation.filming import Look
+from surgicai_vision.evaluation.films import LAST_S, Look
 
 type Colour = tuple[int, int, int]
 
@@ -188,3 +189,34 @@ def _font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
     """Return DejaVu Sans in a size [px]."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)
+
+
+def video_frames(
+    config: TaskConfig,
+    states: Sequence[NDArray[np.float64]],
+    moments: Sequence[Moment],
+    title: str,
+    outcome: str,
+    look: Look,
+) -> Iterator[Image]:
+    """Yield the images of an episode's video; the last state is always among them.
+
+    Args:
+        config: the task.
+        states: for the env's `set_state_vector`, from the start on.
+        moments: what was measured at each of them.
+        title: what stands above the overlay.
+        outcome: how the episode ended, shown at the end for `LAST_S`.
+        look: views, size and pace.
+    """
+    last = len(states) - 1
+    overlay = Overlay(moments, look, title, config)
+    with contact_sheet.state_renderer(config, look.size, look.quality) as draw:
+        for index in [*range(0, last, look.every), last]:
+            images = {view: draw(states[index], view) for view in look.views}
+            if index == last:
+                end = overlay.frame(images, index, outcome)
+                for _ in range(max(1, round(LAST_S * look.fps / look.speed))):
+                    yield end
+            else:
+                yield overlay.frame(images, index)

@@ -18,7 +18,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.evaluation.agent import MakeAgent
-from surgicai_vision.evaluation.filming import Filming
+from surgicai_vision.evaluation.films import Filming
 from surgicai_vision.evaluation.slot import Episode, Slot
 
 BATCH = 8

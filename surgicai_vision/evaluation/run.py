@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from surgicai_vision.core.progress import Progress, Stage
-from surgicai_vision.evaluation.filming import Filming
+from surgicai_vision.evaluation.films import Filming
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.rollout import evaluate

@@ -18,8 +18,10 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision import envs
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import PhysicsError
+from surgicai_vision.envs.episode_monitor import EpisodeMonitor
 from surgicai_vision.envs.moment import Moment, present_moment
 from surgicai_vision.evaluation.agent import Agent, Env, Observation
 from surgicai_vision.evaluation.metrics import EpisodeMetrics, failure_kind
@@ -46,8 +48,6 @@ class Episode:
 
 def env_of(agent: Agent, config: TaskConfig) -> Env:
     """Make an env that shows what the agent sees."""
-    from surgicai_vision import envs
-
     cameras = tuple(agent.cameras)
     return envs.make(
         config,
@@ -84,8 +84,6 @@ class Slot:
     moments: list[Moment] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        from surgicai_vision.envs.episode_monitor import EpisodeMonitor
-
         self.env = env_of(self.agent, self.task_config)
         self.monitor = EpisodeMonitor(self.env)
 

@@ -31,7 +31,7 @@ from surgicai_vision.envs.live.views import LiveViews
 from surgicai_vision.envs.live.window import Window
 from surgicai_vision.envs.moment import Moment
 from surgicai_vision.evaluation.agent import Agent, Env
-from surgicai_vision.evaluation.filming import outcome_of
+from surgicai_vision.evaluation.films import outcome_of
 from surgicai_vision.evaluation.metrics import EpisodeMetrics
 from surgicai_vision.evaluation.slot import Slot
 

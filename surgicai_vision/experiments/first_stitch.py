@@ -24,8 +24,9 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.progress import Stage, silent_stage
 from surgicai_vision.core.video import Image, read_video, write_video
 from surgicai_vision.envs import contact_sheet
-from surgicai_vision.evaluation.filming import Look, outcome_of, video_frames
+from surgicai_vision.evaluation.films import Look, outcome_of
 from surgicai_vision.evaluation.metrics import EpisodeMetrics
+from surgicai_vision.evaluation.overlay import video_frames
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.evaluation.slot import Slot
 from surgicai_vision.evaluation.storage import Row

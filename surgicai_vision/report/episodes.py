@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
+from surgicai_vision.evaluation.statistics import clopper_pearson
 from surgicai_vision.report import text
 from surgicai_vision.report.charts import KIND_COLOURS
 from surgicai_vision.report.filmstrips import Reel, Strip
@@ -84,8 +85,6 @@ def group_details(
 
 def _cell(result: Result, commands: Sequence[str]) -> dict[str, object]:
     """Return one training seed: counts, episodes in short form, facts."""
-    from surgicai_vision.evaluation.statistics import clopper_pearson
-
     rows = result.rows
     k = sum(bool(row["success"]) for row in result.rows)
     return {

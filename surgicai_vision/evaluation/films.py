@@ -10,7 +10,7 @@ to be written; a folder with it is filmed into anew, and what it lists is remove
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -22,7 +22,7 @@ from surgicai_vision.core import files, names
 from surgicai_vision.core.cameras import check_camera
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.core.video import SUFFIX, Image, write_video
+from surgicai_vision.core.video import SUFFIX, write_video
 from surgicai_vision.evaluation.metrics import EpisodeMetrics
 
 if TYPE_CHECKING:
@@ -149,6 +149,8 @@ class Filming:
         for earlier in self.folder.glob(f"{row.task}-{row.seed}-*{SUFFIX}"):
             earlier.unlink()
         title = f"{self.title or row.policy}, start {row.seed}"
+        from surgicai_vision.evaluation.overlay import video_frames  # OpenCV and fonts
+
         frames = video_frames(config, states, moments, title, outcome_of(row), self.look)
         write_video(self.folder / video_name(row), frames, self.look.fps)
 
@@ -179,37 +181,3 @@ def outcome_of(row: EpisodeMetrics) -> str:
     """Return how an episode ended, in words."""
     outcome = "success" if row.success else row.failure.replace("_", " ")
     return f"{outcome} after {row.steps} steps"
-
-
-def video_frames(
-    config: TaskConfig,
-    states: Sequence[NDArray[np.float64]],
-    moments: "Sequence[Moment]",
-    title: str,
-    outcome: str,
-    look: Look = Look(),
-) -> Iterator[Image]:
-    """Yield the images of an episode's video; the last state is always among them.
-
-    Args:
-        config: the task.
-        states: for the env's `set_state_vector`, from the start on.
-        moments: what was measured at each of them.
-        title: what stands above the overlay.
-        outcome: how the episode ended, shown at the end for `LAST_S`.
-        look: views, size and pace.
-    """
-    from surgicai_vision.envs import contact_sheet
-    from surgicai_vision.evaluation.overlay import Overlay
-
-    last = len(states) - 1
-    overlay = Overlay(moments, look, title, config)
-    with contact_sheet.state_renderer(config, look.size, look.quality) as draw:
-        for index in [*range(0, last, look.every), last]:
-            images = {view: draw(states[index], view) for view in look.views}
-            if index == last:
-                end = overlay.frame(images, index, outcome)
-                for _ in range(max(1, round(LAST_S * look.fps / look.speed))):
-                    yield end
-            else:
-                yield overlay.frame(images, index)

@@ -11,7 +11,7 @@ from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.video import read_video
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.agents import ExpertAgent, ZeroAgent
-from surgicai_vision.evaluation.filming import LAST_S, Filming, Look
+from surgicai_vision.evaluation.films import LAST_S, Filming, Look
 from surgicai_vision.evaluation.overlay import BAND, GOOD
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.evaluation.slot import Slot
