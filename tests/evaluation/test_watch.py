@@ -195,7 +195,7 @@ def test_a_browser_watches_the_expert(tmp_path, width, height):
             assert browser.value("document.getElementById('message').className") == "good"
             assert re.match(r"Success after \d+ steps", browser.value(text("text")))
             steps = int(browser.value(text("step")).split()[0])
-            assert browser.value("curves.points.length") == steps + 1
+            assert browser.until(f"curves.points.length === {steps + 1}")
             assert browser.value("curves.points[0][0] > curves.points.at(-1)[0]")
             click("[data-view-choice=free]")
             assert browser.until("document.querySelectorAll('figure').length === 3")
