@@ -135,7 +135,7 @@ make_venv() {
 
 install_packages() {
     say "installing $(grep -c '==' requirements.lock) locked packages in .venv (about 6 GB on disk, once)"
-    "$uv" pip install --quiet --python "$venv/bin/python" --require-hashes -r requirements.lock
+    "$uv" pip install --quiet --python "$venv/bin/python" --no-deps --require-hashes -r requirements.lock
     "$uv" pip install --quiet --python "$venv/bin/python" --no-deps --no-build-isolation \
         --editable . --editable ./lerobot_env_surgicai --editable ./lerobot_salvage
 }
