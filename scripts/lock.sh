@@ -15,7 +15,7 @@ compile() {
         --no-header --no-emit-index-url --no-emit-find-links ${UPGRADE:+--upgrade} "$@" >/dev/null
 }
 
-compile --all-extras --group dev --group docs pyproject.toml --output-file requirements.lock
+compile --all-extras --group dev --group docs --override scripts/overrides.txt pyproject.toml --output-file requirements.lock
 echo uv | compile --no-annotate - --output-file scripts/uv.txt
 if grep -nE '://|^--' requirements.lock scripts/uv.txt; then
     echo "lock: the lines above name an address or an option; they must not be committed" >&2
