@@ -19,6 +19,8 @@ Physics, images, resets and workers, each against the bare thing at equal settin
 * looks: frames of episodes each with a look of its own (`randomisation: appearance`) against the
   same episodes again, whose looks are drawn already, and against episodes of the plain look. An
   episode is a reset and 200 observations of two views.
+* skin: images of every state of an expert's procedure in soft tissue, with the skin that follows
+  the state and with whole skin; two views a state, as policies have them. And in channels.
 * reset: per task [ms].
 * workers: two worker processes against one, steps of all envs a second: gymnasium's asynchronous
   vector env (`async_…`, an env a worker) and ours (`shares_…`, `--share` envs a worker), with state
@@ -56,6 +58,7 @@ from surgicai_vision.core.cameras import CAMERAS
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig
 from surgicai_vision.core.tasks import SUBTASK_STEPS, env_id
 from surgicai_vision.demos.expert import Expert
+from surgicai_vision.envs.skin import Skin
 from surgicai_vision.scene.arm import GRASP_DEPTH
 from surgicai_vision.scene.cameras import crop_of
 from surgicai_vision.scene.compose import build_spec
@@ -343,6 +346,51 @@ def measure_looks(repeats: int) -> dict[str, Any]:
     }
 
 
+def measure_skin(repeats: int) -> dict[str, Any]:
+    """Time images of soft tissue whose skin follows the state against images of whole skin."""
+    rates: dict[str, list[float]] = {"following": [], "whole": [], "channels": []}
+    filmed = {kind: _states(SceneConfig(tissue=kind)) for kind in ("soft", "channels")}
+    env = filmed["soft"][0]
+    tissue = env.simulation.tissue
+    assert tissue is not None
+    with (
+        FrameRenderer(env.model, SIZE, SIZE, skin=Skin(env.simulation, tissue)) as following,
+        FrameRenderer(filmed["channels"][0].model, SIZE, SIZE) as channels,
+    ):
+        for _ in range(repeats):
+            rates["following"].append(_rate(*filmed["soft"], following))
+            env.set_state_vector(filmed["soft"][1][0])
+            following.render(env.data, CAMERA)  # the first state's skin is whole
+            with FrameRenderer(env.model, SIZE, SIZE) as whole:
+                rates["whole"].append(_rate(*filmed["soft"], whole))
+            rates["channels"].append(_rate(*filmed["channels"], channels))
+    return {
+        **{f"{kind}_frames_per_s": round(median(values)) for kind, values in rates.items()},
+        "following_of_whole": ratio(rates["following"], rates["whole"]),
+        "following_of_channels": ratio(rates["following"], rates["channels"]),
+    }
+
+
+def _states(scene: SceneConfig) -> tuple[envs.SuturingEnv, list[np.ndarray]]:
+    """Return an env and every state of an expert's procedure in it."""
+    env, start, actions, _ = record(scene)
+    env.set_state_vector(start)
+    states = [start]
+    for action in actions:
+        env.step(action)
+        states.append(env.get_state())
+    return env, states
+
+
+def _rate(env: envs.SuturingEnv, states: list[np.ndarray], renderer: FrameRenderer) -> float:
+    """Return images a second, two a state; restoring it is not counted."""
+    seconds = 0.0
+    for state in states:
+        env.set_state_vector(state)
+        seconds += timed(lambda: [renderer.render(env.data, CAMERA) for _ in range(2)])
+    return 2 * len(states) / seconds
+
+
 def measure_reset(repeats: int) -> dict[str, float]:
     """Return the median time of a reset per task [ms]."""
     row = {}
@@ -411,7 +459,7 @@ def measure_help(repeats: int) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print one JSON line."""
-    parts = ("step", "tissue", "frames", "crop", "looks", "reset", "workers", "help")
+    parts = ("step", "tissue", "frames", "crop", "looks", "skin", "reset", "workers", "help")
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -437,6 +485,8 @@ def main() -> None:
         row["crop"] = measure_crop(chosen.repeats, chosen.frames)
     if "looks" in chosen.only:
         row["looks"] = measure_looks(chosen.repeats)
+    if "skin" in chosen.only:
+        row["skin"] = measure_skin(chosen.repeats)
     if "reset" in chosen.only:
         row["reset_ms"] = measure_reset(chosen.repeats)
     if "help" in chosen.only:
@@ -450,7 +500,7 @@ def main() -> None:
             for kind in ("state", "pixels")
         }
     row["load_average"] = [round(value, 2) for value in os.getloadavg()]
-    emit("speed", row, render=bool({"frames", "crop", "looks"} & {*chosen.only}))
+    emit("speed", row, render=bool({"frames", "crop", "looks", "skin"} & {*chosen.only}))
 
 
 if __name__ == "__main__":

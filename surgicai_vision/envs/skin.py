@@ -25,9 +25,9 @@ from surgicai_vision.scene.phantom import DENT, ORIGIN, SIZE
 from surgicai_vision.scene.visual.skin_state import Pull, SkinState, Wound
 from surgicai_vision.scene.visual.soft_skin import SoftSkin
 
-PLACE = 1e-4
+PLACE = 3e-4
 """Places are rounded to this [m]."""
-WAY = 4e-5
+WAY = 1.2e-4
 """Displacements are rounded to this [m]."""
 TIP_REACH = 0.0012
 """Reach of the dent about a needle [m]: about as deep as wide, as skin under a point."""
@@ -62,11 +62,10 @@ class Skin:
         self.meshes = self._drawn.meshes
         self._pads = [pad for arm in names.ARMS for pad in simulation.scene.arms[arm].pads]
 
-    def follow(self) -> SkinState:
-        """Write the meshes of the present state into the model and return what they show."""
-        state = self.state()
-        self._drawn.shape(state)
-        return state
+    def follow(self) -> tuple[int, ...]:
+        """Write the meshes of the present state into the model and return their versions."""
+        self._drawn.shape(self.state())
+        return self._drawn.versions
 
     def state(self) -> SkinState:
         """Return what the skin shows now."""

@@ -60,10 +60,10 @@ class Following(Protocol):
     meshes: tuple[int, ...]
     """Their ids."""
 
-    def follow(self) -> object:
-        """Write the meshes of the present state into the model; return what they show.
+    def follow(self) -> tuple[int, ...]:
+        """Write the meshes of the present state into the model; return a version of each.
 
-        Meshes that show the same are not uploaded again.
+        A mesh of the same version as before is not uploaded again.
         """
 
 
@@ -221,7 +221,7 @@ class _Target:
         self.codes = np.zeros(0, dtype=np.uint8)
         self.look = appearance.shown(model)
         self.painted = [0.0] * len(self.look)
-        self.skin: object = None
+        self.versions: dict[int, int] = {}
 
     def draw(
         self,
@@ -243,11 +243,10 @@ class _Target:
             self.painted = numbers
             self.codes = np.zeros(0, dtype=np.uint8)
         if skin is not None:
-            shown = skin.follow()
-            if shown != self.skin:
-                for mesh in skin.meshes:
+            for mesh, version in zip(skin.meshes, skin.follow(), strict=True):
+                if self.versions.get(mesh) != version:
                     mujoco.mjr_uploadMesh(self.model, self.context, mesh)
-                self.skin = shown
+                    self.versions[mesh] = version
         # Another target may have drawn since; without this its buffer would be drawn over and read.
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value

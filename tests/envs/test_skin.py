@@ -73,7 +73,8 @@ def test_a_pressing_tip_takes_the_skin_along(insertion):
     env, states = insertion
     env.set_state_vector(last(states, OUTSIDE))
     skin = skin_of(env)
-    deepest = skin.follow().pulls[0]
+    skin.follow()
+    deepest = skin.state().pulls[0]
     hole = env.stitch.pair.entry
     tip = env.simulation.needle_point(env.simulation.tip_angle)
     depth = math.hypot(*deepest.way)
@@ -152,7 +153,7 @@ def test_a_dent_has_depth(insertion):
 
     def dented():
         model_skin.shape(state)
-        return state
+        return model_skin.versions
 
     env._images._skin.follow = dented
     try:
@@ -219,7 +220,11 @@ def test_shaping_is_exact_and_can_be_undone():
         np.linalg.norm(points - hole.centre, axis=1) < 2e-3
     )
     assert low.any()
+    versions = skin.versions
+    skin.shape(dented)
+    assert skin.versions == versions
     skin.shape(SkinState())
+    assert all(now > then for now, then in zip(skin.versions[:1], versions[:1], strict=True))
     for name, before in whole.items():
         np.testing.assert_array_equal(world_points(env, name), before)
 

@@ -78,6 +78,11 @@ class Wounds:
     def __init__(self, pairs: tuple[HolePair, ...]):
         self._pairs = pairs
         self._edges = piece_edges(pairs)
+        nothing = (np.zeros((0, 3)), np.zeros((0, 3)))
+        self._kept: list[tuple[tuple[Wound, ...] | None, tuple[Array, Array]]] = [
+            (None, nothing),
+            (None, nothing),
+        ]
 
     def faces(self) -> Faces:
         """Return the triangles of all wounds, (m, 3)."""
@@ -93,16 +98,25 @@ class Wounds:
 
         The latest `WOUNDS` are shown; those not there are hidden.
         """
+        points, normals = self._whole(wounds[-WOUNDS:], halo)
+        return _lifted(points, pulls), normals
+
+    def _whole(self, wounds: tuple[Wound, ...], halo: bool) -> tuple[Array, Array]:
+        """Return points and normals on whole skin; those of the last wounds are kept."""
+        if self._kept[halo][0] == wounds:
+            return self._kept[halo][1]
         size = HALO if halo else 1.0
-        lift = (MARK_LIFT + WOUND_LIFT) / 2 if halo else WOUND_LIFT
+        lift = LIFT + ((MARK_LIFT + WOUND_LIFT) / 2 if halo else WOUND_LIFT)
         spare = np.insert(_rim(size, 0.0), 2, 0.0, axis=1) + PARKED
         points = [spare] * WOUNDS
         normals = np.tile((0.0, 0.0, 1.0), (WOUNDS * len(spare), 1))
-        for index, wound in enumerate(wounds[-WOUNDS:]):
+        for index, wound in enumerate(wounds):
             hole = self._plane(wound.start)
-            points[index] = _lifted(_decal(hole, wound, size, LIFT + lift), pulls)
+            points[index] = _decal(hole, wound, size, lift)
             normals[index * len(spare) : (index + 1) * len(spare)] = hole.normal
-        return np.concatenate(points), normals
+        drawn = (np.concatenate(points), normals)
+        self._kept[halo] = (wounds, drawn)
+        return drawn
 
     def _plane(self, point: Point) -> Hole:
         """Return the hole whose flank a point is on."""

@@ -52,9 +52,14 @@ class SkinGrid:
         across = np.concatenate([np.zeros((len(self._rows), 1)), np.cumsum(steps, axis=1)], axis=1)
         self._across = (across - across.mean(axis=1, keepdims=True)) / SIZE[0]
         self._columns = np.arange(self._sections.shape[1], dtype=np.float64)
+        self._places: tuple[tuple[Point, float], ...] = ()
 
     def gather(self, pulls: list[Pull]) -> None:
         """Lay the fine lines about pulls, the largest first, at least `FOCI` of them."""
+        places = tuple((pull.place, pull.reach) for pull in pulls[:FOCI])
+        if places == self._places:
+            return
+        self._places = places
         fine = np.array(FINE)
         across = [self._nearby(pull.place, fine * pull.reach) for pull in pulls[:FOCI]]
         along = np.clip(pulls[0].place[1] + fine * pulls[0].reach, self._rows[-1], self._rows[0])

@@ -17,6 +17,10 @@ from surgicai_vision.scene.holes import Point
 Array = NDArray[np.float64]
 
 
+LEAST = 1e-4
+"""Smallest weight of a pull that counts: beyond three reaches nothing moves."""
+
+
 @dataclass(frozen=True)
 class Pull:
     """A place of the skin that is taken along.
@@ -62,6 +66,7 @@ def displaced(points: Array, pulls: tuple[Pull, ...]) -> Array:
     for pull in pulls:
         square = ((points - pull.place) ** 2).sum(axis=1)
         weight = np.exp(-square / pull.reach**2)
+        weight[weight < LEAST] = 0.0
         total += weight
         moved += (weight**2)[:, None] * pull.way
     result: Array = points + moved / total[:, None]

@@ -62,14 +62,26 @@ class SoftSkin:
         self.meshes = tuple(int(model.mesh(name).id) for name in MATERIALS)
         self._turns = [quaternion_to_matrix(model.mesh_quat[mesh]) for mesh in self.meshes]
         self._state: SkinState | None = None
+        self._points: list[Array | None] = [None] * len(self.meshes)
+        self._versions = [0] * len(self.meshes)
+
+    @property
+    def versions(self) -> tuple[int, ...]:
+        """Return how often each mesh has been written."""
+        return tuple(self._versions)
 
     def shape(self, state: SkinState) -> None:
-        """Write the meshes of a state, unless they are there already."""
+        """Write the meshes of a state, but those that are there already."""
         if state == self._state:
             return
         meshes = self._drawing.meshes(state)
         for index, name in enumerate(MATERIALS):
-            self._write(index, *meshes[name])
+            points, normals = meshes[name]
+            before = self._points[index]
+            if before is None or not np.array_equal(points, before):
+                self._write(index, points, normals)
+                self._points[index] = points
+                self._versions[index] += 1
         start = int(self._model.mesh_texcoordadr[self.meshes[0]])
         coordinates = self._drawing.grid.coordinates
         self._model.mesh_texcoord[start : start + len(coordinates)] = coordinates
