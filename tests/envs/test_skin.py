@@ -79,7 +79,8 @@ def test_a_pressing_tip_takes_the_skin_along(insertion):
     tip = env.simulation.needle_point(env.simulation.tip_angle)
     depth = math.hypot(*deepest.way)
     assert depth == pytest.approx(-hole.height(tip), abs=3e-4) and depth > 4e-4
-    np.testing.assert_allclose(np.array(deepest.way) / depth, np.negative(hole.normal), atol=0.05)
+    inwards = depth * np.negative(hole.normal)
+    np.testing.assert_allclose(deepest.way, inwards, atol=WAY)  # to what they are rounded
     points = world_points(env, "skin")
     # Where the tip is, the drawn skin is no further away than its lines are apart.
     assert np.linalg.norm(points - tip, axis=1).min() < 6e-4
