@@ -227,7 +227,7 @@ def test_actions_beyond_the_box_are_clipped():
         ({"scene": {"layouts": "simple"}}, ("layout", "thread", "hole_pair")),
         ({"image_size": 8}, ("16", "960")),
         ({"image_size": (224,)}, ("height, width",)),
-        ({"render_mode": "human"}, ("rgb_array",)),
+        ({"render_mode": "ansi"}, ("human", "rgb_array")),
     ],
 )
 def test_wrong_arguments_are_refused_with_what_exists(argument, allowed):

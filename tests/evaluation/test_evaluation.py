@@ -13,9 +13,8 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError
-from surgicai_vision.envs import episode_monitor
 from surgicai_vision.envs.bite_measures import BiteMeasures
-from surgicai_vision.evaluation import policy_spec, storage
+from surgicai_vision.evaluation import policy_spec, slot, storage
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent, RandomAgent, ZeroAgent
 from surgicai_vision.evaluation.metrics import (
@@ -103,7 +102,7 @@ class FakeMonitor:
 @pytest.fixture
 def fake_envs(monkeypatch):
     made = []
-    monkeypatch.setattr(episode_monitor, "EpisodeMonitor", FakeMonitor)
+    monkeypatch.setattr(slot, "EpisodeMonitor", FakeMonitor)
 
     def make(config, **_):
         made.append(FakeEnv(config))
