@@ -158,7 +158,7 @@ def _counts(collected: Collected) -> list[tuple[int, str]]:
     states = [cell.state for cell in collected.missing]
     counts = [(trained, "done"), *((states.count(state), state) for state in sorted(set(states)))]
     episodes = sum(len(result.rows) for result in collected.results)
-    return [(trained + len(states), "cells"), *counts, (episodes, "episodes")]
+    return [(trained + len(states), "runs"), *counts, (episodes, "episodes")]
 
 
 def details(groups: Sequence[Group], reel: Reel, commands: dict[str, list[str]]) -> Markup:
