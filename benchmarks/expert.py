@@ -18,6 +18,7 @@ from common import chunks, emit, median, spread
 from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import (
+    WORLD,
     RandomisationConfig,
     SceneConfig,
     TaskConfig,
@@ -28,18 +29,6 @@ from surgicai_vision.core.config import (
 from surgicai_vision.core.errors import SurgicaiError
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.evaluation.statistics import clopper_pearson
-
-WORLD = RandomisationConfig(
-    phantom_shift=10.0,
-    phantom_turn=15.0,
-    pair="any",
-    needle_size=0.16,
-    needle_arc="any",
-    needle_thickness=0.3,
-    robot_start=15.0,
-)
-"""A world that varies: every geometric axis at its limit. The needle's size is the largest that
-leaves PSM2's jaws room in every pair with a needle of a third of a circle."""
 
 
 class Job(NamedTuple):

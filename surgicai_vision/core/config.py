@@ -195,6 +195,19 @@ class RandomisationConfig:
         )
 
 
+WORLD = RandomisationConfig(
+    phantom_shift=10.0,
+    phantom_turn=15.0,
+    pair=ANY,
+    needle_size=0.16,
+    needle_arc=ANY,
+    needle_thickness=0.3,
+    robot_start=15.0,
+)
+"""A world that varies: every geometric axis at its limit. The needle's size is the largest that
+leaves PSM2's jaws room in every pair with a needle of a third of a circle."""
+
+
 @dataclass(frozen=True)
 class TaskConfig:
     """One task in one scene: everything that decides what an episode is.

@@ -95,7 +95,9 @@ def read_video(path: Path) -> NDArray[np.uint8]:
     return np.asarray(np.stack(frames), np.uint8)
 
 
-def write_animation(path: Path, frames: Iterable[Image], fps: float, quality: int = 60) -> int:
+def write_animation(
+    path: Path, frames: Iterable[Image], fps: float, quality: int = 60, effort: int = 6
+) -> int:
     """Write frames as an animated WebP, which pages show without a player, and count them.
 
     Args:
@@ -103,6 +105,7 @@ def write_animation(path: Path, frames: Iterable[Image], fps: float, quality: in
         frames: RGB images (height, width, 3) uint8 of one size.
         fps: frames a second.
         quality: of the images, 0 to 100.
+        effort: 0 (quick) to 6 (small file).
 
     Raises:
         InputError: no frames, or a path that is no `.webp`.
@@ -123,6 +126,6 @@ def write_animation(path: Path, frames: Iterable[Image], fps: float, quality: in
             duration=round(1000 / fps),
             loop=0,
             quality=quality,
-            method=6,
+            method=effort,
         )
     return len(images)

@@ -8,7 +8,6 @@ plays no video), `strip.jpg`, `poster.jpg` (the video's first image) and, writte
 `procedure.json`; where that is there nothing is done again.
 """
 
-import io
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,13 +15,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import PIL.Image
 from numpy.typing import NDArray
 
 from surgicai_vision.core import files, names
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.progress import Stage, silent_stage
-from surgicai_vision.core.video import Image, read_video, write_video
+from surgicai_vision.core.video import Image, read_video, write_animation, write_video
 from surgicai_vision.envs import contact_sheet
 from surgicai_vision.evaluation.films import Look, outcome_of
 from surgicai_vision.evaluation.metrics import EpisodeMetrics
@@ -39,6 +37,7 @@ STRIP: Final = "strip.jpg"
 MOVING: Final = "procedure.webp"
 MOVING_EVERY: Final = 2
 MOVING_QUALITY: Final = 60
+MOVING_EFFORT: Final = 2
 """Every so many of the video's images make the moving picture, WebP of this quality: 0.9 MB for a
 procedure of 8 s."""
 STARTS: Final = range(names.TEST_SEED, names.TEST_SEED + 3)
@@ -125,7 +124,9 @@ def sew(
         with stage("filming", "images") as progress:
             frames = _counted(_with_poster(frames, out / POSTER), progress, total)
             write_video(out / VIDEO, frames, LOOK.fps)
-        _write_moving(out / VIDEO, out / MOVING)
+        moving = read_video(out / VIDEO)[::MOVING_EVERY]
+        fps = LOOK.fps / MOVING_EVERY
+        write_animation(out / MOVING, moving, fps, MOVING_QUALITY, MOVING_EFFORT)
         _strip(sewer, slot.states, shown.ends, out / STRIP)
     finally:
         slot.env.close()
@@ -203,23 +204,6 @@ def _counted(frames: Iterator[Image], progress: Callable[..., None], total: int)
     for count, frame in enumerate(frames, 1):
         progress(min(count, total), total)
         yield frame
-
-
-def _write_moving(video: Path, path: Path) -> None:
-    """Write a video again as an animated WebP, which plays for ever."""
-    first, *rest = (PIL.Image.fromarray(frame) for frame in read_video(video)[::MOVING_EVERY])
-    content = io.BytesIO()
-    first.save(
-        content,
-        "WEBP",
-        save_all=True,
-        append_images=rest,
-        duration=round(1000 * MOVING_EVERY / LOOK.fps),
-        loop=0,
-        quality=MOVING_QUALITY,
-        method=2,
-    )
-    files.write_bytes(path, content.getvalue())
 
 
 def _strip(

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.web.screen import PageScreen
-from surgicai_vision.core.web.server import PageServer
-from surgicai_vision.core.web.site import ScreenSite, render_page
+from surgicai_vision.core.web.site import ScreenPage, ScreenSite, render_page
 from surgicai_vision.teleoperation.gamepad import Gamepad
 from surgicai_vision.teleoperation.inputs import Input, merge
 from surgicai_vision.teleoperation.keyboard import TABLE, Keyboard, key_names
@@ -132,7 +131,7 @@ def _read_message(content: object) -> _Message:
     return _Message(client, number, *texts, *numbers)
 
 
-class WebView:
+class WebView(ScreenPage):
     """The page's server; a `Device` and a `Screen`. Use it as a context manager.
 
     Args:
@@ -146,23 +145,13 @@ class WebView:
 
     def __init__(self, views: tuple[str, ...], title: str, port: int = 0):
         self.inputs = PageInputs()
-        self.screen = PageScreen()
+        screen = PageScreen()
         html = render_page(
             FOLDER / "page.html.j2", views=views, title=title, rows=TABLE, key_names=key_names
         )
         files = {name: FOLDER / name for name in ("page.js", "page.css")}
-        site = ScreenSite(html, files, self.screen, self.inputs.receive)
-        self.server = PageServer(site, port)
+        site = ScreenSite(html, files, screen, self.inputs.receive)
+        super().__init__(site, port)
         self.wants_image = self.screen.wants_image
         self.show = self.screen.show
         self.poll = self.inputs.poll
-
-    def __enter__(self) -> "WebView":
-        self.server.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Let open pages fetch the last status, then shut the server down."""
-        if self.screen.watched:
-            time.sleep(0.5)
-        self.server.stop()

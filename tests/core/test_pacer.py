@@ -1,22 +1,9 @@
 """Pacer: what it asks for, what is reached, and how it changes over."""
 
 import pytest
+from told_clock import Clock
 
 from surgicai_vision.core.pacer import MEMORY_TICKS, Pacer
-
-
-class Clock:
-    """Time that passes when told."""
-
-    def __init__(self):
-        self.now = 0.0
-
-    def __call__(self):
-        return self.now
-
-    def sleep(self, seconds):
-        assert seconds > 0
-        self.now += seconds
 
 
 def run(pacer, clock, cost, ticks):

@@ -13,6 +13,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import (
     NEEDLE_ARCS,
     RANDOMISATION_LIMITS,
+    WORLD,
     RandomisationConfig,
     SceneConfig,
     TaskConfig,
@@ -31,15 +32,6 @@ from surgicai_vision.scene.needle import NeedleShape
 from surgicai_vision.scene.phantom import ORIGIN, SIZE
 from surgicai_vision.scene.reshape import reshape_needle
 
-WORLD = RandomisationConfig(
-    phantom_shift=10.0,
-    phantom_turn=15.0,
-    pair="any",
-    needle_size=0.16,
-    needle_arc="any",
-    needle_thickness=0.3,
-    robot_start=15.0,
-)
 AXES = WORLD.on
 
 

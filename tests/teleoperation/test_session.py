@@ -8,6 +8,7 @@ import sys
 
 import pytest
 from teleoperators import REST, SHORT, VIEWS, FakeMapping, Script, SessionEnv, event, right
+from told_clock import Clock
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.core.config import TaskConfig
@@ -251,20 +252,6 @@ def test_a_session_without_a_result_leaves_no_folder(tmp_path):
 
 
 # -- the loop --------------------------------------------------------------------------------------
-
-
-class Clock:
-    """Time that passes when told."""
-
-    def __init__(self):
-        self.now = 0.0
-
-    def __call__(self):
-        return self.now
-
-    def sleep(self, seconds):
-        assert seconds > 0
-        self.now += seconds
 
 
 class Canvas:

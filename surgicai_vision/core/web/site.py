@@ -10,19 +10,23 @@ Below the server's token:
 """
 
 import json
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 from urllib.parse import parse_qs
 
 import jinja2
 
 from surgicai_vision.core.web.screen import PageScreen
-from surgicai_vision.core.web.server import Content, page_file
+from surgicai_vision.core.web.server import Content, PageServer, page_file
 
 FOLDER = Path(__file__).parent
 SHARED = {name: FOLDER / name for name in ("base.css", "screen.js")}
 """What every such page loads: how it looks, and how images and status come in."""
+LAST_S = 0.5
+"""Time that open pages have to fetch the last status [s]."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,32 @@ class ScreenSite:
         name = path.removeprefix("view/").removesuffix(".jpg")
         image = self.screen.jpeg(name) if path == f"view/{name}.jpg" else None
         return None if image is None else (image, "image/jpeg")
+
+
+class ScreenPage:
+    """A page while it is served. Use it as a context manager.
+
+    Args:
+        site: the page.
+        port: to listen at; 0 takes any.
+
+    Raises:
+        InputError: the port is not free.
+    """
+
+    def __init__(self, site: ScreenSite, port: int):
+        self.screen = site.screen
+        self.server = PageServer(site, port)
+
+    def __enter__(self) -> Self:
+        self.server.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let open pages fetch the last status, then shut the server down."""
+        if self.screen.watched:
+            time.sleep(LAST_S)
+        self.server.stop()
 
 
 def render_page(template: Path, **values: object) -> bytes:

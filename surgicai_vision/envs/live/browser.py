@@ -12,7 +12,6 @@ about what runs.
 """
 
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +21,7 @@ from typing import final
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.web.screen import PageScreen
-from surgicai_vision.core.web.server import PageServer
-from surgicai_vision.core.web.site import ScreenSite, render_page
+from surgicai_vision.core.web.site import ScreenPage, ScreenSite, render_page
 from surgicai_vision.envs.moment import Moment
 
 PLAYING = "playing"
@@ -108,7 +106,7 @@ class LiveStatus:
 
 
 @final
-class LivePage:
+class LivePage(ScreenPage):
     """The page's server. Use it as a context manager.
 
     Args:
@@ -123,7 +121,7 @@ class LivePage:
 
     def __init__(self, title: str, views: Sequence[str], controls: bool, port: int = 0):
         self.views = (*views, FREE)
-        self.screen = PageScreen()
+        screen = PageScreen()
         self._allowed = {**VIEW_COMMANDS, **(PLAY_COMMANDS if controls else {})}
         self._lock = threading.Lock()
         self._waiting: list[Command] = []
@@ -139,18 +137,8 @@ class LivePage:
             subtasks=names.SUBTASKS,
         )
         files = {name: FOLDER / name for name in ("live.js", "live.css")}
-        site = ScreenSite(html, files, self.screen, self.receive, {"curves": self.curves})
-        self.server = PageServer(site, port)
-
-    def __enter__(self) -> "LivePage":
-        self.server.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Let open pages fetch the last status, then shut the server down."""
-        if self.screen.watched:
-            time.sleep(0.5)
-        self.server.stop()
+        site = ScreenSite(html, files, screen, self.receive, {"curves": self.curves})
+        super().__init__(site, port)
 
     @property
     def points(self) -> int:
