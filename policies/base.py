@@ -153,16 +153,13 @@ class Plugin:
         name: the name users give.
         recipe: frozen dataclass of its settings.
         make: (recipe, shape of each view's feature) → untrained policy.
-        target: dataset key of what it learns.
-        ahead: frames by which the target is ahead of what is seen; the last frame's at an episode's
-            end.
+        target: what it learns: a dataset's column, or `names.STAGE`, which is computed of columns.
     """
 
     name: str
     recipe: type[Recipe]
     make: Callable[[Recipe, tuple[tuple[int, ...], ...]], "Policy"]
     target: str = names.ACTION
-    ahead: int = 0
 
 
 class Policy(nn.Module, abc.ABC):
@@ -194,6 +191,14 @@ class Policy(nn.Module, abc.ABC):
     def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the loss (scalar) for normalised inputs and demonstrated answers (B, …)."""
 
+    def calibrate(self, answers: torch.Tensor, target: torch.Tensor) -> None:
+        """Fit after the last epoch what gradients do not; nothing by default.
+
+        Args:
+            answers: what `forward` returns for the frames held out, (N, n); N at least 1.
+            target: what was demonstrated there, (N, …).
+        """
+
     @final
     def normalise(self, observed: torch.Tensor) -> torch.Tensor:
         """Return raw inputs (B, inputs.dim) with the training frames' mean and variance removed."""
@@ -212,7 +217,8 @@ class Policy(nn.Module, abc.ABC):
                 its base; the vector of `inputs.vector` where that is another.
 
         Returns:
-            (B, 7) float32 in [-1, 1]; (B, 5) logits of a high-level policy.
+            (B, 7) float32 in [-1, 1]; of a high-level policy (B, 5) logits, or (B, 6) with the
+            progress last.
 
         Raises:
             InputError: arrays of other shapes than the policy was trained on, or not finite.

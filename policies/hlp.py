@@ -1,49 +1,113 @@
 """`hlp`: the paper's high-level policy, which classifies the subtask that is due.
 
 The recipe `paper` (paper, Section 4 and appendix): the network of `bc` with the logits of five
-classes at its end; cross-entropy against the phases of whole procedures, a little ahead (`AHEAD`);
-visual features beside the tip pose and jaw of both arms.
+classes at its end; cross-entropy against the phases of whole procedures, a little ahead
+(`training.visits.AHEAD`); visual features beside the tip pose and jaw of both arms.
+
+With `progress` in its recipe (configs/recipes/high-level.yaml) it also says how far the present
+subtask is, as stage and progress of SARM do (Chen et al., Stage-aware reward modeling for long
+horizon robot manipulation, arXiv:2509.25358; `lerobot.rewards.sarm` in LeRobot 0.6.1): one more
+output of the same network, a sigmoid, with squared error.
+
+Its logits are calibrated on the episodes held out of its training, so that their softmax is a
+probability: divided by one temperature, which changes no choice (Guo et al., On calibration of
+modern neural networks, ICML 2017, arXiv:1706.04599).
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
+from torch.nn.modules.module import _IncompatibleKeys
 
 from policies.base import Inputs, Plugin, Policy, Recipe
 from policies.layers import FeatureMLP
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
 
-AHEAD = 10
-"""Frames by which labels are ahead.
-
-In our recordings a subtask continues for 15 frames after its success, while hardly anything moves.
-Without the shift its last frames and the first of the next subtask would look alike with different
-labels, and a policy would name the old subtask for ever; what is due there is the next one.
+CLASSES = len(names.SUBTASKS)
+TEMPERATURES = (0.1, 10.0)
+"""Between which the temperature is looked for: held-out frames that are all named rightly would
+drive it to 0, and make every later answer a certain one.
 """
+
+
+@dataclass(frozen=True)
+class HLPRecipe(Recipe):
+    """Settings of the high-level policy.
+
+    Attributes:
+        progress: weight of the progress's squared error beside the cross-entropy; 0 for a policy
+            that says no progress. SARM's is 1.
+    """
+
+    progress: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.progress >= 0:
+            raise InputError(f"progress is {self.progress}; it must be at least 0.")
+        if self.privileged:
+            raise InputError("Policy 'hlp' sees both arms and images; leave 'privileged' off.")
 
 
 @final
 class HighLevelPolicy(Policy):
-    """The MLP that classifies the phase."""
+    """The MLP that classifies the phase.
 
-    def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
-        if recipe.privileged:
-            raise InputError("Policy 'hlp' sees both arms and images; leave 'privileged' off.")
+    Attributes:
+        temperature: what the logits are divided by; 1 before it is fitted.
+    """
+
+    temperature: torch.Tensor
+
+    def __init__(self, recipe: HLPRecipe, visual: tuple[tuple[int, ...], ...]):
         super().__init__(Inputs(visual, names.BOTH_ARMS if recipe.proprioception else None))
-        self.network = FeatureMLP(recipe, self.inputs, len(names.SUBTASKS))
+        self.network = FeatureMLP(recipe, self.inputs, CLASSES + bool(recipe.progress))
+        self.weight = recipe.progress
+        self.register_buffer("temperature", torch.ones(()))
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, torch.Tensor], strict: bool = True, assign: bool = False
+    ) -> _IncompatibleKeys:
+        """Load a state; one from before calibration has no temperature, and its logits stay."""
+        whole = {"temperature": torch.ones(()), **state_dict}
+        return super().load_state_dict(whole, strict, assign)
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return the logits (B, 5) of the subtasks for normalised inputs."""
-        logits: torch.Tensor = self.network(observed)
-        return logits
+        """Return the calibrated logits of the subtasks, and the progress where it is learned.
+
+        Returns:
+            (B, 5), or (B, 6) with the progress in [0, 1] last, for normalised inputs.
+        """
+        answers: torch.Tensor = self.network(observed)
+        logits = answers[:, :CLASSES] / self.temperature
+        return torch.cat([logits, answers[:, CLASSES:].sigmoid()], dim=1)
 
     def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Return the cross-entropy against phases (B,) int64."""
-        return nn.functional.cross_entropy(self(observed), target)
+        """Return the cross-entropy, and the weighted squared error of the progress.
+
+        Args:
+            observed: normalised inputs (B, inputs.dim).
+            target: (B, 2), the column `names.STAGE`; a progress below 0 is unknown and left out.
+        """
+        answers: torch.Tensor = self.network(observed)
+        loss = nn.functional.cross_entropy(answers[:, :CLASSES], target[:, 0].long())
+        if not self.weight:
+            return loss
+        known = target[:, 1] >= 0
+        squares = (answers[:, CLASSES].sigmoid() - target[:, 1]) ** 2 * known
+        return loss + self.weight * squares.sum() / known.sum().clamp(min=1)
+
+    def calibrate(self, answers: torch.Tensor, target: torch.Tensor) -> None:
+        """Set the temperature that makes held-out frames' subtasks the most likely."""
+        logits = answers[:, :CLASSES].double() * self.temperature
+        fitted = fit_temperature(logits.cpu().numpy(), target[:, 0].long().cpu().numpy())
+        self.temperature.fill_(fitted)
 
     def choose(
         self, features: NDArray[np.float32] | None, both_arms: NDArray[np.float32]
@@ -53,7 +117,35 @@ class HighLevelPolicy(Policy):
         Returns:
             (B,) indices in `names.SUBTASKS`.
         """
-        return np.asarray(self.act(features, both_arms).argmax(axis=1), np.int64)
+        logits = self.act(features, both_arms)[:, :CLASSES]
+        return np.asarray(logits.argmax(axis=1), np.int64)
 
 
-HLP = Plugin("hlp", Recipe, HighLevelPolicy, names.PHASE, AHEAD)
+def fit_temperature(logits: NDArray[np.float64], classes: NDArray[np.int64]) -> float:
+    """Return the temperature within `TEMPERATURES` with the smallest cross-entropy.
+
+    The cross-entropy is convex in one over the temperature, so that there is one minimum.
+
+    Args:
+        logits: (N, classes).
+        classes: (N,) the right ones.
+    """
+    from scipy.optimize import minimize_scalar
+    from scipy.special import log_softmax
+
+    rows = np.arange(len(classes))
+
+    def cross_entropy(logarithm: float) -> float:
+        return -float(log_softmax(logits / np.exp(logarithm), axis=1)[rows, classes].mean())
+
+    bounds = tuple(np.log(TEMPERATURES))
+    found = minimize_scalar(cross_entropy, bounds=bounds, method="bounded")
+    return float(np.exp(found.x))
+
+
+def _make(recipe: Recipe, visual: tuple[tuple[int, ...], ...]) -> HighLevelPolicy:
+    assert isinstance(recipe, HLPRecipe), "training and loading make the recipe of the plug-in"
+    return HighLevelPolicy(recipe, visual)
+
+
+HLP = Plugin("hlp", HLPRecipe, _make, names.STAGE)

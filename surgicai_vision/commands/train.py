@@ -113,6 +113,11 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         encoders.find_weights(encoder, weights)
     from surgicai_vision.experiments.run import train_run
 
+    if options.subtask and policies.policy_plugin(options.policy).target == names.STAGE:
+        raise InputError(
+            f"Policy '{options.policy}' learns from whole procedures; leave --subtask "
+            f"{options.subtask} out."
+        )
     task = names.SUTURE if options.subtask else options.task
     run = RunConfig(
         TaskConfig(task),

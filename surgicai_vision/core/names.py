@@ -102,6 +102,8 @@ PRIVILEGED_STATE = "privileged_state"
 
 CLOCKED_STATE = "clocked_state"
 """STATE and, last, the time since the subtask began as `config.clock` tells it."""
+STAGE = "stage"
+"""The subtask that is due and the progress within the present one (`training.visits.stages`)."""
 
 META_FILE = "meta/surgicai.json"
 """Our own sidecar inside a LeRobot dataset: cameras, units, renderer, hashes, versions."""

@@ -24,6 +24,7 @@ from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, 
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_json, write_bytes, write_json
 from surgicai_vision.training.run_config import RunConfig
+from surgicai_vision.training.stage_errors import StageErrors
 
 if TYPE_CHECKING:
     import torch
@@ -75,6 +76,8 @@ class Checkpoint:
         device: what it was trained on.
         code_version: version of this package.
         policy_sha256: hash of `policy.safetensors`.
+        stage_errors: a high-level policy's errors on the episodes held out; None for another
+            policy, or where nothing was held out.
         format: version of this file's layout.
         folder: where it lies (not stored).
     """
@@ -93,6 +96,7 @@ class Checkpoint:
     device: str
     code_version: str
     policy_sha256: str = ""
+    stage_errors: StageErrors | None = None
     format: int = FORMAT
     folder: Path = field(default=Path("."), compare=False)
 

@@ -1,7 +1,8 @@
-"""Training data: the split into training and validation, batches, statistics of the inputs."""
+"""Training data: columns, the split into training and validation, batches, statistics of inputs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,22 +11,39 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import clock
+from surgicai_vision.core.errors import check_name
+from surgicai_vision.dataset.protocol import Dataset
+from surgicai_vision.training.visits import stages
 
 if TYPE_CHECKING:
     from policies.base import Recipe
 
+Columns = Mapping[str, NDArray[np.generic]]
 
-def with_clock(
-    columns: dict[str, NDArray[np.generic]], vector: str | None
-) -> dict[str, NDArray[np.generic]]:
-    """Return the columns, with `names.CLOCKED_STATE` (N, 10) where `vector` asks for it."""
-    if vector != names.CLOCKED_STATE:
-        return columns
+
+def column(dataset: Dataset, key: str) -> NDArray[np.generic]:
+    """Return a column that is trained on: a recorded one, or one that is computed of them.
+
+    Raises:
+        UnknownName: the dataset has no such column.
+        InputError: a column that this dataset's frames do not allow to compute.
+    """
+    columns = dataset.columns()
+    if key in COMPUTED:
+        return COMPUTED[key](columns, np.asarray(dataset.episode_index))
+    return columns[check_name("column", key, columns)]
+
+
+def _clocked_state(columns: Columns, episode_index: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return `names.CLOCKED_STATE`, (N, 10) float32."""
     steps = np.rint(np.asarray(columns["timestamp"]) * names.FPS)
-    return {
-        **columns,
-        vector: np.concatenate([columns[names.STATE], clock(steps)], axis=1, dtype=np.float32),
-    }
+    return np.concatenate([columns[names.STATE], clock(steps)], axis=1, dtype=np.float32)
+
+
+COMPUTED: Mapping[str, Callable[[Columns, NDArray[np.int64]], NDArray[np.generic]]] = (
+    MappingProxyType({names.CLOCKED_STATE: _clocked_state, names.STAGE: stages})
+)
+"""Column that no dataset holds → (its columns, (N,) episode of every frame) → (N, n) values."""
 
 
 def split(

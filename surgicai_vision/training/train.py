@@ -23,7 +23,6 @@ machine.
 import ctypes
 import io
 import json
-import math
 import pickle
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -39,7 +38,7 @@ from policies.base import Plugin, Policy, Recipe
 from surgicai_vision import __version__
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, digest, to_mapping
-from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, UnknownName
+from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
 from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset.protocol import Dataset
@@ -51,8 +50,9 @@ from surgicai_vision.training.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
-from surgicai_vision.training.data import cuts, over_places, split, with_clock
+from surgicai_vision.training.data import column, cuts, over_places, split
 from surgicai_vision.training.run_config import RunConfig
+from surgicai_vision.training.stage_errors import StageErrors, stage_errors
 from surgicai_vision.training.threads import one_thread
 
 REQUEST = "training.json"
@@ -196,11 +196,8 @@ def _check(task: _Task) -> None:
         )
     with torch.random.fork_rng(devices=[]):
         vector = task.untrained().inputs.vector
-    columns = with_clock(task.dataset.columns(), vector)
     for key in (vector or names.STATE, task.policy.target):
-        if key not in columns:
-            raise UnknownName("column", key, columns)
-        if not np.isfinite(columns[key]).all():
+        if not np.isfinite(column(task.dataset, key)).all():
             raise InputError(f"Column '{key}' of the dataset holds values that are not finite.")
 
 
@@ -226,7 +223,6 @@ class _Training:
     def __init__(self, task: _Task, start: Policy | None, device: torch.device) -> None:
         self.task = task
         self.device = device
-        columns = with_clock(task.dataset.columns(), task.untrained().inputs.vector)
         index = np.asarray(task.dataset.episode_index)
         self.rows, self.held_rows, self.held_episodes = split(index, task.recipe, task.seed)
         if len(self.rows) < 2:
@@ -236,14 +232,10 @@ class _Training:
         torch.manual_seed(task.seed)
         self.policy = task.untrained()
         vector = self.policy.inputs.vector
-        target = np.array(columns[task.policy.target])
-        self.vector = np.asarray(columns[vector], np.float32) if vector else None
+        self.vector = np.asarray(column(task.dataset, vector), np.float32) if vector else None
+        target = column(task.dataset, task.policy.target)
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
-        last = np.searchsorted(index, index, side="right") - 1
-        ahead = np.minimum(
-            np.arange(len(index)) + math.ceil(task.policy.ahead / task.recipe.frame_stride), last
-        )
-        self.target = torch.from_numpy(target[ahead].astype(kind))
+        self.target = torch.from_numpy(target.astype(kind))
         if start is None:
             self._measure()
         else:
@@ -276,7 +268,27 @@ class _Training:
                 self._save(out / STATE)
             if progress:
                 progress(done, epochs)
-        return self._write(out)
+        return self._write(out, self._conclude())
+
+    @torch.no_grad()
+    def _conclude(self) -> StageErrors | None:
+        """Calibrate on the frames held out; return a high-level policy's errors there."""
+        if not len(self.held_rows):
+            return None
+        target = self.target[self.held_rows]
+        self.policy.eval()
+        self.policy.calibrate(self._answers(self.held_rows), target)
+        if self.task.policy.target != names.STAGE:
+            return None
+        return stage_errors(self._answers(self.held_rows).numpy(), target.numpy())
+
+    def _answers(self, rows: NDArray[np.int64]) -> torch.Tensor:
+        """Return the policy's answers to some frames, (n, …)."""
+        pieces = [rows[at : at + STATISTICS_ROWS] for at in range(0, len(rows), STATISTICS_ROWS)]
+        normalised = (
+            self.policy.normalise(self._observed(piece).to(self.device)) for piece in pieces
+        )
+        return torch.cat([self.policy(observed).cpu() for observed in normalised])
 
     def _optimiser(self) -> tuple[torch.optim.Optimizer, LRScheduler | None]:
         """Return the recipe's optimiser and its schedule, or None where the learning rate stays."""
@@ -403,7 +415,7 @@ class _Training:
         self.losses = list(state["losses"])
         self.held_losses = list(state["held_losses"])
 
-    def _write(self, folder: Path) -> Checkpoint:
+    def _write(self, folder: Path, errors: StageErrors | None = None) -> Checkpoint:
         """Write the policy as it stands."""
         task = self.task
         dataset = task.dataset
@@ -423,6 +435,7 @@ class _Training:
             validation_losses=tuple(self.held_losses),
             device=str(self.device),
             code_version=__version__,
+            stage_errors=errors,
         )
         return write_checkpoint(folder, checkpoint, self.policy.state_dict())
 

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from policies.base import Recipe
 from policies.bc import BC
 from policies.hlp import HLP
 from surgicai_vision.core.config import TaskConfig, to_mapping
@@ -15,7 +14,7 @@ def checkpoint(folder: Path, task: str, policy: str = "bc") -> str:
     plugin = {"bc": BC, "hlp": HLP}[policy]
     written = Checkpoint(
         run=RunConfig(TaskConfig(task), policy=policy, demonstrations=1),
-        recipe=to_mapping(Recipe()),
+        recipe=to_mapping(plugin.recipe()),
         image_size=32,
         encoder=None,
         proprioception=True,
@@ -28,5 +27,5 @@ def checkpoint(folder: Path, task: str, policy: str = "bc") -> str:
         device="cpu",
         code_version="",
     )
-    write_checkpoint(folder, written, plugin.make(Recipe(), ()).state_dict())
+    write_checkpoint(folder, written, plugin.make(plugin.recipe(), ()).state_dict())
     return str(folder)

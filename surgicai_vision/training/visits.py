@@ -1,0 +1,168 @@
+"""Visits: from the recorded phases of an episode to what a high-level policy learns.
+
+A visit is a run of frames of one phase in one episode. It is finished if a later phase follows, or
+nothing: episodes are recorded to their success. A visit that an earlier phase follows was broken
+off: something went wrong, and the demonstrator went back.
+
+Interface:
+
+* `stages(columns, episode_index) -> (N, 2)`: the column `names.STAGE`, the subtask that is due and
+  the progress within the present one.
+* `subtasks_due(…)`, `progress(…)`: its two halves.
+
+Everything is computed from the columns `names.PHASE`, `names.SUCCESS` and "timestamp".
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import DWELL
+from surgicai_vision.core.errors import InputError
+
+AHEAD = 10
+"""Control steps by which the subtask that is due is ahead.
+
+In our recordings a subtask continues for `DWELL` steps after its success, while hardly anything
+moves. Without the shift its last frames and the first of the next subtask would look alike with
+different labels, and a policy would name the old subtask for ever; what is due there is the next
+one (docs/hierarchical.md has the measurement).
+"""
+UNKNOWN = -1.0
+"""Progress of a frame whose visit was broken off: it has no end to count towards."""
+
+
+@dataclass(frozen=True)
+class Visits:
+    """The visits of all episodes, V of them in the order of the frames.
+
+    Attributes:
+        number: visit of every frame, (N,) int64.
+        first: first row of each visit, (V,) int64.
+        last: last row of each visit, (V,) int64.
+        ends_episode: whether it is the last visit of its episode, (V,) bool.
+        is_finished: whether it was not broken off, (V,) bool.
+    """
+
+    number: NDArray[np.int64]
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    ends_episode: NDArray[np.bool_]
+    is_finished: NDArray[np.bool_]
+
+
+def find_visits(phase: NDArray[np.int64], episode_index: NDArray[np.int64]) -> Visits:
+    """Return the visits of frames with these phases, (N,), and episodes, (N,) rising."""
+    begins = np.ones(len(phase), bool)
+    begins[1:] = (np.diff(phase) != 0) | (np.diff(episode_index) != 0)
+    first = np.flatnonzero(begins)
+    last = np.append(first[1:], len(phase)) - 1
+    ends_episode = np.ones(len(first), bool)
+    ends_episode[:-1] = episode_index[first[1:]] != episode_index[first[:-1]]
+    goes_on = np.zeros(len(first), bool)
+    goes_on[:-1] = phase[first[1:]] > phase[first[:-1]]
+    return Visits(np.cumsum(begins) - 1, first, last, ends_episode, ends_episode | goes_on)
+
+
+def subtasks_due(
+    phase: NDArray[np.int64],
+    step: NDArray[np.int64],
+    episode_index: NDArray[np.int64],
+    ahead: int = AHEAD,
+) -> NDArray[np.int64]:
+    """Return the subtask that is due at every frame: the phase `ahead` control steps later.
+
+    It is never taken from another episode, nor from beyond the end of a visit that was broken off:
+    before an upset nothing shows that a return is near. With the first frame after it the label is
+    the phase that was returned to.
+
+    Args:
+        phase: (N,) recorded phases.
+        step: (N,) control steps since each episode's beginning, rising in it.
+        episode_index: (N,) episode of every frame, rising.
+        ahead: control steps.
+
+    Returns:
+        (N,) int64, indices in `names.SUBTASKS`.
+    """
+    found = find_visits(phase, episode_index)
+    limit = found.last.copy()
+    for visit in range(len(limit) - 2, -1, -1):
+        if found.is_finished[visit] and not found.ends_episode[visit]:
+            limit[visit] = limit[visit + 1]
+    # Episode and step as one number that rises over all frames, with room for `ahead`.
+    episode = np.unique(episode_index, return_inverse=True)[1]
+    time = episode * (int(step.max()) + ahead + 1) + step
+    later = np.searchsorted(time, time + ahead)
+    due: NDArray[np.int64] = phase[np.minimum(later, limit[found.number])]
+    return due
+
+
+def progress(
+    phase: NDArray[np.int64],
+    step: NDArray[np.int64],
+    episode_index: NDArray[np.int64],
+    success: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """Return how much of its visit each frame has behind it, in [0, 1], or `UNKNOWN`.
+
+    It rises evenly from 0 at a visit's first frame to 1 at the first frame that shows its success,
+    and stays there: τ = (t - s) / (e - s) of SARM (Chen et al., arXiv:2509.25358), as
+    `lerobot.rewards.sarm.sarm_utils.compute_tau` has it in LeRobot 0.6.1. The end e lies
+    `DWELL` - 1 control steps before the next visit's first frame, because a success must have held
+    for `DWELL` steps; in an episode's last visit it is what `success` says.
+
+    Args:
+        phase: (N,) recorded phases.
+        step: (N,) control steps since each episode's beginning, rising in it.
+        episode_index: (N,) episode of every frame, rising.
+        success: (N,) whether the step after each frame met the task (`names.SUCCESS`).
+    """
+    found = find_visits(phase, episode_index)
+    shares = np.full(len(phase), UNKNOWN, np.float32)
+    for visit in np.flatnonzero(found.is_finished):
+        rows = slice(found.first[visit], found.last[visit] + 1)
+        if found.ends_episode[visit]:
+            met = np.flatnonzero(success[rows])
+            end = step[rows][met[0] if len(met) else -1] + 1
+        else:
+            end = step[found.first[visit + 1]] - DWELL + 1
+        begin = step[found.first[visit]]
+        shares[rows] = np.clip((step[rows] - begin) / max(end - begin, 1), 0.0, 1.0)
+    return shares
+
+
+def stages(
+    columns: Mapping[str, NDArray[np.generic]], episode_index: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Return the column `names.STAGE`: the subtask due and the progress in the present one.
+
+    Args:
+        columns: a dataset's columns.
+        episode_index: (N,) episode of every frame, rising.
+
+    Returns:
+        (N, 2) float32: an index in `names.SUBTASKS`, and [0, 1] or `UNKNOWN`.
+
+    Raises:
+        InputError: the task has no subtasks, or these are not all frames of their episodes.
+    """
+    phase = np.asarray(columns[names.PHASE], np.int64)
+    if len(phase) and not 0 <= phase.min() <= phase.max() < len(names.SUBTASKS):
+        raise InputError(
+            f"The dataset has phases from {phase.min()} to {phase.max()}; subtasks are learned "
+            f"from those of {names.SUTURE}, 0 to {len(names.SUBTASKS) - 1}."
+        )
+    step = np.rint(np.asarray(columns["timestamp"], np.float64) * names.FPS).astype(np.int64)
+    if (np.diff(step)[np.diff(episode_index) == 0] <= 0).any():
+        raise InputError(
+            "The frames are one subtask's of whole procedures; subtasks and progress are learned "
+            "from the procedures themselves. Leave the subtask (--subtask) out."
+        )
+    success = np.asarray(columns[names.SUCCESS], bool)
+    due = subtasks_due(phase, step, episode_index)
+    share = progress(phase, step, episode_index, success)
+    return np.stack([due, share], axis=1).astype(np.float32)
