@@ -22,7 +22,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
-from torch.nn.modules.module import _IncompatibleKeys
 
 from policies.base import Inputs, Plugin, Policy, Recipe
 from policies.layers import FeatureMLP
@@ -73,10 +72,15 @@ class HighLevelPolicy(Policy):
 
     def load_state_dict(
         self, state_dict: Mapping[str, torch.Tensor], strict: bool = True, assign: bool = False
-    ) -> _IncompatibleKeys:
-        """Load a state; one from before calibration has no temperature, and its logits stay."""
+    ) -> tuple[list[str], list[str]]:
+        """Load a state; one from before calibration has no temperature, and its logits stay.
+
+        Returns:
+            Names that were missing and names that were not expected, as torch's own.
+        """
         whole = {"temperature": torch.ones(()), **state_dict}
-        return super().load_state_dict(whole, strict, assign)
+        names_left: tuple[list[str], list[str]] = super().load_state_dict(whole, strict, assign)
+        return names_left
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
         """Return the calibrated logits of the subtasks, and the progress where it is learned.
