@@ -70,7 +70,8 @@ TRAIN = "train"
 HELDOUT = "heldout"
 """Sets of families, as `RandomisationConfig.appearance` names them."""
 
-OBS_TYPES = ("state", "goal", "pixels", "pixels_agent_pos")
+OBS_TYPES = ("state", "goal", "relative", "pixels", "pixels_agent_pos")
+REWARDS = ("sparse", "dense", "staged")
 GRASPS = ("friction", "attach")
 TORQUES = ("effective", "dvrk")
 TISSUES = ("channels", "soft")
@@ -83,6 +84,16 @@ BOTH_ARMS_NAMES = tuple(f"{arm}_{name}" for arm in ARMS for name in STATE_NAMES)
 PRIVILEGED_NAMES = tuple(
     f"{part}_{name}" for part in ("now", "goal", "error") for name in STATE_NAMES
 )
+
+RELATIVE_NAMES = (
+    *("x", "y", "z"),
+    *(f"tip_{axis}_axis_{along}" for axis in "xy" for along in "xyz"),
+    "jaw",
+    *(f"error_{name}" for name in ("x", "y", "z", "rx", "ry", "rz")),
+    *(f"fine_{name}" for name in ("x", "y", "z", "rx", "ry", "rz")),
+    *("met", "demanded"),
+)
+"""Elements of obs_type "relative" (`envs.relative`)."""
 
 # LeRobot keys.
 STATE = "observation.state"
@@ -99,6 +110,9 @@ BOTH_ARMS = "both_arms"
 """Measured tip pose and jaw of psm1, then of psm2, each in its own base."""
 PRIVILEGED_STATE = "privileged_state"
 """The 21 values of obs_type "state" with the goal; no LeRobot key, lest a policy be fed it."""
+
+RELATIVE_STATE = "relative_state"
+"""The 24 values of obs_type "relative" with the goal; in no dataset, the env says it."""
 
 CLOCKED_STATE = "clocked_state"
 """STATE and, last, the time since the subtask began as `config.clock` tells it."""

@@ -26,6 +26,11 @@ from surgicai_vision.envs.suture import Suture
 
 __all__ = ["SUBTASKS", "GoalSuturingEnv", "SuturingEnv", "make", "make_registered", "make_task"]
 
+OPTIONS = (
+    *("step", "tolerance", "reward", "max_steps"),
+    *("action_repeat", "hold_jaw", "end_on_drop"),
+)
+"""Fields of `TaskConfig` that are arguments of `make_task` as they are."""
 SUBTASKS: dict[str, Subtask] = {
     subtask.name: subtask for subtask in (Grasp(), Place(), Insert(), Handoff(), Pullout())
 }
@@ -71,11 +76,7 @@ def make_task(
         scene: a `SceneConfig`, its fields, or None for the default scene.
         **arguments: fields of `TaskConfig` and arguments of `make`.
     """
-    fields: dict[str, Any] = {
-        key: arguments.pop(key)
-        for key in ("step", "tolerance", "reward", "max_steps")
-        if key in arguments
-    }
+    fields: dict[str, Any] = {key: arguments.pop(key) for key in OPTIONS if key in arguments}
     if "randomisation" in arguments:
         axes = arguments.pop("randomisation")
         fields["randomisation"] = (

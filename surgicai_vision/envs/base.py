@@ -6,12 +6,16 @@
   base frame and Δjaw, each times the step size (`config.STEPS`); every step is 20 ms.
 * Observation: see `observation`.
 * Reward: sparse: 0 on success, else -1; dense: -(d_trans / 100 + d_angle / 10) with d_trans in cm
-  and d_angle in rad.
+  and d_angle in rad; staged: 0 on success, else -(tanh(d_trans / 1 cm) + tanh(d_angle / 0.5 rad) +
+  1 where what success needs besides the pose does not hold) / 3, at most `STAGED_MOST`. The dense
+  reward pays nothing for a grasp or for the holes; the staged one does.
 * Success: judged from the measured state, never from the command: position and geodesic angle
   within the tolerance, and what the subtask demands (jaw contact, both holes passed, needle out).
 * Start: random, seeded by `reset(seed=…)`; covers the end states of the subtask before.
 * Termination: success, or a physics error (`info["physics_error"]`, never a success).
-* Truncation: `max_steps`.
+* Truncation: `max_steps`; with `end_on_drop` also when a needle that was held at the subtask's
+  start is dropped. It truncates and does not terminate: where every step costs, an end that is
+  worth 0 would teach to drop it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +25,7 @@ from typing import TYPE_CHECKING, ClassVar, cast
 import gymnasium
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
@@ -34,6 +38,7 @@ from surgicai_vision.envs.control import StepSize
 from surgicai_vision.envs.feasibility import refuse_impossible
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.observation import ObservationConfig
+from surgicai_vision.envs.relative import relative_features
 from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
 from surgicai_vision.envs.subtask import Subtask
 from surgicai_vision.envs.success import Info, Target, measure, meets_demands
@@ -43,6 +48,12 @@ from surgicai_vision.scene.rendering import Frame
 if TYPE_CHECKING:
     from surgicai_vision.envs.live.human import Human
 
+STAGE_DISTANCE = 0.01
+"""Distance [m] whose part of the staged reward is tanh 1."""
+STAGE_TURN = 0.5
+"""Angle [rad] whose part of the staged reward is tanh 1."""
+STAGED_MOST = -0.01
+"""The largest staged reward of a step without success."""
 START_DRAWS = 60
 """Draws of a start state before giving up."""
 RENDER_CAMERA = "front"
@@ -145,6 +156,18 @@ class SuturingEnv(gymnasium.Env):
         return self.observe(), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
+        """Take one control step of 20 ms, or `action_repeat` of them until the episode ends."""
+        if self.config.hold_jaw and self.subtask.starts_held:
+            action = np.array([*np.asarray(action).ravel()[:6], 0.0], np.float32)
+        for _ in range(self.config.action_repeat - 1):
+            before = self._control_step(action)
+            if before[2] or before[3]:
+                return before
+        return self._control_step(action)
+
+    def _control_step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[Observation, float, bool, bool, Info]:
         """Take one control step of 20 ms."""
         simulation = self.simulation
         state = simulation.task_state
@@ -166,6 +189,9 @@ class SuturingEnv(gymnasium.Env):
         if self.render_mode == "human":
             self._shown().step(info)
         truncated = self._truncates and state.steps >= self.config.max_steps
+        if self.config.end_on_drop:
+            info["dropped"] = self.subtask.starts_held and simulation.has_dropped(self.subtask.arm)
+            truncated = truncated or info["dropped"]
         return seen, self.reward(info), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -304,6 +330,11 @@ class SuturingEnv(gymnasium.Env):
         """Return the reward of a measurement."""
         if self.config.reward == "sparse":
             return 0.0 if info["is_success"] else -1.0
+        if self.config.reward == "staged":
+            is_met = info["is_success"] or self._meets_demands()
+            return float(
+                staged_reward(info["d_trans"], info["d_angle"], is_met, info["is_success"])
+            )
         error: float = info["d_trans"] + info["d_angle"] / 10.0
         return -error
 
@@ -334,6 +365,10 @@ class SuturingEnv(gymnasium.Env):
         """Return the observation of obs_type "state", goal included, (21,)."""
         return self._state_vector(self._target())
 
+    def relative_state(self) -> NDArray[np.float32]:
+        """Return the observation of obs_type "relative", goal included, (24,)."""
+        return self._relative_state(self._target())
+
     def needle_pose(self) -> NDArray[np.float32]:
         """Return the needle's position [m] and quaternion (w, x, y, z) in world, (7,)."""
         pose: NDArray[np.float32] = self.data.qpos[self.scene.needle_qpos].astype(np.float32)
@@ -346,6 +381,8 @@ class SuturingEnv(gymnasium.Env):
     def _observe(self, target: Target) -> Observation:
         if self.view.obs_type == "state":
             return self._state_vector(target)
+        if self.view.obs_type == "relative":
+            return self._relative_state(target)
         seen = self._images.look(self.view)
         if self.view.obs_type == "pixels_agent_pos":
             seen["agent_pos"] = self.agent_pos()
@@ -361,6 +398,20 @@ class SuturingEnv(gymnasium.Env):
             goal = simulation.to_base(arm, poses.compose(desired, poses.relative(achieved, tip)))
             return observation.state_vector(arm, simulation.tip_in_base(arm), goal, jaw)
         return observation.state_vector_in_world(arm, simulation.bases[arm], tip, *target, jaw)
+
+    def _relative_state(self, target: Target) -> NDArray[np.float32]:
+        """Return the relative features; in a whole procedure those of the present subtask."""
+        simulation = self.simulation
+        subtask = self.subtask
+        achieved, desired = target
+        jaw = simulation.jaw(subtask.arm)
+        is_met = meets_demands(simulation, subtask, self.stitch, self.config.tolerance)
+        return relative_features(
+            self.agent_pos(),
+            observation.goal_vector(achieved, jaw, is_met),
+            observation.goal_vector(desired, 0.0, True),
+            poses.square(simulation.bases[subtask.arm])[:3, :3],
+        )
 
     # -- progress ----------------------------------------------------------------------------------
 
@@ -398,3 +449,21 @@ class SuturingEnv(gymnasium.Env):
     def _progress(self, info: Info) -> bool:
         """Go on to the next subtask, where a task has several; return True if so."""
         return False
+
+
+def staged_reward(
+    distance: ArrayLike, turn: ArrayLike, is_met: ArrayLike, is_success: ArrayLike
+) -> NDArray[np.float64]:
+    """Return staged rewards in [-1, 0]; see the module's docstring.
+
+    Args:
+        distance: to the goal [m], a number or (batch,).
+        turn: to the goal [rad].
+        is_met: whether what success needs besides the pose holds.
+        is_success: whether the task is solved.
+    """
+    away = np.tanh(np.divide(distance, STAGE_DISTANCE))
+    turned = np.tanh(np.divide(turn, STAGE_TURN))
+    missing = np.where(is_met, 0.0, 1.0)
+    reward = np.minimum(-(away + turned + missing) / 3.0, STAGED_MOST)
+    return np.where(is_success, 0.0, reward)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.envs import observation
-from surgicai_vision.envs.base import Observation, SuturingEnv
+from surgicai_vision.envs.base import Observation, SuturingEnv, staged_reward
 from surgicai_vision.envs.success import Info, Target
 from surgicai_vision.envs.suture import Suture
 
@@ -35,6 +35,10 @@ class GoalSuturingEnv(SuturingEnv):
         if self.config.reward == "sparse":
             return np.where(self._reached(achieved_goal, desired_goal), 0.0, -1.0)
         distance, turn = observation.goal_errors(achieved_goal, desired_goal)
+        if self.config.reward == "staged":
+            is_met = _meets(achieved_goal, desired_goal)
+            is_reached = self._reached(achieved_goal, desired_goal)
+            return staged_reward(distance, turn, is_met, is_reached)
         return -(distance + turn / 10.0)
 
     def compute_terminated(
@@ -51,9 +55,9 @@ class GoalSuturingEnv(SuturingEnv):
         return np.full(np.shape(achieved_goal)[:-1], is_over)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
-        """Take one control step; the dense reward is that of the observed, rounded goals."""
+        """Take one step; a reward that is not sparse is that of the observed, rounded goals."""
         seen, reward, terminated, truncated, info = super().step(action)
-        if self.config.reward == "dense":
+        if self.config.reward != "sparse":
             assert isinstance(seen, dict)
             achieved = cast(Goals, seen["achieved_goal"])
             desired = cast(Goals, seen["desired_goal"])
@@ -65,7 +69,7 @@ class GoalSuturingEnv(SuturingEnv):
         distance, turn = observation.goal_errors(achieved_goal, desired_goal)
         tolerance = self.subtask.tolerances[self.config.tolerance]
         is_near = (distance <= tolerance.distance) & (turn <= tolerance.angle)
-        return is_near & (np.asarray(achieved_goal)[..., 7] >= np.asarray(desired_goal)[..., 7])
+        return is_near & _meets(achieved_goal, desired_goal)
 
     def _observe(self, target: Target) -> Observation:
         achieved, desired = target
@@ -79,6 +83,12 @@ class GoalSuturingEnv(SuturingEnv):
 
 class GoalSuture(GoalSuturingEnv, Suture):
     """The whole procedure; the goal is that of the present subtask."""
+
+
+def _meets(achieved_goal: Goals, desired_goal: Goals) -> NDArray[np.bool_]:
+    """Return whether what goals ask for besides the pose holds, () or (batch,)."""
+    met: NDArray[np.bool_] = np.asarray(achieved_goal)[..., 7] >= np.asarray(desired_goal)[..., 7]
+    return met
 
 
 def _physics_errors(info: Infos | None) -> NDArray[np.bool_]:

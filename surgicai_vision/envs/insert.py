@@ -29,6 +29,7 @@ class Insert(Subtask):
     name = "insert"
     arm = PSM2
     phase = 2
+    starts_held = True
     tolerances = MappingProxyType(
         {"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(1.0, 5.0)}
     )

@@ -8,6 +8,8 @@
   `desired_goal` (8,). The goals are the measured frame that success is judged by and its goal, in
   world: x y z [m], rotation vector, jaw, and 1 where what success needs besides the pose holds
   (contact, holes passed, needle out), else 0.
+* `relative`: (24,) float32: what `goal` shows, relative and in the active arm's base, as a network
+  learns from it; see `envs.relative`.
 * `pixels`: Dict of images: "front" is (height, width, 3) uint8 RGB; with depth=True also
   "front_depth" (height, width, 1) float32 [m], with segmentation=True also "front_segmentation"
   (height, width, 1) uint8.
@@ -92,6 +94,8 @@ class ObservationConfig:
             return spaces.Dict(
                 {"observation": _box(7), "achieved_goal": _box(8), "desired_goal": _box(8)}
             )
+        if self.obs_type == "relative":
+            return _box(len(names.RELATIVE_NAMES))
         height, width = self.image_size
         frame_spaces: dict[str, spaces.Space[object]] = {
             names.RGB: spaces.Box(0, 255, (height, width, 3), np.uint8),

@@ -52,6 +52,7 @@ class Place(Subtask):
     name = "place"
     arm = PSM2
     phase = 1
+    starts_held = True
     through = False
     tolerances = MappingProxyType(
         {"paper": Tolerance.of(5.0, 10.0), "released": Tolerance.of(5.0, 10.0)}

@@ -33,6 +33,7 @@ class Pullout(Subtask):
     name = "pullout"
     arm = PSM1
     phase = 4
+    starts_held = True
     tolerances = MappingProxyType(
         {"paper": Tolerance.of(5.0, 20.0), "released": Tolerance.of(5.0, 5.0)}
     )

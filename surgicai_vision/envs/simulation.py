@@ -49,6 +49,10 @@ RELEASE_JAW = 0.1
 """How far its jaw opens a step [rad], to 0.5 rad."""
 RELEASE_SHIFT = 0.001
 """How far it is then drawn back a step [m]."""
+DROPPED = 0.005
+"""How far the needle's arc is from the jaws of an arm that dropped it, at least [m]."""
+ARC_PARTS = 12
+"""Parts of the arc at whose ends that distance is measured: 1.8 mm each."""
 BESIDE = 0.0115
 """How far beside the exit PSM1 starts at least [m]; its home is 27 mm beside that of pair 1. A
 start that the draws of robot and phantom would put nearer, in PSM2's way, is moved out."""
@@ -430,6 +434,14 @@ class Simulation:
             return self._welds.active(arm)
         left, right = self.touching(arm)
         return left and right
+
+    def has_dropped(self, arm: str) -> bool:
+        """Return True if an arm neither holds the needle nor has it near its jaws."""
+        if self.holds(arm):
+            return False
+        grasp = poses.position(self.grasp(arm))
+        angles = [self.tip_angle * part / ARC_PARTS for part in range(ARC_PARTS + 1)]
+        return min(math.dist(grasp, self.needle_point(angle)) for angle in angles) > DROPPED
 
     def touches_phantom(self, *, needle: bool) -> bool:
         """Return True if an instrument, or with `needle` the needle too, touches the phantom.

@@ -71,6 +71,8 @@ class Subtask(ABC):
     demands: ClassVar[Mapping[str, Demands]]
     """Preset → what else success needs."""
 
+    starts_held: ClassVar[bool] = False
+    """The active jaws hold the needle at the start."""
     through: ClassVar[bool] = True
     """The needle is driven through the tissue, or already was."""
 
