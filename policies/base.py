@@ -15,7 +15,7 @@ rounds to float32, which hides the order in which a matrix product was summed.
 import abc
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, final
@@ -70,6 +70,11 @@ class Recipe:
             nearly the same.
         privileged: feed the 21 values of obs_type "state", goal included, in place of all else:
             an upper bound.
+        join_views: take in the feature maps of all views as channels of one map, so that
+            convolutions see both eyes at once; else each view has a head of its own.
+        proprioception_noise: noise on the measured poses in training, in standard deviations of
+            each value; 0 is none.
+        map_shift: move feature maps by up to so many places in training; 0 does not.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -86,6 +91,9 @@ class Recipe:
     map_head: str = "softmax"
     frame_stride: int = 1
     privileged: bool = False
+    join_views: bool = False
+    proprioception_noise: float = 0.0
+    map_shift: int = 0
 
     def __post_init__(self) -> None:
         check_name("split", self.split, ("episode", "transition"))
@@ -107,6 +115,15 @@ class Recipe:
             raise InputError("clock goes with proprioception; switch it on, and privileged off.")
         if not self.weight_decay >= 0:
             raise InputError(f"weight_decay is {self.weight_decay}; it must be at least 0.")
+        if not self.proprioception_noise >= 0 or self.map_shift < 0:
+            raise InputError(
+                f"proprioception_noise is {self.proprioception_noise}, map_shift {self.map_shift}; "
+                "neither may be below 0."
+            )
+        if self.proprioception_noise and (self.privileged or not self.proprioception):
+            raise InputError(
+                "proprioception_noise goes with proprioception; switch it on, and privileged off."
+            )
         if not 0 <= self.validation < 1:
             raise InputError(f"validation is {self.validation}; give a share from 0 to below 1.")
 
@@ -143,6 +160,28 @@ class Inputs:
     def dim(self) -> int:
         """Length of the concatenated input."""
         return self.features + (VECTORS[self.vector] if self.vector else 0)
+
+
+def visual_shapes(recipe: Recipe, visual: Sequence[tuple[int, ...]]) -> tuple[tuple[int, ...], ...]:
+    """Return the shape of each feature that a head of its own takes in.
+
+    Rows of maps lie side by side, channel after channel: joined they are one map already.
+
+    Args:
+        recipe: its `join_views` counts.
+        visual: shape of each view's feature.
+
+    Raises:
+        InputError: views are to be joined whose features are not maps of one size.
+    """
+    if not recipe.join_views or len(visual) < 2:
+        return tuple(visual)
+    if any(len(shape) != 3 or shape[1:] != visual[0][1:] for shape in visual):
+        raise InputError(
+            f"join_views is for feature maps of one size; these are {tuple(visual)}. Take "
+            "--pool spatial, or leave join_views out."
+        )
+    return ((sum(shape[0] for shape in visual), *visual[0][1:]),)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import final
 import torch
 from torch import nn
 
-from policies.base import Inputs, Recipe
+from policies.base import Inputs, Recipe, visual_shapes
 from surgicai_vision.core.errors import InputError
 
 POINTS = 32
@@ -138,7 +138,8 @@ class FeatureMLP(nn.Module):
     def __init__(self, recipe: Recipe, inputs: Inputs, answers: int):
         super().__init__()
         self.inputs = inputs
-        heads = [_head(shape, recipe.map_head) for shape in inputs.visual]
+        self.shapes = visual_shapes(recipe, inputs.visual)
+        heads = [_head(shape, recipe.map_head) for shape in self.shapes]
         self.heads = nn.ModuleList(heads)
         layers: list[nn.Module] = []
         width = sum(head.dim for head in heads) + inputs.dim - inputs.features
@@ -150,7 +151,7 @@ class FeatureMLP(nn.Module):
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
         """Return (B, answers) for normalised inputs (B, inputs.dim)."""
-        sizes = [math.prod(shape) for shape in self.inputs.visual]
+        sizes = [math.prod(shape) for shape in self.shapes]
         *rows, vector = observed.split([*sizes, self.inputs.dim - self.inputs.features], dim=1)
         seen = [head(row) for head, row in zip(self.heads, rows, strict=True)]
         answers: torch.Tensor = self.layers(torch.cat([*seen, vector], dim=1))

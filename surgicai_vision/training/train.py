@@ -34,7 +34,7 @@ import torch
 from numpy.typing import NDArray
 from torch.optim.lr_scheduler import LRScheduler
 
-from policies.base import Plugin, Policy, Recipe
+from policies.base import Plugin, Policy, Recipe, visual_shapes
 from surgicai_vision import __version__
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, digest, to_mapping
@@ -43,6 +43,7 @@ from surgicai_vision.core.files import check_output, read_json, write_bytes, wri
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
+from surgicai_vision.training.augment import with_noise, with_shift
 from surgicai_vision.training.checkpoint import (
     CARD,
     Checkpoint,
@@ -356,7 +357,7 @@ class _Training:
         self.policy.train()
         total = 0.0
         for rows in self._batches():
-            observed = self.policy.normalise(self._observed(rows).to(self.device))
+            observed = self._augmented(self.policy.normalise(self._observed(rows).to(self.device)))
             loss = self.policy.loss(observed, self.target[rows].to(self.device))
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()
@@ -369,6 +370,17 @@ class _Training:
                 "The training loss is not finite; lower the learning rate or look at the features."
             )
         return total / len(self.rows)
+
+    def _augmented(self, observed: torch.Tensor) -> torch.Tensor:
+        """Return normalised inputs (B, inputs.dim) as the recipe's augmentation leaves them."""
+        recipe = self.task.recipe
+        inputs = self.policy.inputs
+        if recipe.map_shift:
+            shapes = visual_shapes(recipe, inputs.visual)
+            observed = with_shift(observed, shapes, recipe.map_shift)
+        if recipe.proprioception_noise:
+            observed = with_noise(observed, inputs, recipe.proprioception_noise)
+        return observed
 
     @torch.no_grad()
     def _validate(self) -> float:

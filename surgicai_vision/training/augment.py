@@ -1,0 +1,74 @@
+"""Augmentation: what is done to normalised inputs in training, and never when a policy acts.
+
+* `with_noise(observed, inputs, deviation)`: Gaussian noise on the measured poses (the recipe's
+  `proprioception_noise`), so that a policy does not trust the joints further than they can be
+  trusted. The clock is not measured and stays as it is.
+* `with_shift(observed, shapes, places)`: feature maps moved by whole places (the recipe's
+  `map_shift`), as where a crop lies beside the jaws; DrQ moves images so (Kostrikov et al., Image
+  augmentation is all you need, ICLR 2021).
+
+Both draw from torch's own random state, which `train` seeds, stores and restores.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from policies.base import VECTORS, Inputs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import CLOCK_SIZE
+
+
+def with_noise(observed: torch.Tensor, inputs: Inputs, deviation: float) -> torch.Tensor:
+    """Add noise to the measured poses, whatever else is fed left as it is.
+
+    Args:
+        observed: (B, inputs.dim) normalised inputs, the views' features first.
+        inputs: what they are.
+        deviation: standard deviation of the noise, in standard deviations of each value.
+    """
+    if inputs.vector is None:
+        return observed
+    clock = CLOCK_SIZE if inputs.vector == names.CLOCKED_STATE else 0
+    measured = VECTORS[inputs.vector] - clock
+    noise = torch.zeros_like(observed)
+    drawn = deviation * torch.randn(len(observed), measured)
+    noise[:, inputs.features : inputs.features + measured] = drawn.to(noise.device)
+    return observed + noise
+
+
+def with_shift(
+    observed: torch.Tensor, shapes: Sequence[tuple[int, ...]], places: int
+) -> torch.Tensor:
+    """Move every feature map by up to `places` places each way, each row and map by its own draw.
+
+    What comes in from outside is the channel's mean, which is 0 in normalised inputs.
+
+    Args:
+        observed: (B, inputs.dim) normalised inputs, the views' features first.
+        shapes: of the features, in their order; only maps (C, h, w) are moved.
+        places: largest move [places].
+    """
+    moved = observed.clone()
+    at = 0
+    for shape in shapes:
+        size = math.prod(shape)
+        if len(shape) == 3:
+            maps = observed[:, at : at + size].unflatten(1, shape)
+            target = moved[:, at : at + size].unflatten(1, shape)
+            target.zero_()
+            moves = torch.randint(-places, places + 1, (len(maps), 2)).tolist()
+            for row, (down, right) in enumerate(moves):
+                to_y, from_y = _overlap(down, shape[1])
+                to_x, from_x = _overlap(right, shape[2])
+                target[row, :, to_y, to_x] = maps[row, :, from_y, from_x]
+        at += size
+    return moved
+
+
+def _overlap(move: int, length: int) -> tuple[slice, slice]:
+    """Return where an axis that is moved lands, and what of it does."""
+    low = max(move, 0)
+    high = length + min(move, 0)
+    return slice(low, high), slice(low - move, high - move)
