@@ -57,6 +57,10 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
         max_steps: episode limit [control steps].
         scene: the scene.
         randomisation: what differs from episode to episode besides the start.
+        action_repeat: control steps that an action is held.
+        hold_jaw: whether the jaw stays as it is where the needle is held at the start.
+        end_on_drop: whether an episode ends when the needle is dropped.
+        advance: how the whole procedure goes on: "success" or "told".
         encoder: show this encoder's features of the views in place of images.
         encoder_weights: file with the encoder's pretrained weights.
         encoder_sha256: hash of the weights it must have; empty for any.
@@ -73,6 +77,10 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
     max_steps: int | None = None
     scene: SceneConfig | None = None
     randomisation: RandomisationConfig | None = None
+    action_repeat: int | None = None
+    hold_jaw: bool | None = None
+    end_on_drop: bool | None = None
+    advance: str | None = None
     encoder: str | None = None
     encoder_weights: str | None = None
     encoder_sha256: str = ""

@@ -36,6 +36,8 @@ STEPS: Mapping[str, tuple[float, float, float]] = types.MappingProxyType(
 """Step preset → translation [m], rotation [deg], jaw [rad] of an action of 1. Sources:
 SurgicAI's image evaluation, its RL training script, the trajectories shipped with its release."""
 
+ADVANCES = ("success", "told")
+"""Who takes the whole procedure to its next subtask: the measured success, or whoever acts."""
 DWELL = 15
 """Control steps a subtask's success must hold, in a whole procedure, before the next one begins."""
 CLOCK_PERIOD = 25
@@ -228,6 +230,10 @@ class TaskConfig:
         hold_jaw: in a subtask that starts with the needle held the jaw's action is taken as 0, as
             the released code does in an insertion.
         end_on_drop: end an episode whose subtask starts with the needle held when it is dropped.
+        advance: how the whole procedure goes on to its next subtask: "success", when the present
+            one's measured success has held for `DWELL` steps, as in the released code, or "told":
+            by `enter` alone, so that nothing the env measures decides which arm moves or lets go.
+            A task of one subtask is the same either way.
     """
 
     task: str = "grasp"
@@ -240,6 +246,7 @@ class TaskConfig:
     action_repeat: int = 1
     hold_jaw: bool = False
     end_on_drop: bool = False
+    advance: str = "success"
 
     def __post_init__(self) -> None:
         check_task(self.task)
@@ -250,6 +257,7 @@ class TaskConfig:
             raise InputError(
                 f"action_repeat is {self.action_repeat}; allowed: 1 to {ACTION_REPEAT_LIMIT}."
             )
+        check_name("advance", self.advance, ADVANCES)
         if self.max_steps < 0:
             raise InputError(
                 f"max_steps is {self.max_steps}; it must be at least 1, or 0 for the paper's limit."

@@ -27,7 +27,7 @@ from surgicai_vision.envs.suture import Suture
 __all__ = ["SUBTASKS", "GoalSuturingEnv", "SuturingEnv", "make", "make_registered", "make_task"]
 
 OPTIONS = (
-    *("step", "tolerance", "reward", "max_steps"),
+    *("step", "tolerance", "reward", "max_steps", "advance"),
     *("action_repeat", "hold_jaw", "end_on_drop"),
 )
 """Fields of `TaskConfig` that are arguments of `make_task` as they are."""

@@ -287,6 +287,17 @@ class SuturingEnv(gymnasium.Env):
         """Return the present subtask's index in `names.SUBTASKS`, -1 for a task of its own."""
         return self.simulation.task_state.phase
 
+    def enter(self, phase: int) -> None:
+        """Make a subtask the present one; a task of one subtask has only its own.
+
+        Args:
+            phase: index in `names.SUBTASKS`; that of the present subtask changes nothing.
+        """
+        if phase != self.phase:
+            raise InputError(
+                f"'{self.config.task}' has one subtask, {self.phase}; it cannot enter {phase}."
+            )
+
     def named(self, kind: str, name: str) -> int:
         """Return an element's id; a wrong name lists what exists."""
         return self.scene.named(kind, name)

@@ -77,6 +77,14 @@ class Grasp(Subtask):
             simulation, PSM2, simulation.task_state.grasp_angle
         )
 
+    def targets(self, simulation: Simulation, stitch: Stitch) -> tuple[tuple[Pose, Pose], ...]:
+        """Return the episode's target, and the nearest of those that episodes draw."""
+        drawn = self.target(simulation, stitch)
+        x, y, _ = poses.position(poses.relative(simulation.needle(), drawn[0]))
+        low, high = stitch.grasps(*GRASP_ANGLES)
+        angle = min(max(math.atan2(y, -x), low), high)
+        return drawn, (drawn[0], grasp_goal(simulation, PSM2, angle))
+
 
 def grasp_goal(simulation: Simulation, arm: str, angle: float) -> Pose:
     """Return the jaws' grasp frame that holds the needle's point at `angle` [rad], in world."""

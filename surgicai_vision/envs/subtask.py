@@ -86,3 +86,10 @@ class Subtask(ABC):
     @abstractmethod
     def target(self, simulation: Simulation, stitch: Stitch) -> tuple[Pose, Pose]:
         """Return the measured pose that matters and its goal, both in world."""
+
+    def targets(self, simulation: Simulation, stitch: Stitch) -> tuple[tuple[Pose, Pose], ...]:
+        """Return the targets of which any will do for what follows, that of the episode first.
+
+        There are more than one where each episode draws its goal from a range.
+        """
+        return (self.target(simulation, stitch),)

@@ -8,7 +8,7 @@
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,15 @@ ON_MARK = 0.002
 """How far from its mark a bite in soft tissue may go in and come out [m]: about half of a channel's
 opening."""
 Info = dict[str, Any]
+
+
+class Verdict(NamedTuple):
+    """Whether a subtask is solved: by the paper, and by what soft tissue asks besides."""
+
+    paper: bool
+    full: bool
+
+
 Target = tuple[Pose, Pose]
 """The measured frame that success is judged by, and where it should be, both in world."""
 
@@ -37,8 +46,7 @@ def measure(
     contact = simulation.holds(subtask.arm)
     distance = poses.distance(achieved, desired)
     turn = poses.angle(achieved, desired)
-    tolerance = subtask.tolerances[preset]
-    near = distance <= tolerance.distance and turn <= tolerance.angle and not state.has_diverged
+    near = _is_near(subtask, preset, distance, turn) and not state.has_diverged
     as_in_paper = near and _meets_demands(simulation, subtask, stitch, preset, contact)
     return {
         "is_success": as_in_paper and _is_well_stitched(simulation, subtask, stitch),
@@ -52,6 +60,28 @@ def measure(
         "physics_error": state.has_diverged,
         "tip_path": state.tip_path,
     }
+
+
+def judge(simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str) -> Verdict:
+    """Return whether a subtask is solved now, whichever one is on, by any of its `targets`.
+
+    Nothing is remembered: who looks changes nothing.
+    """
+    if simulation.task_state.has_diverged:
+        return Verdict(paper=False, full=False)
+    near = any(
+        _is_near(subtask, preset, poses.distance(*target), poses.angle(*target))
+        for target in subtask.targets(simulation, stitch)
+    )
+    contact = simulation.holds(subtask.arm)
+    as_in_paper = near and _meets_demands(simulation, subtask, stitch, preset, contact)
+    return Verdict(as_in_paper, as_in_paper and _is_well_stitched(simulation, subtask, stitch))
+
+
+def _is_near(subtask: Subtask, preset: str, distance: float, turn: float) -> bool:
+    """Return True if a distance [m] and an angle [rad] are within the tolerance."""
+    tolerance = subtask.tolerances[preset]
+    return distance <= tolerance.distance and turn <= tolerance.angle
 
 
 def meets_demands(simulation: Simulation, subtask: Subtask, stitch: Stitch, preset: str) -> bool:

@@ -5,6 +5,12 @@ paper's tolerances are met before a subtask is finished (an insertion counts 5 m
 and the next one needs it finished. When the pull-out begins PSM2 lets go by itself, as in the
 released code. A high-level policy may choose another subtask by `enter`.
 
+With `TaskConfig.advance` "told" only `enter` goes on to a subtask: what is measured moves no arm
+and lets nothing go. It is still counted, wherever the procedure has been told to be: a subtask that
+is solved after all before it (any grasp within the range that goals are drawn from will do), an
+insertion and a pull-out also by themselves, since no needle is in both holes that was not brought
+there. The whole is solved when the pull-out is.
+
 In soft tissue the next subtask begins by the paper's own success: a bite beside the marks is still
 pulled out. `subtask_success`, `progress` and `is_success` ask for the marks as well
 (`envs.success`).
@@ -14,8 +20,9 @@ from surgicai_vision.core.config import DWELL
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.simulation import RELEASE_STEPS
-from surgicai_vision.envs.success import Info
+from surgicai_vision.envs.success import Info, Verdict, judge
 
+INSERT_PHASE = 2
 PULLOUT_PHASE = 4
 
 
@@ -24,6 +31,9 @@ class Suture(SuturingEnv):
 
     def _progress(self, info: Info) -> bool:
         """Go on to the next subtask when the present one's success has held; return if so."""
+        if self.config.advance == "told":
+            self._count(info)
+            return False
         state = self.simulation.task_state
         info["subtask_success"] = info["is_success"]
         state.dwell = state.dwell + 1 if info["paper_success"] else 0
@@ -37,6 +47,30 @@ class Suture(SuturingEnv):
             return False
         self._make_present(state.phase + 1)
         return True
+
+    def _count(self, info: Info) -> None:
+        """Count the subtasks that are solved, wherever the procedure has been told to be."""
+        state = self.simulation.task_state
+        info["subtask_success"] = info["is_success"]
+        whole = self.judge(PULLOUT_PHASE)
+        if whole.full:
+            state.done = len(self._subtasks)
+        elif state.done <= INSERT_PHASE and self.judge(INSERT_PHASE).full:
+            state.done = INSERT_PHASE + 1
+        elif state.done < PULLOUT_PHASE and self.judge(state.done).full:
+            state.done += 1
+        info["progress"] = state.done
+        info["is_success"] = whole.full
+        info["paper_success"] = whole.paper
+
+    def judge(self, phase: int) -> Verdict:
+        """Return whether a subtask is solved now, whichever one is on (`envs.success.judge`).
+
+        Args:
+            phase: index in `names.SUBTASKS`.
+        """
+        subtask = self._subtasks[phase]
+        return judge(self.simulation, subtask, self.stitch, self.config.tolerance)
 
     def _meets_demands(self) -> bool:
         """Return True only in the last subtask, whose success is that of the whole."""

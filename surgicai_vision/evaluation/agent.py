@@ -1,8 +1,13 @@
-"""The agent: what acts in an evaluation, with every member that callers use."""
+"""The agent: what acts in an evaluation, with every member that callers use.
+
+An agent asks what it moves for nothing but what `Robot` has, and an env is one. What reads the
+env's own state (an expert, ends by measured success, a policy fed the privileged state) says so in
+`Agent.privileged`, and then `simulated(robot)` is its env.
+"""
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +20,29 @@ type Env = base.SuturingEnv
 type Observation = base.Observation
 type Actions = NDArray[np.float32]
 """One action a slot, (n, 7)."""
+
+
+class Robot(Protocol):
+    """All that an agent may ask of what it moves, beside the images."""
+
+    def agent_pos(self) -> NDArray[np.float32]:
+        """Return the active arm's measured tip in its base, (7,): x y z, roll pitch yaw, jaw.
+
+        In m and rad.
+        """
+
+    def both_arms(self) -> NDArray[np.float32]:
+        """Return both arms' `agent_pos`, psm1 first, (14,)."""
+
+    def enter(self, phase: int) -> None:
+        """Make a subtask, an index in `names.SUBTASKS`, the present one: its arm is active now."""
+
+
+def simulated(robot: Robot) -> Env:
+    """Return the env that a privileged agent (`Agent.privileged`) is given as its robot."""
+    return cast("base.SuturingEnv", robot)
+
+
 type FeatureTable = dict[tuple[str, tuple[str, ...]], dict[int, NDArray[np.float32]]]
 """(encoder's fingerprint, views) → id of an observation → its features."""
 
@@ -33,20 +61,22 @@ class Agent(abc.ABC):
         cameras: cameras it needs, empty for none.
         image_size: height and width of their images [px].
         depth: whether it needs their depth too.
+        privileged: whether it reads the env's own state: it acts in simulation alone.
     """
 
     name: str
     cameras: tuple[str, ...] = ()
     image_size: int = 224
     depth: bool = False
+    privileged: bool = False
 
     @abc.abstractmethod
-    def reset(self, slot: int, env: Env, seed: int) -> None:
-        """Forget the slot's last episode; `env` has just been reset with `seed`."""
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
+        """Forget the slot's last episode; `robot` has just been reset with `seed`."""
 
     @abc.abstractmethod
     def act(
-        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the actions (len(slots), 7) of the running slots."""
 

@@ -13,10 +13,11 @@ from surgicai_vision.core.errors import UnreachablePose
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
-    Env,
     FeatureTable,
     Observation,
+    Robot,
     frame_of,
+    simulated,
 )
 from surgicai_vision.training.threads import one_thread
 
@@ -31,18 +32,19 @@ class ExpertAgent(Agent):
     """The scripted expert: reads the env's state, needs no images."""
 
     name = "expert"
+    privileged = True
 
     def __init__(self) -> None:
         self._experts: dict[int, Expert] = {}
 
-    def reset(self, slot: int, env: Env, seed: int) -> None:
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Make an expert for the slot's episode."""
         from surgicai_vision.demos.expert import Expert
 
-        self._experts[slot] = Expert(env)
+        self._experts[slot] = Expert(simulated(robot))
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the experts' actions (n, 7); not a number where the expert knows no way on."""
         actions = np.full((len(slots), 7), np.nan, np.float32)
@@ -63,12 +65,12 @@ class RandomAgent(Agent):
     def __init__(self) -> None:
         self._generators: dict[int, np.random.Generator] = {}
 
-    def reset(self, slot: int, env: Env, seed: int) -> None:
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Seed the slot's generator."""
         self._generators[slot] = np.random.default_rng(seed)
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return actions (n, 7) in [-1, 1]."""
         return np.stack(
@@ -82,11 +84,11 @@ class ZeroAgent(Agent):
 
     name = "zero"
 
-    def reset(self, slot: int, env: Env, seed: int) -> None:
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Nothing to forget."""
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return zeros (n, 7)."""
         return np.zeros((len(slots), 7), np.float32)
@@ -106,12 +108,12 @@ class ReplayAgent(Agent):
         self._actions = np.concatenate([actions, np.zeros((1, 7), np.float32)])
         self._steps: dict[int, int] = {}
 
-    def reset(self, slot: int, env: Env, seed: int) -> None:
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Start from the first action."""
         self._steps[slot] = 0
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the actions of the slots' steps (n, 7)."""
         steps = [min(self._steps[slot], len(self._actions) - 1) for slot in slots]
@@ -139,15 +141,15 @@ def mean_demonstration(
     return np.stack(steps).astype(np.float32)
 
 
-VECTORS: Mapping[str, Callable[[Env], NDArray[np.float32]]] = MappingProxyType(
+VECTORS: Mapping[str, Callable[[Robot], NDArray[np.float32]]] = MappingProxyType(
     {
-        names.STATE: lambda env: env.agent_pos(),
-        names.CLOCKED_STATE: lambda env: env.agent_pos(),  # the agent itself adds the clock
-        names.BOTH_ARMS: lambda env: env.both_arms(),
-        names.PRIVILEGED_STATE: lambda env: env.state_vector(),
+        names.STATE: lambda robot: robot.agent_pos(),
+        names.CLOCKED_STATE: lambda robot: robot.agent_pos(),  # the agent itself adds the clock
+        names.BOTH_ARMS: lambda robot: robot.both_arms(),
+        names.PRIVILEGED_STATE: lambda robot: simulated(robot).state_vector(),
     }
 )
-"""What a policy may be fed beside features: dataset key → how the env says it."""
+"""What a policy may be fed beside features: dataset key → how the robot says it."""
 
 BASELINES: Mapping[str, Callable[[], Agent]] = MappingProxyType(
     {ExpertAgent.name: ExpertAgent, RandomAgent.name: RandomAgent, ZeroAgent.name: ZeroAgent}
@@ -182,6 +184,7 @@ class PolicyAgent(Agent):
         self.image_size = image_size
         self.cameras = tuple(dict.fromkeys(map(names.camera_of, views)))
         self.depth = any(map(names.is_depth_view, views))
+        self.privileged = vector == names.PRIVILEGED_STATE
         self._policy = policy
         self._encoder = encoder
         self._vector = VECTORS[vector]
@@ -193,7 +196,7 @@ class PolicyAgent(Agent):
         """Look features up in a table that agents share, and put new ones there."""
         self._shared = features
 
-    def reset(self, slot: int, env: Env, seed: int) -> None:
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Start the slot's clock; the policy has no other memory."""
         self.restart(slot)
 
@@ -202,28 +205,28 @@ class PolicyAgent(Agent):
         self._ticks[slot] = 0
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the policy's actions (n, 7)."""
         ticks = [self._ticks[slot] for slot in slots]
         self._ticks.update({slot: tick + 1 for slot, tick in zip(slots, ticks, strict=True)})
-        return self.answer(envs, observations, ticks)
+        return self.answer(robots, observations, ticks)
 
     def answer(
         self,
-        envs: Sequence[Env],
+        robots: Sequence[Robot],
         observations: Sequence[Observation],
         ticks: Sequence[int] | None = None,
     ) -> NDArray[np.float32]:
         """Return the policy's answers (n, …): actions, or a high-level policy's logits.
 
         Args:
-            envs: the envs, for proprioception.
+            robots: what is moved, for proprioception.
             observations: their observations.
-            ticks: control steps since each env's subtask began, for a policy with a clock.
+            ticks: control steps since each robot's subtask began, for a policy with a clock.
         """
         with one_thread():
-            vectors = np.stack([self._vector(env) for env in envs])
+            vectors = np.stack([self._vector(robot) for robot in robots])
             if self._clocked and ticks is not None:
                 clocks = clock(np.array(ticks))
                 vectors = np.concatenate([vectors, clocks], axis=1, dtype=np.float32)

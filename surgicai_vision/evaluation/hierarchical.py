@@ -4,11 +4,15 @@ HLP → LLP → termination → HLP: the high-level policy says which subtask is
 policy moves its arm until the subtask ends, and the high-level policy is asked again. A subtask
 ends
 
+* `learned`: when the high-level policy itself names another subtask. It is asked every
+  `decide_every` control steps, and believed when it has named the same other subtask `patience`
+  times in a row, each time with a probability of at least `confidence`. The env goes on when it is
+  told and not before (`TaskConfig.advance`): nothing that is measured of needle or tissue decides
+  anything;
 * `privileged`: when the env's measured success has held (a grasp's for `grasp_hold` steps), as in
-  the released code;
-* `learned`: when the high-level policy itself names another subtask, `PATIENCE` observations in a
-  row;
-* in either case after `steps` control steps (paper: 200).
+  the released code: a control, which no robot has;
+* in either case after `steps` control steps (paper: 200): the high-level policy is asked, its
+  likeliest subtask is taken at once, and the same one begins anew where it names that.
 
 After `decisions` decisions (paper: 50) both arms hold still.
 
@@ -18,12 +22,12 @@ A hierarchical policy is a YAML file, which `surgicai-vision evaluate hierarchic
     hlp: outputs/train/suture-hlp-…   # a checkpoint, or `order`: the subtasks in their order
     grasp: outputs/train/grasp-…      # whatever `evaluate` takes for this subtask
     place: …                          # and so on for insert, handoff, pullout
-    termination: privileged
+    termination: learned
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast, final
+from typing import TYPE_CHECKING, Protocol, cast, final
 
 import numpy as np
 
@@ -34,10 +38,10 @@ from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
-    Env,
     FeatureTable,
     MakeAgent,
     Observation,
+    Robot,
 )
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.training.run_config import TERMINATIONS
@@ -49,10 +53,6 @@ if TYPE_CHECKING:
 ORDER = "order"
 SUFFIXES = (".yaml", ".yml")
 GRASP = names.SUBTASKS.index("grasp")
-PATIENCE = 5
-"""Observations in a row that must name another subtask before a learned termination believes them
-(0.1 s).
-"""
 MAX_STEPS = 2000
 """Control steps of an episode: ten subtasks of full length."""
 
@@ -73,6 +73,13 @@ class HierarchicalConfig:
         grasp_hold: control steps a grasp must hold before it ends as `privileged`, at most the
             env's own `DWELL`; a policy that learned to search (`demos.search_expert`) lets go again
             sooner than that.
+        confidence: probability, by the high-level policy's softmax, that another subtask must have
+            before it counts as named (`learned`). More of it means later ends and fewer false ones.
+        patience: how often in a row the high-level policy must name the same other subtask before
+            a `learned` end is believed.
+        decide_every: control steps from one question to the high-level policy to the next
+            (`learned`); only then are its images rendered and encoded. A subtask takes at least
+            `decide_every` times `patience` steps.
     """
 
     hlp: str
@@ -81,23 +88,35 @@ class HierarchicalConfig:
     insert: str
     handoff: str
     pullout: str
-    termination: str = "privileged"
+    termination: str = "learned"
     steps: int = 200
     decisions: int = 50
     max_steps: int = MAX_STEPS
     grasp_hold: int = DWELL
+    confidence: float = 0.5
+    patience: int = 3
+    decide_every: int = 5
 
     def __post_init__(self) -> None:
         check_name("termination", self.termination, TERMINATIONS)
-        limits = {"steps": self.steps, "decisions": self.decisions, "max_steps": self.max_steps}
+        limits = {
+            "steps": self.steps,
+            "decisions": self.decisions,
+            "max_steps": self.max_steps,
+            "patience": self.patience,
+            "decide_every": self.decide_every,
+        }
         for name, limit in limits.items():
             if limit < 1:
                 raise InputError(f"{name} is {limit}; it must be at least 1.")
         if not 1 <= self.grasp_hold <= DWELL:
             raise InputError(f"grasp_hold is {self.grasp_hold}; allowed: 1 to {DWELL}.")
+        if not 0.0 <= self.confidence < 1.0:
+            raise InputError(f"confidence is {self.confidence}; allowed: 0 to below 1.")
         if self.hlp == ORDER and self.termination == "learned":
             raise InputError(
-                "A learned termination needs a high-level policy; give hlp: a checkpoint folder."
+                "A learned termination needs a high-level policy; give hlp: a checkpoint folder, "
+                "or termination: privileged, which ends a subtask by its measured success."
             )
 
     @property
@@ -105,6 +124,11 @@ class HierarchicalConfig:
         """Subtask → what acts in it, in the order of the subtasks."""
         policies = (self.grasp, self.place, self.insert, self.handoff, self.pullout)
         return dict(zip(names.SUBTASKS, policies, strict=True))
+
+    @property
+    def advance(self) -> str:
+        """Who takes the env to its next subtask: `TaskConfig.advance`."""
+        return "told" if self.termination == "learned" else "success"
 
 
 @dataclass
@@ -115,21 +139,89 @@ class _Progress:
         subtask: the one that is on; -1 before the first decision.
         steps: control steps it has taken.
         decisions: decisions taken.
-        doubts: observations in a row that named another subtask.
+        named: the other subtask that the high-level policy named last.
+        times: how often in a row it has.
     """
 
     subtask: int = -1
     steps: int = 0
     decisions: int = 0
-    doubts: int = 0
+    named: int = -1
+    times: int = 0
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """What a high-level policy says: a subtask, and how probable it holds it."""
+
+    subtask: int
+    probability: float = 1.0
+
+
+class _Ends(Protocol):
+    """When a subtask ends."""
+
+    def is_asked(self, state: _Progress, robot: Robot) -> bool:
+        """Return True if the high-level policy is asked now."""
+
+    def believes(self, state: _Progress, choice: _Choice) -> bool:
+        """Return True if what it says is a decision."""
+
+
+@final
+class _PrivilegedEnds:
+    """A subtask ends when the env's measured success has held.
+
+    Args:
+        grasp_hold: control steps that does for a grasp.
+    """
+
+    def __init__(self, grasp_hold: int):
+        self._grasp_hold = grasp_hold
+
+    def is_asked(self, state: _Progress, robot: Robot) -> bool:
+        """Return True if the env has gone on, which a grasp that has held long enough makes it."""
+        env = _suture(robot)
+        if state.subtask == env.phase == GRASP and env.dwell >= self._grasp_hold:
+            env.enter(GRASP + 1)
+        return env.phase != state.subtask
+
+    def believes(self, state: _Progress, choice: _Choice) -> bool:
+        """Return True: the subtask has ended, whatever comes next."""
+        return True
+
+
+@final
+class _LearnedEnds:
+    """A subtask ends when the high-level policy keeps naming another one.
+
+    Args:
+        config: `confidence`, `patience` and `decide_every`.
+    """
+
+    def __init__(self, config: HierarchicalConfig):
+        self._config = config
+
+    def is_asked(self, state: _Progress, robot: Robot) -> bool:
+        """Return True every so many steps."""
+        return state.steps % self._config.decide_every == 0
+
+    def believes(self, state: _Progress, choice: _Choice) -> bool:
+        """Return True once the same other subtask was named often enough in a row."""
+        if choice.subtask == state.subtask or choice.probability < self._config.confidence:
+            state.named, state.times = -1, 0
+            return False
+        state.times = state.times + 1 if choice.subtask == state.named else 1
+        state.named = choice.subtask
+        return state.times >= self._config.patience
 
 
 @final
 class HierarchicalAgent(Agent):
     """A high-level policy over low-level ones; see the module's docstring.
 
-    It asks the env for nothing but both arms' measured poses and, with a privileged termination,
-    whether the present subtask has ended; it tells it which subtask, and so which arm, is on.
+    It tells its robot which subtask, and so which arm, is on, and asks it for measured poses alone;
+    with a privileged termination also whether the present subtask has ended.
 
     Args:
         config: when a subtask ends.
@@ -148,7 +240,10 @@ class HierarchicalAgent(Agent):
         self.config = config
         self._low = [make() for make in low]
         self._high = high() if high is not None else None
+        learned = config.termination == "learned"
+        self._ends: _Ends = _LearnedEnds(config) if learned else _PrivilegedEnds(config.grasp_hold)
         self._agents = [*self._low, *([self._high] if self._high else [])]
+        self.privileged = not learned or any(agent.privileged for agent in self._agents)
         seen = {camera for agent in self._agents for camera in agent.cameras}
         self.cameras = tuple(camera for camera in camera_names() if camera in seen)
         sizes = {agent.image_size for agent in self._agents if agent.cameras}
@@ -162,20 +257,20 @@ class HierarchicalAgent(Agent):
         for agent in self._agents:
             agent.share(self._features)
 
-    def reset(self, slot: int, env: Env, seed: int) -> None:
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Forget the slot's last episode."""
         self._slots[slot] = _Progress()
         for agent in self._low:
-            agent.reset(slot, env, seed)
+            agent.reset(slot, robot, seed)
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the actions (n, 7) of the subtasks that are on, decided anew where one ended."""
         self._features.clear()
         states = [self._slots[slot] for slot in slots]
         with one_thread():
-            self._decide(slots, states, cast("Sequence[Suture]", envs), observations)
+            self._decide(slots, states, robots, observations)
         actions = np.zeros((len(slots), len(names.ACTION_NAMES)), np.float32)
         for subtask, agent in enumerate(self._low):
             rows = [
@@ -186,7 +281,7 @@ class HierarchicalAgent(Agent):
             if rows:
                 actions[rows] = agent.act(
                     [slots[row] for row in rows],
-                    [envs[row] for row in rows],
+                    [robots[row] for row in rows],
                     [observations[row] for row in rows],
                 )
         for state in states:
@@ -200,58 +295,49 @@ class HierarchicalAgent(Agent):
     def _decide(
         self,
         slots: Sequence[int],
-        states: Sequence[_Progress],
-        envs: "Sequence[Suture]",
+        states: list[_Progress],
+        robots: Sequence[Robot],
         observations: Sequence[Observation],
     ) -> None:
         """Ask the high-level policy wherever it is due, and begin what it says."""
-        for state, env in zip(states, envs, strict=True):
-            if self._has_grasped(state, env):
-                env.enter(GRASP + 1)
-        asked = [
-            row
-            for row, state in enumerate(states)
-            if self._may_act(state) and self._is_asked(state, envs[row])
+        due = [
+            self._ends.is_asked(state, robot) or self._is_over(state)
+            for state, robot in zip(states, robots, strict=True)
         ]
+        asked = [row for row, state in enumerate(states) if due[row] and self._may_act(state)]
         if not asked:
             return
-        chosen = self._choose([envs[row] for row in asked], [observations[row] for row in asked])
+        chosen = self._choose([robots[row] for row in asked], [observations[row] for row in asked])
         for row, choice in zip(asked, chosen, strict=True):
             state = states[row]
-            env = envs[row]
-            if self._believes(state, env, choice):
-                state.subtask = choice
-                state.steps = 0
-                state.doubts = 0
-                state.decisions += 1
-                self._low[choice].restart(slots[row])
-            if self._may_act(state):
-                env.enter(state.subtask)
+            if self._is_over(state) or self._ends.believes(state, choice):
+                states[row] = self._slots[slots[row]] = _Progress(
+                    choice.subtask, decisions=state.decisions + 1
+                )
+                self._low[choice.subtask].restart(slots[row])
+            if self._may_act(states[row]):
+                robots[row].enter(states[row].subtask)
 
-    def _is_asked(self, state: _Progress, env: "Suture") -> bool:
-        if state.subtask < 0 or state.steps >= self.config.steps:
-            return True
-        return self.config.termination == "learned" or env.phase != state.subtask
+    def _is_over(self, state: _Progress) -> bool:
+        """Return True if no subtask is on, or it has taken all its steps."""
+        return state.subtask < 0 or state.steps >= self.config.steps
 
-    def _has_grasped(self, state: _Progress, env: "Suture") -> bool:
-        """Return True if a grasp has held for `grasp_hold` steps, before the env itself goes on."""
-        if self.config.termination != "privileged" or not state.subtask == env.phase == GRASP:
-            return False
-        return bool(env.dwell >= self.config.grasp_hold)
-
-    def _believes(self, state: _Progress, env: "Suture", choice: int) -> bool:
-        """Return True if a choice is a decision; a learned termination must wait for more."""
-        if (
-            state.subtask < 0
-            or state.steps >= self.config.steps
-            or self.config.termination == "privileged"
-        ):
-            return True
-        state.doubts = state.doubts + 1 if choice != state.subtask else 0
-        return state.doubts >= PATIENCE
-
-    def _choose(self, envs: "Sequence[Suture]", observations: Sequence[Observation]) -> list[int]:
-        """Return the subtask that is due in each env."""
+    def _choose(
+        self, robots: Sequence[Robot], observations: Sequence[Observation]
+    ) -> list[_Choice]:
+        """Return what the high-level policy says for each robot."""
         if self._high is None:
-            return [env.phase for env in envs]
-        return [int(due) for due in self._high.answer(envs, observations).argmax(axis=1)]
+            return [_Choice(_suture(robot).phase) for robot in robots]
+        # Beyond the logits it may say how far the subtask has come.
+        logits = self._high.answer(robots, observations)[:, : len(names.SUBTASKS)]
+        odds = np.exp(logits.astype(np.float64) - logits.max(axis=1, keepdims=True))
+        likely = odds.argmax(axis=1)
+        return [
+            _Choice(int(subtask), float(row[subtask] / row.sum()))
+            for subtask, row in zip(likely, odds, strict=True)
+        ]
+
+
+def _suture(robot: Robot) -> "Suture":
+    """Return the env of a hierarchical policy that is privileged."""
+    return cast("Suture", robot)

@@ -30,7 +30,7 @@ from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
-from surgicai_vision.evaluation.agent import Actions, Agent, Env, Observation, frame_of
+from surgicai_vision.evaluation.agent import Actions, Agent, Observation, Robot, frame_of
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training.run_config import OWN
 from surgicai_vision.training.threads import one_thread
@@ -210,8 +210,8 @@ class LeRobotAgent(Agent):
         name: how tables call it.
         folder: its checkpoint.
         inputs: what it sees.
+        text: the task in words, as its dataset says it.
         weights: where pretrained weights come from.
-        text: the task in words, as its dataset says it; empty for the env's own.
     """
 
     def __init__(
@@ -219,8 +219,8 @@ class LeRobotAgent(Agent):
         name: str,
         folder: Path,
         inputs: Inputs,
+        text: str,
         weights: WeightsSource = ANYWHERE,
-        text: str = "",
     ):
         self.name = name
         self.cameras = inputs.cameras
@@ -233,7 +233,7 @@ class LeRobotAgent(Agent):
         self._devices = ("cpu",) if device == "cpu" else ("cpu", device)
         self._slots: dict[int, tuple[LeRobotPolicy, dict[str, torch.Tensor]]] = {}
 
-    def reset(self, slot: int, env: Env, seed: int) -> None:
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Give the slot a policy that remembers nothing, and the random numbers of its seed."""
         import torch
 
@@ -253,7 +253,7 @@ class LeRobotAgent(Agent):
         self._slots[slot][0].reset()
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the policy's actions (n, 7)."""
         import torch
@@ -261,25 +261,25 @@ class LeRobotAgent(Agent):
         cuda = [device for device in self._devices if device != "cpu"]
         with one_thread(), torch.inference_mode(), torch.random.fork_rng(devices=cuda):
             if self._together:
-                return self._act(self._policy, envs, observations)
+                return self._act(self._policy, robots, observations)
             actions = []
-            for slot, env, observation in zip(slots, envs, observations, strict=True):
+            for slot, robot, observation in zip(slots, robots, observations, strict=True):
                 policy, states = self._slots[slot]
                 for device, state in states.items():
                     _set_random(device, state)
-                actions.append(self._act(policy, [env], [observation]))
+                actions.append(self._act(policy, [robot], [observation]))
                 self._slots[slot] = policy, {device: _random(device) for device in states}
             return np.concatenate(actions)
 
     def _act(
-        self, policy: LeRobotPolicy, envs: Sequence[Env], observations: Sequence[Observation]
+        self, policy: LeRobotPolicy, robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Ask one policy for the actions of a batch, through LeRobot's pipeline."""
         import torch
         from lerobot.envs.utils import preprocess_observation
 
-        # Asked of the env: another arm may have become active since it was observed.
-        raw: dict[str, object] = {"agent_pos": np.stack([env.agent_pos() for env in envs])}
+        # Asked of the robot: another arm may have become active since it was observed.
+        raw: dict[str, object] = {"agent_pos": np.stack([robot.agent_pos() for robot in robots])}
         if self._encoder is None:
             raw["pixels"] = {
                 view: np.stack([frame_of(o, view) for o in observations]) for view in self.cameras
@@ -292,7 +292,7 @@ class LeRobotAgent(Agent):
             raw["environment_state"] = np.concatenate(views, axis=1)
         batch = {
             **preprocess_observation(raw),
-            "task": [self._text or env.task_description for env in envs],
+            "task": [self._text] * len(robots),
         }
         action = self._after(policy.select_action(self._before(batch)))
         return np.asarray(action.to("cpu", torch.float32).numpy(), np.float32)

@@ -156,7 +156,13 @@ def _in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
         return spec
     if "task" in env:
         raise InputError("env: the task is an option of its own; write `task:` beside `env:`.")
-    limit = {"max_steps": spec.config.max_steps} if spec.run.is_hierarchical else {}
+    limit: dict[str, JSON] = {}
+    if spec.run.is_hierarchical:
+        if "advance" in env:
+            raise InputError(
+                "env: advance follows from the termination of a hierarchical policy; leave it out."
+            )
+        limit = {"max_steps": spec.config.max_steps, "advance": spec.config.advance}
     config = from_mapping(TaskConfig, {**limit, **env, "task": spec.config.task}, "env")
     return dataclasses.replace(spec, run=dataclasses.replace(spec.run, env=config))
 
@@ -214,7 +220,7 @@ def _from_folder(folder: Path, task: str | None, weights: WeightsSource) -> Poli
     run = RunConfig(known.config, known.encoder, known.inputs.cameras, policy=known.policy)
     text = task_text(known.config.task)
     make = functools.partial(
-        lerobot_agent.LeRobotAgent, run.name, lerobot, known.inputs, weights, text
+        lerobot_agent.LeRobotAgent, run.name, lerobot, known.inputs, text, weights
     )
     about: dict[str, JSON] = {
         "checkpoint": {"policy_sha256": known.policy_sha256},
@@ -329,9 +335,11 @@ def hierarchical_policy(
         known["hlp"] = checkpoint.run
         high = functools.partial(policy_agent, folder, weights)
     envs = {
-        dataclasses.replace(run.env, task=names.SUTURE, max_steps=config.max_steps)
+        dataclasses.replace(
+            run.env, task=names.SUTURE, max_steps=config.max_steps, advance=config.advance
+        )
         for run in known.values()
-    } or {TaskConfig(names.SUTURE, max_steps=config.max_steps)}
+    } or {TaskConfig(names.SUTURE, max_steps=config.max_steps, advance=config.advance)}
     if len(envs) > 1:
         raise InputError(
             "The policies were trained in different scenes or with different steps; "

@@ -12,7 +12,7 @@ from surgicai_vision.evaluation.storage import MARKER, read_rows
 
 POLICY = (
     "hlp: order\ngrasp: expert\nplace: zero\ninsert: expert\nhandoff: random\npullout: expert\n"
-    "max_steps: 520\n"
+    "termination: privileged\nmax_steps: 520\n"
 )
 STARTS = ["--episodes", "2", "--workers", "1", "--json"]
 

@@ -14,17 +14,14 @@ from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import ExpertAgent, PolicyAgent
-from surgicai_vision.evaluation.hierarchical import (
-    PATIENCE,
-    HierarchicalAgent,
-    HierarchicalConfig,
-)
+from surgicai_vision.evaluation.hierarchical import HierarchicalAgent, HierarchicalConfig
 from surgicai_vision.evaluation.metrics import summary
-from surgicai_vision.evaluation.policy_spec import hierarchical_policy
+from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.training.run_config import TERMINATIONS
 
 EXPERTS = dict.fromkeys(names.SUBTASKS, "expert")
+PRIVILEGED = {**EXPERTS, "termination": "privileged"}
 
 
 class Env:
@@ -65,15 +62,42 @@ class Constant(Agent):
         self.restarted.append(slot)
 
 
-def agent(classes: list[int], **changes: object) -> HierarchicalAgent:
+class Saying:
+    """A high-level policy that says `classes` in turn, each with a probability of `sure`."""
+
+    cameras = ()
+    image_size = 224
+    privileged = False
+
+    def __init__(self, classes: list[int], sure: float = 0.9):
+        self.said = iter(classes)
+        self.logits = np.full((5, 5), np.log((1 - sure) / 4))
+        np.fill_diagonal(self.logits, np.log(sure))
+
+    def share(self, features):
+        pass
+
+    def answer(self, robots, observations):
+        logits = self.logits[[next(self.said) for _ in robots]]
+        progress = np.full((len(robots), 1), 9.0)  # beside the logits, and none of them
+        return np.concatenate([logits, progress], axis=1).astype(np.float32)
+
+
+def agent(classes: list[int], sure: float = 0.9, **changes: object) -> HierarchicalAgent:
     """Return a policy whose high level says `classes` in turn and whose low level its index."""
     made = HierarchicalAgent(
-        HierarchicalConfig("order", **{**EXPERTS, **changes}), [ExpertAgent] * 5
+        HierarchicalConfig("hlp", **{**PRIVILEGED, **changes}),
+        [ExpertAgent] * 5,
+        lambda: Saying(classes, sure),
     )
-    said = iter(classes)
-    made._high = SimpleNamespace(answer=lambda envs, _: np.eye(5)[[next(said) for _ in envs]])
     made._low = [Constant(index / 10) for index in range(5)]
     return made
+
+
+def learned(classes: list[int], sure: float = 0.9, **changes: object) -> HierarchicalAgent:
+    """Return the same with learned ends that ask in every step unless told otherwise."""
+    how = {"termination": "learned", "decide_every": 1, "patience": 1, **changes}
+    return agent(classes, sure, **how)
 
 
 def roll(actor: HierarchicalAgent, env: Env, steps: int) -> list[int]:
@@ -97,14 +121,15 @@ def test_a_grasp_may_end_sooner_than_the_env_ends_it_and_nothing_else_may() -> N
     env = Env(10)
     acted = roll(agent([0, 1, 2], grasp_hold=3), env, 17)
     assert acted == [0] * 5 + [1] * 10 + [2] * 2 and env.begun == [1]
-    learned = agent([0] * 9, grasp_hold=3)
-    object.__setattr__(learned.config, "termination", "learned")
-    assert roll(learned, Env(10), 8) == [0] * 8, (
+    assert roll(learned([0] * 9, grasp_hold=3), Env(10), 8) == [0] * 8, (
         "a learned termination asks the high-level policy alone"
     )
     for wrong in (0, 16):
         with pytest.raises(InputError, match="grasp_hold is"):
-            HierarchicalConfig("order", **EXPERTS, grasp_hold=wrong)
+            HierarchicalConfig("hlp", **EXPERTS, grasp_hold=wrong)
+    for wrong in (-0.1, 1.0):
+        with pytest.raises(InputError, match="confidence is"):
+            HierarchicalConfig("hlp", **EXPERTS, confidence=wrong)
 
 
 def test_a_choice_moves_its_own_arm() -> None:
@@ -124,17 +149,35 @@ def test_a_policy_that_plans_ahead_forgets_its_plan_when_its_subtask_begins() ->
     assert [low.restarted for low in actor._low] == [[0], [0], [0], [], []]
 
 
-def test_learned_termination_waits_for_the_high_level_policy() -> None:
-    actor, env = agent([0] * 4 + [1] * 3 + [0] + [1] * 20), Env(2)
-    object.__setattr__(actor.config, "termination", "learned")
-    acted = roll(actor, env, 8 + PATIENCE + 2)
-    assert acted == [0] * (8 + PATIENCE - 1) + [1] * 3, (
-        "the env's own success must not end a subtask"
-    )
+def test_a_learned_end_waits_until_the_same_subtask_was_named_often_enough_in_a_row() -> None:
+    said = [0] * 4 + [1] * 3 + [0] + [1, 1, 1, 2] + [1] * 20
+    acted = roll(learned(said, patience=5), Env(2), 20)
+    assert acted == [0] * 16 + [1] * 4, "the env's own success must not end a subtask"
+
+
+def test_a_learned_end_waits_for_a_sure_high_level_policy() -> None:
+    said = [0, 1, 1, 1, 1]
+    assert roll(learned(said, sure=0.7, confidence=0.75), Env(2), 5) == [0] * 5
+    assert roll(learned(said, sure=0.7, confidence=0.65), Env(2), 5) == [0, 1, 1, 1, 1]
+
+
+def test_the_high_level_policy_is_asked_every_so_many_steps() -> None:
+    actor = learned([0, 1, 1, 1], decide_every=4, patience=2)
+    assert roll(actor, Env(2), 13) == [0] * 8 + [1] * 5
+    assert list(actor._high.said) == [], "at steps 0, 4, 8, and 4 after the decision there"
+
+
+def test_a_learned_subtask_that_took_all_its_steps_may_begin_anew() -> None:
+    actor = learned([0, 0, 1, 2], sure=0.3, steps=3, decide_every=200)
+    assert roll(actor, Env(99), 12) == [0] * 6 + [1] * 3 + [2] * 3
+    assert [low.restarted for low in actor._low] == [[0, 0], [0], [0], [], []]
 
 
 def test_experts_in_their_order_sew_and_count_their_stages() -> None:
-    made = hierarchical_policy(HierarchicalConfig("order", **EXPERTS, max_steps=1000, grasp_hold=5))
+    made = hierarchical_policy(
+        HierarchicalConfig("order", **PRIVILEGED, max_steps=1000, grasp_hold=5)
+    )
+    assert made.config.advance == "success" and made.make_agent().privileged
     assert made.config.task == "suture"
     row = evaluate(made.make_agent, made.config, [names.TEST_SEED], workers=1)[0].row
     assert row.success and row.stages == 5, row
@@ -171,6 +214,19 @@ def test_trained_policies_act_together_in_any_batch(tmp_path: Path) -> None:
             for batch in (1, 2)
         ]
         assert repr(rows[0]) == repr(rows[1]) and rows[0][0].steps == 12  # NaN is unequal to itself
+        assert made.config.advance == {"learned": "told", "privileged": "success"}[termination]
+        assert made.make_agent().privileged == (termination == "privileged")
+    spec = open_policy(written(tmp_path, hlp, low), env={"reward": "dense"})
+    assert (spec.config.advance, spec.config.reward) == ("told", "dense")
+    with pytest.raises(InputError, match="follows from the termination"):
+        open_policy(written(tmp_path, hlp, low), env={"advance": "success"})
+
+
+def written(folder: Path, hlp: str, low: dict[str, str]) -> Path:
+    """Write the file of a hierarchical policy that says nothing of its ends."""
+    path = folder / "hierarchical.yaml"
+    path.write_text(f"hlp: {hlp}\n" + "".join(f"{name}: {low[name]}\n" for name in low))
+    return path
 
 
 def test_low_level_policies_share_features() -> None:
@@ -203,15 +259,15 @@ def test_wrong_hierarchical_policies_are_refused(
         checkpoint(tmp_path / "hlp", "suture", "hlp"),
     )
     with pytest.raises(InputError, match="not for 'place'"):
-        hierarchical_policy(HierarchicalConfig("order", **{**EXPERTS, "place": grasp}))
+        hierarchical_policy(HierarchicalConfig("order", **{**PRIVILEGED, "place": grasp}))
     with pytest.raises(InputError, match="takes an 'hlp'"):
         hierarchical_policy(HierarchicalConfig(grasp, **EXPERTS))
     with pytest.raises(InputError, match="does not act"):
-        hierarchical_policy(HierarchicalConfig("order", **{**EXPERTS, "grasp": hlp}))
+        hierarchical_policy(HierarchicalConfig("order", **{**PRIVILEGED, "grasp": hlp}))
     with pytest.raises(BadFile, match="not a checkpoint"):
         hierarchical_policy(HierarchicalConfig(str(tmp_path), **EXPERTS))
     with pytest.raises(InputError, match="needs a high-level policy"):
-        HierarchicalConfig("order", **EXPERTS, termination="learned")
+        HierarchicalConfig("order", **EXPERTS)
     with pytest.raises(UnknownName, match="termination"):
         from_mapping(HierarchicalConfig, {"hlp": "order", **EXPERTS, "terminaton": "learned"})
     (tmp_path / "hierarchical.yaml").write_text("hlp: order\ngrasp: expert\n")

@@ -507,6 +507,7 @@ def test_act_trains_beside_depth_and_is_evaluated(dataset: Path, tmp_path: Path,
         ]
         assert said(rows[0]) == said(rows[1])
     low = dict.fromkeys(names.SUBTASKS, "zero") | {open_dataset(dataset).task: str(out)}
+    low["termination"] = "privileged"
     made = hierarchical_policy(HierarchicalConfig("order", **low, steps=4, max_steps=10))
     assert made.run.views == ("back",) and made.config.task == "suture"
     rows = [

@@ -100,6 +100,8 @@ def test_an_evaluation_of_another_version_is_refused(tmp_path: Path) -> None:
 def test_a_file_names_no_code(tmp_path: Path) -> None:
     low = dict.fromkeys(names.SUBTASKS, "expert") | {"insert": "test_policy_spec:Still"}
     path = tmp_path / "hierarchical.yaml"
-    path.write_text("hlp: order\n" + "".join(f"{name}: {low[name]}\n" for name in low))
+    path.write_text(
+        "hlp: order\ntermination: privileged\n" + "".join(f"{name}: {low[name]}\n" for name in low)
+    )
     with pytest.raises(InputError, match=r"insert: test_policy_spec:Still names code"):
         open_policy(path)

@@ -19,9 +19,9 @@ from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
-    Env,
     FeatureTable,
     Observation,
+    Robot,
     frame_of,
 )
 
@@ -117,17 +117,18 @@ class CorruptedAgent(Agent):
         self.cameras = agent.cameras
         self.image_size = agent.image_size
         self.depth = agent.depth
+        self.privileged = agent.privileged
         self._agent = agent
         self._change = change
         self._strength = strength
         self._seeds: dict[int, int] = {}
         self._steps: dict[int, int] = {}
 
-    def reset(self, slot: int, env: Env, seed: int) -> None:
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Count the slot's steps from 0."""
         self._seeds[slot] = seed
         self._steps[slot] = 0
-        self._agent.reset(slot, env, seed)
+        self._agent.reset(slot, robot, seed)
 
     def restart(self, slot: int) -> None:
         """Tell the agent behind; the slot's steps count on."""
@@ -138,7 +139,7 @@ class CorruptedAgent(Agent):
         self._agent.share(features)
 
     def act(
-        self, slots: Sequence[int], envs: Sequence[Env], observations: Sequence[Observation]
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
         """Return the agent's actions (n, 7) on what it sees."""
         seen = [
@@ -147,7 +148,7 @@ class CorruptedAgent(Agent):
         ]
         for slot in slots:
             self._steps[slot] += 1
-        return self._agent.act(slots, envs, seen)
+        return self._agent.act(slots, robots, seen)
 
     def _seen(self, slot: int, observation: Observation) -> Observation:
         changed = {}
