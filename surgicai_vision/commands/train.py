@@ -26,6 +26,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
+from surgicai_vision.training.checkpoint import Checkpoint, read_checkpoint
 from surgicai_vision.training.run_config import RunConfig, with_epochs
 
 if TYPE_CHECKING:
@@ -152,9 +153,23 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             log=log,
         )
     console.say(f"checkpoint: {out}")
+    _tell_errors(read_checkpoint(out), console)
     if run.policy == "bc":
         console.say(f"next: surgicai-vision evaluate {out}")
     return {"checkpoint": str(out)}
+
+
+def _tell_errors(checkpoint: Checkpoint, console: Console) -> None:
+    """Say how a high-level policy did on the episodes held out."""
+    errors = checkpoint.stage_errors
+    if errors is None:
+        return
+    console.say(
+        f"held-out frames: {errors.right} of {errors.frames} subtasks named rightly, calibration "
+        f"error {errors.calibration_error:.3f}"
+    )
+    if errors.progress_error is not None:
+        console.say(f"held-out frames: mean error of the progress {errors.progress_error:.3f}")
 
 
 def _views(options: Options, encoder: str | None) -> tuple[str, ...]:

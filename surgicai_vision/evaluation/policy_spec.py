@@ -323,6 +323,7 @@ def hierarchical_policy(
         low[subtask] = spec.make_agent
         if spec.run.is_trained:
             known[subtask] = spec.run
+    about: dict[str, JSON] = {"hierarchical": to_mapping(config)}
     high: functools.partial[PolicyAgent] | None = None
     if config.hlp != ORDER:
         folder = released.resolve(config.hlp)
@@ -332,6 +333,11 @@ def hierarchical_policy(
                 f"{config.hlp} is '{checkpoint.policy}' of '{checkpoint.task.task}'; "
                 "hlp: takes an 'hlp' of 'suture'."
             )
+        if checkpoint.stage_errors is not None:
+            about["high_level"] = {
+                "policy_sha256": checkpoint.policy_sha256,
+                "stage_errors": to_mapping(checkpoint.stage_errors),
+            }
         known["hlp"] = checkpoint.run
         high = functools.partial(policy_agent, folder, weights)
     envs = {
@@ -357,4 +363,4 @@ def hierarchical_policy(
         expert_swap=expert_swap,
     )
     make = functools.partial(HierarchicalAgent, config, tuple(low.values()), high)
-    return PolicySpec(run, make, {"hierarchical": to_mapping(config)})
+    return PolicySpec(run, make, about)

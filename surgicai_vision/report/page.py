@@ -6,11 +6,13 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
+from surgicai_vision.core import names
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.report import charts, curves, paper, sections, text
 from surgicai_vision.report.episodes import group_details, letters
 from surgicai_vision.report.filmstrips import Reel
 from surgicai_vision.report.groups import Group, as_trained, best_trained, of_task
+from surgicai_vision.report.high_level import high_level_policies
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.probes import probes
 from surgicai_vision.report.reader import Collected
@@ -64,6 +66,8 @@ def numbers(
         "data_curves": curves.data_curves(groups),
         "robustness": curves.robustness_curves(groups),
         "procedure": curves.procedure(groups),
+        "high_level": high_level_policies(collected.results),
+        "subtasks": names.SUBTASKS,
         "paper_procedure": ", ".join(text.percent(rate) for rate in paper.HIERARCHICAL),
         "probes": probes(collected.probes, groups),
         "pairs": [sections.pair_row(at, pair) for at, pair in enumerate(pairs)],

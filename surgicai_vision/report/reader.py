@@ -72,6 +72,12 @@ class Result:
         return found
 
     @property
+    def high_level(self) -> dict[str, Any]:
+        """Hash and errors of the high-level policy that decided; empty where none was counted."""
+        found: dict[str, Any] = self.about.get("high_level") or {}
+        return found
+
+    @property
     def seed(self) -> int:
         """The training seed."""
         return self.run.seed

@@ -24,7 +24,6 @@ from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, 
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_json, write_bytes, write_json
 from surgicai_vision.training.run_config import RunConfig
-from surgicai_vision.training.stage_errors import StageErrors
 
 if TYPE_CHECKING:
     import torch
@@ -55,6 +54,34 @@ class EncoderRecord:
     pool: str
     fingerprint: str
     shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class StageErrors:
+    """What a high-level policy got right and wrong on held-out frames.
+
+    Attributes:
+        confusion: frames, by the subtask that was due (row) and the one it named (column), both in
+            the order of `names.SUBTASKS`.
+        calibration_error: mean distance between the probability of what it named and how often
+            that was right, in [0, 1] (expected calibration error).
+        progress_error: mean absolute error of the progress, in [0, 1]; None for a policy that says
+            none.
+    """
+
+    confusion: tuple[tuple[int, ...], ...]
+    calibration_error: float
+    progress_error: float | None = None
+
+    @property
+    def frames(self) -> int:
+        """Frames counted."""
+        return sum(map(sum, self.confusion))
+
+    @property
+    def right(self) -> int:
+        """Frames whose subtask it named."""
+        return sum(row[index] for index, row in enumerate(self.confusion))
 
 
 @dataclass(frozen=True)

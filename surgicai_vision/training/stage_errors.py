@@ -4,46 +4,17 @@
 and kept in its checkpoint; the report shows them.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
+from surgicai_vision.training.checkpoint import StageErrors
 
 CLASSES = len(names.SUBTASKS)
 BINS = 15
 """Bins of the calibration error, as in Guo et al., On calibration of modern neural networks, ICML
 2017 (arXiv:1706.04599), Section 3.
 """
-
-
-@dataclass(frozen=True)
-class StageErrors:
-    """What a high-level policy got right and wrong on held-out frames.
-
-    Attributes:
-        confusion: frames, by the subtask that was due (row) and the one it named (column), both in
-            the order of `names.SUBTASKS`.
-        calibration_error: mean distance between the probability of what it named and how often
-            that was right, in [0, 1] (expected calibration error).
-        progress_error: mean absolute error of the progress, in [0, 1]; None for a policy that says
-            none.
-    """
-
-    confusion: tuple[tuple[int, ...], ...]
-    calibration_error: float
-    progress_error: float | None = None
-
-    @property
-    def frames(self) -> int:
-        """Frames counted."""
-        return sum(map(sum, self.confusion))
-
-    @property
-    def right(self) -> int:
-        """Frames whose subtask it named."""
-        return sum(row[index] for index, row in enumerate(self.confusion))
 
 
 def stage_errors(answers: NDArray[np.float32], target: NDArray[np.float32]) -> StageErrors:

@@ -48,12 +48,13 @@ from surgicai_vision.training.checkpoint import (
     CARD,
     Checkpoint,
     EncoderRecord,
+    StageErrors,
     read_checkpoint,
     write_checkpoint,
 )
 from surgicai_vision.training.data import column, cuts, over_places, split
 from surgicai_vision.training.run_config import RunConfig
-from surgicai_vision.training.stage_errors import StageErrors, stage_errors
+from surgicai_vision.training.stage_errors import stage_errors
 from surgicai_vision.training.threads import one_thread
 
 REQUEST = "training.json"

@@ -1,5 +1,6 @@
 """Hierarchical policies: high-level policy, low-level policies, terminations, limits."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +19,12 @@ from surgicai_vision.evaluation.hierarchical import HierarchicalAgent, Hierarchi
 from surgicai_vision.evaluation.metrics import summary
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.rollout import evaluate
+from surgicai_vision.training.checkpoint import (
+    StageErrors,
+    read_checkpoint,
+    read_tensors,
+    write_checkpoint,
+)
 from surgicai_vision.training.run_config import TERMINATIONS
 
 EXPERTS = dict.fromkeys(names.SUBTASKS, "expert")
@@ -227,6 +234,18 @@ def written(folder: Path, hlp: str, low: dict[str, str]) -> Path:
     path = folder / "hierarchical.yaml"
     path.write_text(f"hlp: {hlp}\n" + "".join(f"{name}: {low[name]}\n" for name in low))
     return path
+
+
+def test_a_counted_high_level_policy_is_told_with_its_errors(tmp_path: Path) -> None:
+    folder = Path(checkpoint(tmp_path / "hlp", "suture", "hlp"))
+    config = HierarchicalConfig(str(folder), **EXPERTS)
+    assert "high_level" not in hierarchical_policy(config).about
+    plain = read_checkpoint(folder)
+    errors = StageErrors(((3, 0, 0, 0, 0),) * 5, 0.25)
+    write_checkpoint(folder, replace(plain, stage_errors=errors), read_tensors(plain))
+    told = hierarchical_policy(config).about["high_level"]
+    assert told["policy_sha256"] == plain.policy_sha256
+    assert from_mapping(StageErrors, told["stage_errors"]) == errors
 
 
 def test_low_level_policies_share_features() -> None:

@@ -15,6 +15,7 @@ from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.evaluation.metrics import EpisodeMetrics
 from surgicai_vision.evaluation.slot import Episode, Film
 from surgicai_vision.evaluation.storage import FORMAT, write_evaluation
+from surgicai_vision.training.checkpoint import StageErrors
 from surgicai_vision.training.run_config import RunConfig, Shift, Starts
 
 TASKS = ("grasp", "insert", "handoff")
@@ -84,6 +85,20 @@ CHECKPOINT = {
     "policy_sha256": "aa" * 32,
     "dataset": "fedcba9876543210" * 4,
 }
+
+
+STAGE_ERRORS = StageErrors(
+    confusion=(
+        (412, 9, 0, 0, 0),
+        (11, 301, 4, 0, 0),
+        (0, 7, 522, 13, 0),
+        (0, 0, 21, 377, 2),
+        (0, 0, 0, 3, 298),
+    ),
+    calibration_error=0.0123,
+    progress_error=0.0456,
+)
+"""Of the high-level policy of the whole procedure."""
 
 
 def run_of(task, encoder, views, seed, **more):
@@ -185,6 +200,11 @@ def add_curves(out):
             )
             for at, stage in enumerate(stages)
         ]
-        about = {"hierarchical": {"hlp": "order"}, "command": COMMAND, "provenance": MACHINE}
+        about = {
+            "hierarchical": {"hlp": "outputs/train/hlp"},
+            "high_level": {"policy_sha256": "bb" * 32, "stage_errors": to_mapping(STAGE_ERRORS)},
+            "command": COMMAND,
+            "provenance": MACHINE,
+        }
         write_evaluation(out / "hierarchical" / str(swap), made, run, about)
     return out

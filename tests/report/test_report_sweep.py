@@ -15,7 +15,16 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from matplotlib.figure import Figure
-from sweep_results import COMMAND, TASKS, add_curves, evaluation, run_of, store_run, write_sweep
+from sweep_results import (
+    COMMAND,
+    STAGE_ERRORS,
+    TASKS,
+    add_curves,
+    evaluation,
+    run_of,
+    store_run,
+    write_sweep,
+)
 from test_report import assert_stands_alone, painted_stage
 
 from surgicai_vision import report
@@ -363,6 +372,17 @@ def test_curves_procedure_and_probes_are_drawn_with_their_numbers(text, groups):
     assert re.search(r"handoff: -0\.\d\d over 9 pairs \(p [=&]", probes)
     assert probes.count('<svg class="curve"') == 1
     assert "(2.00–7.00; 9.50)" in probes
+
+
+def test_a_high_level_policy_stands_once_with_its_errors(text):
+    section = text.split('id="high-level"')[1].split('id="probes"')[0]
+    assert section.count('<table class="heat">') == 1, "three evaluations share it"
+    cells = re.findall(r"<b>(\d*)</b><small>(\d*)</small>", section)
+    counted = [int(frames or 0) for _, frames in cells]
+    assert counted == [count for row in STAGE_ERRORS.confusion for count in row]
+    assert cells[0] == ("98", "412") and cells[18] == ("94", "377")
+    assert "1910 of 1980 frames named rightly (96 %)" in section
+    assert "calibration error 0.012; mean absolute error of the progress 0.046" in section
 
 
 def test_a_shifted_policy_is_no_cell_of_the_tables(text, groups):
