@@ -40,8 +40,9 @@ class Options:
     Attributes:
         task: The task.
         episodes: Successful episodes to keep.
-        demonstrator: Who acts: expert; search, the expert without the grasp's goal; dmp, movement
-            primitives learned from --from.
+        demonstrator: Who acts: expert; search, the expert without the grasp's goal; recover, the
+            expert of the whole procedure that goes back to what was lost; dmp, movement primitives
+            learned from --from.
         from_: Demonstrations to learn from (--demonstrator dmp).
         demos_used: How many of them to learn from.
         seed: Seed of the first start; each episode takes the next.
@@ -49,6 +50,8 @@ class Options:
             labels stay the expert's.
         noise_from: Lowest such deviation: each episode draws its own between this and --noise.
         perturb_start_fraction: Share of episodes that start with a push that is not recorded.
+        upset_fraction: Share of episodes in which something goes wrong once: the needle is pushed,
+            or jaws open (docs/demos.md).
         learner: A checkpoint, or released:NAME, that acts until a step drawn at random; labels
             stay the expert's (DAgger).
         post_success_steps: Control steps that an episode goes on after its success.
@@ -67,6 +70,7 @@ class Options:
         float | None, FRACTION, Parameter(metavar="SIGMA"), default_text("--noise itself")
     ] = None
     perturb_start_fraction: Annotated[float, FRACTION] = 0.0
+    upset_fraction: Annotated[float, FRACTION] = 0.0
     learner: Annotated[Path | None, DIRECTORY] = None
     post_success_steps: Annotated[int, NOT_NEGATIVE] = 0
     workers: Annotated[int, COUNT] = folders.CORES
@@ -102,20 +106,29 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         out=out,
         demonstrator=options.demonstrator,
         seed=options.seed,
-        disturbance=Disturbance(options.noise, options.perturb_start_fraction, options.noise_from),
+        disturbance=Disturbance(
+            options.noise,
+            options.perturb_start_fraction,
+            options.noise_from,
+            options.upset_fraction,
+        ),
         post_success_steps=options.post_success_steps,
         demos=demos,
         learner=learner,
         context=context,
     )
     # A start that the demonstrator failed from is named in the marker and counts in the share.
-    tried = len(paths) + len(read_marker(out)["skipped"])
+    marker = read_marker(out)
+    tried = len(paths) + len(marker["skipped"])
     low, high = clopper_pearson(len(paths), tried)
     console.say(f"{len(paths)} demonstrations of {options.task}: {out}")
     console.say(
         f"{len(paths)}/{tried} starts succeeded (95 % interval {low:.0%} to {high:.0%})"
         + (f"; {out / MARKER} names the others." if tried > len(paths) else ".")
     )
+    upsets = marker.get("upsets", {})
+    for kind, count in sorted(upsets.items()):
+        console.say(f"upset '{kind}': {count['recovered']}/{count['episodes']} recovered")
     return {
         "task": options.task,
         "episodes": len(paths),
@@ -123,6 +136,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         "share": len(paths) / tried,
         "interval": [low, high],
         "demos": str(out),
+        **({"upsets": upsets} if options.upset_fraction else {}),
     }
 
 

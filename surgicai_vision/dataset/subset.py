@@ -77,7 +77,9 @@ def of_subtask(dataset: Dataset, subtask: str) -> "DatasetSubset":
     """Return a subtask's frames of a dataset of whole procedures, as a dataset of that subtask.
 
     The subtask is the task of its configuration, with the subtask's step limit; `frame_index` and
-    `timestamp` count from the subtask's beginning.
+    `timestamp` count from the beginning of each visit: a run of frames of one phase in one episode.
+    A procedure that went back to a subtask (`demos.recovery_expert`) visits it more than once, and
+    a policy that is asked again starts its clock anew.
 
     Raises:
         UnknownName: no subtask of that name.
@@ -96,6 +98,18 @@ def of_subtask(dataset: Dataset, subtask: str) -> "DatasetSubset":
     limit = TaskConfig(subtask).max_steps
     config = replace(dataset.config, task=subtask, max_steps=limit)
     return DatasetSubset(dataset, rows, {"subtask": subtask}, config=config, restart_time=True)
+
+
+def first_of_visit(rows: NDArray[np.int64], episode_index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return for every selected row the position of the first one of its visit, (N,) int64.
+
+    Args:
+        rows: (N,) int64, rising: which frames of the whole are selected.
+        episode_index: (N,) their episodes. A visit is a run of neighbouring rows of one episode.
+    """
+    begins = np.ones(len(rows), dtype=bool)
+    begins[1:] = (np.diff(rows) != 1) | (np.diff(episode_index) != 0)
+    return np.flatnonzero(begins)[np.cumsum(begins) - 1]
 
 
 @final
@@ -129,7 +143,8 @@ class DatasetSubset:
             selection: says in plain data which frames they are; part of the fingerprint.
             config: configuration of the task; the whole's by default.
             fps: frames per second; the whole's by default.
-            restart_time: let `frame_index` and `timestamp` begin anew in every episode.
+            restart_time: let `frame_index` and `timestamp` begin anew in every run of neighbouring
+                rows of one episode.
         """
         self._whole = whole
         self._selection = dict(selection)
@@ -162,7 +177,7 @@ class DatasetSubset:
         """Return every column that is no image, (N,) or (N, n), by its key."""
         columns = {key: values[self.rows] for key, values in self._whole.columns().items()}
         if self._restart_time:
-            first = np.searchsorted(self.episode_index, self.episode_index, side="left")
+            first = first_of_visit(self.rows, self.episode_index)
             for key in ("frame_index", "timestamp"):
                 columns[key] = np.subtract(columns[key], columns[key][first])
         return columns

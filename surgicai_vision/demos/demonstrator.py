@@ -30,6 +30,11 @@ class Demonstrator(ABC):
         """Return True if an episode goes on after its success, until its limit."""
         return False
 
+    @property
+    def gives_up(self) -> str:
+        """Return why the demonstrator knows no way on, or ""; the episode ends as a failure."""
+        return ""
+
     @abstractmethod
     def action(self) -> NDArray[np.float32]:
         """Return the action for the env's present state, (7,) in [-1, 1]."""
@@ -52,6 +57,7 @@ DEMONSTRATORS: Mapping[str, str] = MappingProxyType(
         "expert": "surgicai_vision.demos.expert:Expert",
         "dmp": "surgicai_vision.demos.dmp.controller:DmpController",
         "search": "surgicai_vision.demos.search_expert:SearchExpert",
+        "recover": "surgicai_vision.demos.recovery_expert:RecoveryExpert",
     }
 )
 """Name → "module:class", imported on first use."""

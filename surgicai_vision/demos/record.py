@@ -45,6 +45,7 @@ from surgicai_vision.demos.store import (
     write_demo,
     write_marker,
 )
+from surgicai_vision.envs.upset import check_upset_task
 
 if TYPE_CHECKING:
     from surgicai_vision.envs.base import SuturingEnv
@@ -90,6 +91,7 @@ def record_into(
     noise: float = 0.0,
     perturb_start_fraction: float = 0.0,
     noise_from: float | None = None,
+    upset_fraction: float = 0.0,
     post_success_steps: int = 0,
     demos: Sequence[str] = (),
     behaviour: BehaviourPolicy | None = None,
@@ -100,15 +102,14 @@ def record_into(
         make_demonstrator(demonstrator, env, demos),
         seed,
         demonstrator,
-        Disturbance(noise, perturb_start_fraction, noise_from),
+        Disturbance(noise, perturb_start_fraction, noise_from, upset_fraction),
         post_success_steps,
         behaviour,
     )
     if result.success:
         write_demo(folder, 0, result.demo)
-    write_json(
-        folder / "result.json", {"seed": seed, "success": result.success, "reason": result.reason}
-    )
+    told = {"seed": seed, "success": result.success, "reason": result.reason}
+    write_json(folder / "result.json", told | ({"upset": result.upset} if upset_fraction else {}))
 
 
 def record(
@@ -132,7 +133,7 @@ def record(
         out: folder to make; the same request continues it or finds it finished.
         demonstrator: a key of `DEMONSTRATORS`.
         seed: first seed; the following ones are taken in order.
-        disturbance: noise and perturbed starts.
+        disturbance: noise, perturbed starts and upsets.
         post_success_steps: control steps recorded after an episode's success.
         demos: files of the demonstrations that a demonstrator in `LEARNING_DEMONSTRATORS` learns
             from; their seeds are left out.
@@ -142,7 +143,7 @@ def record(
     Raises:
         InputError: fewer than one episode, a negative seed or post_success_steps, an unknown
             demonstrator, demonstrations for a demonstrator that learns from none, or none for one
-            that does.
+            that does; upsets in a task that has none.
         OutputExists: `out` holds something else.
         SurgicaiError: the demonstrator failed at too many seeds.
     """
@@ -153,6 +154,8 @@ def record(
             "they must be at least 1, 0 and 0."
         )
     _check_demos(demonstrator, demos)
+    if disturbance.upset_fraction:
+        check_upset_task(config.task)
     # What decides the result: a finished folder of the same request is left as it is.
     request = {
         "task": to_mapping(config),
@@ -173,11 +176,13 @@ def record(
     title = f"demos: {episodes} of {config.task}"
     with building(out) as (store, result), context.stage(title, "episodes") as progress:
         run_jobs = functools.partial(run, store=store, context=context)
-        kept, skipped = _run_seeds(request, demos, learner, run_jobs, progress)
+        kept, skipped, upsets = _run_seeds(request, demos, learner, run_jobs, progress)
         with whole_folder(result) as folder:
             for index, path in enumerate(kept):
                 shutil.copyfile(path, folder / f"episode_{index:06d}.safetensors")
             details = {"request": request, "skipped": skipped, "episodes": episodes}
+            if disturbance.upset_fraction:
+                details["upsets"] = upsets
             write_marker(folder, config.task, demonstrator, **details)
     return list_demos(out)
 
@@ -228,10 +233,16 @@ def _run_seeds(
     learner: Learner | None,
     run_jobs: Callable[..., list[Path]],
     progress: Progress,
-) -> tuple[list[Path], list[dict[str, Any]]]:
-    """Try seeds in order until enough succeeded; return the kept files and the skipped seeds."""
+) -> tuple[list[Path], list[dict[str, Any]], dict[str, dict[str, int]]]:
+    """Try seeds in order until enough succeeded.
+
+    Returns:
+        The kept files; the skipped seeds; and each kind of upset with how many episodes had it
+        (`episodes`) and how many of them succeeded (`recovered`).
+    """
     kept: list[Path] = []
     skipped: list[dict[str, Any]] = []
+    upsets: dict[str, dict[str, int]] = {}
     wanted = request["episodes"]
     inputs = tuple(request.get("demos", ()))
     shared = {
@@ -271,9 +282,13 @@ def _run_seeds(
             if result["success"]:
                 kept.append(folder / "episode_000000.safetensors")
             else:
-                skipped.append({"seed": result["seed"], "reason": result["reason"]})
+                skipped.append({key: result[key] for key in result if key != "success"})
+            if kind := result.get("upset"):
+                count = upsets.setdefault(kind, {"episodes": 0, "recovered": 0})
+                count["episodes"] += 1
+                count["recovered"] += result["success"]
         progress(len(kept), wanted, "episodes")
-    return kept, skipped
+    return kept, skipped, upsets
 
 
 def _report_all(

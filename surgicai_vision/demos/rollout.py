@@ -5,7 +5,8 @@
 With a `Disturbance` the demonstrator meets states off its own path: noise on what is executed,
 while the label stays its own answer (DART, Laskey et al. 2017), and starts that were perturbed
 before the recording begins. With a `BehaviourPolicy` these are states that a learner itself comes
-to (DAgger, Ross et al. 2011; `surgicai_vision.experiments.dagger`).
+to (DAgger, Ross et al. 2011; `surgicai_vision.experiments.dagger`). With upsets (`envs.upset`)
+something goes wrong once, and a demonstrator that can (`demos.recovery_expert`) goes back to it.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import code_version
 from surgicai_vision.demos.demonstrator import BehaviourPolicy, Demonstrator
 from surgicai_vision.demos.store import Demo
+from surgicai_vision.envs.upset import Upset, plan_upset
 
 if TYPE_CHECKING:
     from surgicai_vision.envs.base import Observation, SuturingEnv
@@ -40,11 +42,13 @@ class Disturbance:
             which is not recorded.
         noise_from: lowest deviation; each episode draws its own between this and `noise`. None
             takes `noise` throughout.
+        upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
     """
 
     noise: float = 0.0
     perturb_start_fraction: float = 0.0
     noise_from: float | None = None
+    upset_fraction: float = 0.0
 
     def __post_init__(self) -> None:
         if self.noise_from is not None and not 0.0 <= self.noise_from <= self.noise:
@@ -55,6 +59,10 @@ class Disturbance:
             raise InputError(
                 f"noise is {self.noise:g} and perturb_start_fraction "
                 f"{self.perturb_start_fraction:g}; each must be within 0 and 1."
+            )
+        if not 0.0 <= self.upset_fraction <= 1.0:
+            raise InputError(
+                f"upset_fraction is {self.upset_fraction:g}; it must be within 0 and 1."
             )
 
     def perturb_start(self, env: "SuturingEnv", rng: np.random.Generator) -> bool:
@@ -142,6 +150,10 @@ class EpisodeRecorder:
         self._rows.append((label, action, phase, reward, success, contact))
         return bool(terminated or self.truncated)
 
+    def restate(self) -> None:
+        """Take the env's present state for the last one: it was changed between two steps."""
+        self._states[-1] = self._env.get_state()
+
     def demo(self, with_executed: bool = False) -> Demo:
         """Return the episode as a demonstration, with the executed actions beside the labels."""
         labels, actions, phases, rewards, successes, contacts = zip(*self._rows, strict=True)
@@ -169,11 +181,13 @@ class Rollout:
         demo: what happened.
         success: whether it met the task.
         reason: why it is not kept; "" after a success.
+        upset: what went wrong, one of `envs.upset.KINDS`; "" where nothing did.
     """
 
     demo: Demo
     success: bool
     reason: str
+    upset: str = ""
 
 
 def rollout(
@@ -205,25 +219,34 @@ def rollout(
     if behaviour:
         behaviour.reset(env, seed, rng)
 
+    fraction = disturbance.upset_fraction
+    upset = Upset(env, plan_upset(seed, env.task, fraction) if fraction else None)
     recorder = EpisodeRecorder(env, seed, name)
     steps_left = env.config.max_steps if demonstrator.persists else post_success_steps
     ended = False
     succeeded = False
     while not ended:
+        phase = env.phase
+        is_pushed = upset.before_step()
         label = np.asarray(demonstrator.action(), dtype=np.float32)
+        if is_pushed or env.phase != phase:
+            recorder.restate()
+            observation = env.observe() if behaviour else None
         executed = None
         if behaviour and observation is not None:
             executed = behaviour.action(env, observation)
         if executed is None:
             executed = disturbance.disturb(label, deviation, rng) if deviation else label
-        recorder.step(executed, label)
+        recorder.step(upset.altered(executed), label)
         observation = recorder.observation
         steps_left -= succeeded
         succeeded = succeeded or recorder.success
         finished = succeeded and steps_left <= 0
         ended = finished or recorder.truncated or not recorder.is_physical
+        ended = ended or bool(demonstrator.gives_up)
 
-    demo = recorder.demo(with_executed=bool(disturbance.noise or behaviour))
+    demo = recorder.demo(with_executed=bool(disturbance.noise or behaviour or fraction))
     if not recorder.is_physical:
-        return Rollout(demo, False, "physics error")
-    return Rollout(demo, succeeded, "" if succeeded else f"no success in {len(demo)} steps")
+        return Rollout(demo, False, "physics error", upset.kind)
+    reason = demonstrator.gives_up or f"no success in {len(demo)} steps"
+    return Rollout(demo, succeeded, "" if succeeded else reason, upset.kind)
