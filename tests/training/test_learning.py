@@ -17,7 +17,7 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, UnknownName, check_name
-from surgicai_vision.dataset.subset import of_subtask, with_frame_stride
+from surgicai_vision.dataset.subset import first_of_visit, of_subtask, with_frame_stride
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies, visits
 from surgicai_vision.training.checkpoint import read_checkpoint
@@ -192,6 +192,23 @@ def test_high_level_policy_learns_the_phase(
     kinds = [type(layer).__name__ for layer in policy.network.layers]
     assert kinds == ["BatchNorm1d", "Linear", "ReLU"] * 3 + ["Linear"]
     assert "does not act" in fails(capsys, "evaluate", folder)
+
+
+def test_a_subtasks_time_counts_from_the_beginning_of_each_visit() -> None:
+    """Of an episode in which a subtask is visited twice, and of two that end and begin with it."""
+    rows = np.array([3, 4, 5, 9, 10, 20, 21, 22])
+    episode = np.array([0, 0, 0, 0, 0, 0, 1, 1])
+    assert first_of_visit(rows, episode).tolist() == [0, 0, 0, 3, 3, 5, 6, 6]
+    whole = Dataset()
+    phase = whole.columns()[names.PHASE]
+    once = of_subtask(whole, "insert").columns()
+    # Visited once, it is what counting from the episode's first frame of the subtask gives.
+    kept = np.flatnonzero(phase == 2)
+    index = whole.columns()["frame_index"][kept]
+    first = np.searchsorted(whole.episode_index[kept], whole.episode_index[kept], side="left")
+    np.testing.assert_array_equal(once["frame_index"], index - index[first])
+    seconds = whole.columns()["timestamp"][kept]
+    np.testing.assert_array_equal(once["timestamp"], seconds - seconds[first])
 
 
 def test_a_subtask_of_whole_procedures_is_a_dataset_of_its_own(
