@@ -109,7 +109,8 @@ def first_of_visit(rows: NDArray[np.int64], episode_index: NDArray[np.int64]) ->
     """
     begins = np.ones(len(rows), dtype=bool)
     begins[1:] = (np.diff(rows) != 1) | (np.diff(episode_index) != 0)
-    return np.flatnonzero(begins)[np.cumsum(begins) - 1]
+    first: NDArray[np.int64] = np.flatnonzero(begins)[np.cumsum(begins) - 1]
+    return first
 
 
 @final

@@ -84,7 +84,8 @@ class RecoveryExpert(Demonstrator):
         env: a whole procedure.
 
     Raises:
-        InputError: an env of a single subtask, which has nothing to go back to.
+        InputError: an env of a single subtask, which has nothing to go back to, or one that goes on
+            only where it is told.
     """
 
     def __init__(self, env: SuturingEnv):
@@ -92,6 +93,11 @@ class RecoveryExpert(Demonstrator):
             raise InputError(
                 f"Demonstrator 'recover' goes back to earlier subtasks; '{env.task}' has none. "
                 f"Give --task {names.SUTURE}, or demonstrator expert."
+            )
+        if env.config.advance != "success":
+            raise InputError(
+                f"Demonstrator 'recover' goes on where the env does; advance is "
+                f"'{env.config.advance}'. Leave env.advance out."
             )
         self._env = env
         self._expert = Expert(env)
