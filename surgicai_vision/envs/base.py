@@ -18,7 +18,7 @@
   worth 0 would teach to drop it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from typing import TYPE_CHECKING, ClassVar, cast
 
@@ -34,7 +34,7 @@ from surgicai_vision.core.tasks import task_text
 from surgicai_vision.envs import hole_crossing, observation, poses, randomisation
 from surgicai_vision.envs.calibration import Calibration
 from surgicai_vision.envs.camera_rig import Images
-from surgicai_vision.envs.control import StepSize
+from surgicai_vision.envs.control import Command, StepSize
 from surgicai_vision.envs.feasibility import refuse_impossible
 from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.observation import ObservationConfig
@@ -170,9 +170,27 @@ class SuturingEnv(gymnasium.Env):
     ) -> tuple[Observation, float, bool, bool, Info]:
         """Take one control step of 20 ms."""
         simulation = self.simulation
+        return self._after(
+            simulation.advance(self.subtask.arm, self._checked(action), self._step_size)
+        )
+
+    def step_commands(
+        self, commands: Mapping[str, Command], halfway: Callable[[], None] | None = None
+    ) -> tuple[Observation, float, bool, bool, Info]:
+        """Take one control step of 20 ms under absolute commands of any arms.
+
+        Args:
+            commands: arm → its new command; an arm left out keeps its own.
+            halfway: called after half of the step (`Simulation.advance_to`).
+        """
+        return self._after(self.simulation.advance_to(commands, halfway))
+
+    def _after(self, is_physical: bool) -> tuple[Observation, float, bool, bool, Info]:
+        """Judge and observe the state that a control step has led to."""
+        simulation = self.simulation
         state = simulation.task_state
         subtask = self.subtask
-        if not simulation.advance(subtask.arm, self._checked(action), self._step_size):
+        if not is_physical:
             state.has_diverged = True
         # Between these reads nothing moves, so each pose is read once.
         simulation.keep_reads()

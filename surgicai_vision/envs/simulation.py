@@ -15,6 +15,7 @@ clock shows it.
 import copy
 import math
 import struct
+from collections.abc import Callable, Mapping
 from math import isfinite
 
 import mujoco
@@ -247,28 +248,62 @@ class Simulation:
         """
         if self.latency:
             action = self._delayed(action)
-        data = self.data
+        finite = self._have_finite_servos()
+        present = self.within_reach(arm)
+        self.command(arm, control.follow(present, action, step, self.bases[arm], self._instrument))
+        if self.task_state.release_steps > 0:
+            self._let_go()
+        return self._run() and finite
+
+    def advance_to(
+        self, commands: Mapping[str, Command], halfway: Callable[[], None] | None = None
+    ) -> bool:
+        """Take one control step under commands of any arms, as a robot's interface gives them.
+
+        Nothing is done by itself: no action waits, and PSM2 lets go only where it is told to.
+
+        Args:
+            commands: arm → its new command; an arm left out keeps its own.
+            halfway: called after half of the control step, when joints may be read; poses of bodies
+                are those of a physics step before.
+
+        Returns:
+            As `advance`.
+        """
+        finite = self._have_finite_servos()
+        for arm, command in commands.items():
+            self.command(arm, command)
+        return self._run(halfway) and finite
+
+    def _have_finite_servos(self) -> bool:
+        """Return whether all servos' set points are finite; else give them their commands again."""
         ctrl = self._ctrl
         finite = isfinite(ctrl.dot(ctrl))
         if not finite:
             for name, command in self.commands.items():
                 self.command(name, command)
-        present = self._within_reach(arm)
-        self.command(arm, control.follow(present, action, step, self.bases[arm], self._instrument))
-        if self.task_state.release_steps > 0:
-            self._let_go()
+        return finite
+
+    def _run(self, halfway: Callable[[], None] | None = None) -> bool:
+        """Let the physics run for one control step; return False if it diverged."""
+        data = self.data
         due = data.time + self._control_time
         mujoco.mj_step2(self.model, data)
-        mujoco.mj_step(self.model, data, SUBSTEPS - 1)
+        if halfway is None:
+            mujoco.mj_step(self.model, data, SUBSTEPS - 1)
+        else:
+            mujoco.mj_step(self.model, data, SUBSTEPS // 2 - 1)
+            halfway()
+            mujoco.mj_step(self.model, data, SUBSTEPS // 2)
         if self.tissue:
             self.tissue.update()
         mujoco.mj_step1(self.model, data)
         self._read = None
         if self._welds:
             self._attach(self._welds)
-        return finite and abs(data.time - due) < 1e-9
+        return bool(abs(data.time - due) < 1e-9)
 
-    def _within_reach(self, arm: str) -> Command:
+    def within_reach(self, arm: str) -> Command:
         """Return an arm's command, drawn back to where its servos can still tell the difference.
 
         A servo at its torque limit does not follow; without this the command of an arm that presses

@@ -1,0 +1,17 @@
+"""`robot`: commands that speak CRTK, one module each."""
+
+from types import MappingProxyType
+
+from cyclopts import App
+
+from surgicai_vision.commands import register
+
+COMMANDS = MappingProxyType(
+    {
+        "serve": "Serve the simulation as a dVRK that speaks CRTK over ROS 2.",
+    }
+)
+"""Command → what it does, in one line."""
+
+app = App(name="robot")
+register(app, COMMANDS, __name__)

@@ -1,0 +1,39 @@
+"""What the commands of `robot` share: how they reach the network."""
+
+import os
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from surgicai_vision.commands.options import within
+from surgicai_vision.core.errors import InputError
+
+TRANSPORT = Parameter(choices=("cyclonedds",))
+LAST_DOMAIN = 232
+INTERFACE = Parameter(
+    help="Network interface that is used and heard, and no other; lo is this machine alone.",
+    metavar="NAME",
+)
+Domain = Annotated[
+    int | None,
+    Parameter(
+        help="ROS's domain number, 0 to 232.",
+        metavar="N",
+        show_default=lambda _: "ROS_DOMAIN_ID, else 0",
+    ),
+    within(0, LAST_DOMAIN),
+]
+
+
+def ros_domain(given: int | None) -> int:
+    """Return the domain number that was given, else that of ROS's own variable, else 0.
+
+    Raises:
+        InputError: the variable holds no domain number.
+    """
+    if given is not None:
+        return given
+    text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
+    if not text.isdecimal() or int(text) > LAST_DOMAIN:
+        raise InputError(f"ROS_DOMAIN_ID is '{text}'; allowed: 0 to {LAST_DOMAIN}.")
+    return int(text)

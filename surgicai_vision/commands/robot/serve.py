@@ -1,0 +1,123 @@
+"""`robot serve`: the simulation as a dVRK that speaks CRTK."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from cyclopts import App, Parameter, validators
+
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.options import (
+    FILE_ONLY,
+    IMAGE_SIZE,
+    NOT_NEGATIVE,
+    TASK,
+    VIEWS,
+    default_text,
+    task_config,
+)
+from surgicai_vision.commands.robot.network import INTERFACE, TRANSPORT, Domain, ros_domain
+from surgicai_vision.core import names
+from surgicai_vision.core.processes import Terminated
+
+app = App(
+    name="serve",
+    help_epilogue="""\
+example:
+  surgicai-vision robot serve --task suture --view endo_left,endo_right
+
+It serves until Ctrl-C. docs/robot.md lists the topics; the extra `ros` is needed.""",
+)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `robot serve`.
+
+    Attributes:
+        task: The task whose scene and starts are served.
+        seed: Seed of the first start; a client asks for others on /simulation/reset.
+        clock: real, or stepped by the client on /simulation/step.
+        view: Views whose images are published.
+        size: Height and width of images [px].
+        image_rate: Images of each view a second at most, in real time [Hz].
+        compressed: Publish JPEG files besides the raw images.
+        truth: Publish the needle's pose and the subtask under way, which no robot knows.
+        transport: What carries the messages.
+        interface: See above.
+        domain: See above.
+        seconds: End after so many simulated seconds.
+    """
+
+    task: Annotated[str, TASK] = names.SUTURE
+    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    clock: Annotated[str, Parameter(choices=("real", "stepped"))] = "real"
+    view: Annotated[tuple[str, ...], VIEWS] = ()
+    size: Annotated[int, IMAGE_SIZE] = 224
+    image_rate: Annotated[
+        float, Parameter(validator=validators.Number(gt=0, lte=100), metavar="HZ")
+    ] = 25.0
+    compressed: bool = False
+    truth: bool = False
+    transport: Annotated[str, TRANSPORT] = "cyclonedds"
+    interface: Annotated[str, INTERFACE] = "lo"
+    domain: Domain = None
+    seconds: Annotated[
+        float | None, Parameter(validator=validators.Number(gt=0)), default_text("until Ctrl-C")
+    ] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+
+
+@app.default
+def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
+    """Serve the simulation until it is interrupted, and print how well it kept time."""
+    import numpy as np
+
+    from surgicai_vision import envs
+    from surgicai_vision.robot.server import ServeConfig, Server
+    from surgicai_vision.robot.simulated import SimulatedRobot
+    from surgicai_vision.robot.transport import LOOPBACK, open_transport
+
+    domain = ros_domain(options.domain)
+    config = ServeConfig(
+        options.clock,
+        options.view,
+        (options.size, options.size),
+        options.image_rate,
+        options.compressed,
+        options.truth,
+    )
+    with open_transport(options.transport, options.interface, domain) as transport:
+        env = envs.make(task_config(options.task, options.env))
+        robot = SimulatedRobot(env)
+        robot.reset(options.seed)
+        limit = None if options.seconds is None else round(options.seconds * names.FPS)
+        with Server(robot, transport, config) as server:
+            reach = (
+                "this machine alone"
+                if options.interface == LOOPBACK
+                else f"everyone on {options.interface} may move the arms"
+            )
+            console.note(
+                f"serving {options.task} as PSM1, PSM2 and ECM: domain {domain}, {reach}; "
+                "Ctrl-C ends it"
+            )
+            try:
+                server.run(lambda: limit is not None and robot.steps >= limit)
+            except KeyboardInterrupt as interrupt:
+                if isinstance(interrupt, Terminated):
+                    raise
+            late = 1e3 * np.array(server.lateness or [0.0])
+        env.close()
+    console.say(
+        f"{robot.steps} control steps; they began late by {np.median(late):.2f} ms in the median, "
+        f"{np.percentile(late, 99):.2f} ms at the 99th percentile."
+    )
+    return {
+        "task": options.task,
+        "domain": domain,
+        "interface": options.interface,
+        "steps": robot.steps,
+        "late_ms_median": float(np.median(late)),
+        "late_ms_p99": float(np.percentile(late, 99)),
+    }

@@ -1,0 +1,222 @@
+"""Client: a dVRK as its topics show it, and what is sent to it.
+
+    client = Client(transport, ClientConfig(views=("front",)))
+    client.update()                      # take what has come
+    client.age("/PSM1/measured_js")      # how old the newest is [s]
+    client.send("/PSM1/servo_cp", pose)
+    client.step(["/PSM1/servo_cp"])      # only where the simulation's clock is ours
+
+The topics are a dVRK's (`robot.topics`); `ClientConfig` renames them where a robot's differ. What
+is sent has its own stamp; what is received is as old as its arrival here, since clocks differ.
+"""
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import final
+
+from surgicai_vision.core.errors import InputError, SurgicaiError, UnknownName
+from surgicai_vision.robot import topics
+from surgicai_vision.robot.messages import Header, Message, String, StringStamped
+from surgicai_vision.robot.simulated import PSM_NAMES
+from surgicai_vision.robot.topics import Topic
+from surgicai_vision.robot.transport import Inbox, Publish, Transport
+
+STEP_S = 10.0
+"""Time in which a served simulation must answer a request [s]; images may be slow to render."""
+POLL_S = 0.005
+CONNECT_S = 20.0
+"""Time in which a robot must be found [s]."""
+ASK_AGAIN_S = 0.5
+_DUE = ("measured_js", "setpoint_js", "measured_cp", "setpoint_cp", "image_raw", "compressed")
+"""Last part of the topics on which something comes all the time."""
+
+
+@dataclass(frozen=True)
+class ClientConfig:
+    """What a client hears and how a robot's topics are called.
+
+    Attributes:
+        arms: arms it hears and moves.
+        views: views whose images it hears.
+        is_compressed: hear the compressed images, not the raw ones.
+        is_simulated: also use the topics that only a served simulation has.
+        renamed: topic of `robot.topics` → the robot's own name of it.
+    """
+
+    arms: tuple[str, ...] = tuple(PSM_NAMES)
+    views: tuple[str, ...] = ()
+    is_compressed: bool = False
+    is_simulated: bool = False
+    renamed: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A message and when it arrived here [s, monotonic]."""
+
+    message: Message
+    arrived: float
+
+
+@final
+class Client:
+    """A dVRK as its topics show it; see the module's docstring.
+
+    Args:
+        transport: carries the messages.
+        config: what is heard.
+    """
+
+    def __init__(self, transport: Transport, config: ClientConfig):
+        self._transport = transport
+        self._inboxes: dict[str, Inbox] = {}
+        self._publishers: dict[str, Publish] = {}
+        self._newest: dict[str, Heard] = {}
+        self._last_stamp = 0
+        heard: list[Topic] = []
+        said: list[Topic] = []
+        for arm in config.arms:
+            heard += topics.psm_topics(arm, heard=False).values()
+            said += topics.psm_topics(arm, heard=True).values()
+        image_of = topics.compressed_topic if config.is_compressed else topics.image_topic
+        heard += [image_of(view) for view in config.views]
+        if config.is_simulated:
+            heard += [topics.STEPPED, topics.JUDGEMENT]
+            said += [topics.STEP, topics.RESET, topics.ENTER]
+        known = {topic.name for topic in (*heard, *said)}
+        for name in config.renamed:
+            if name not in known:
+                raise UnknownName("topic", name, known)
+        for topic in heard:
+            self._inboxes[topic.name] = transport.inbox(_renamed(topic, config.renamed))
+        self._said = [_renamed(topic, config.renamed) for topic in said]
+        for topic, renamed in zip(said, self._said, strict=True):
+            self._publishers[topic.name] = transport.publisher(renamed)
+        self._is_simulated = config.is_simulated
+
+    def connect(self, seconds: float = CONNECT_S) -> None:
+        """Wait until somebody hears every topic that is said and says those that are due.
+
+        Raises:
+            SurgicaiError: somebody or something is missing after so many seconds.
+        """
+        ends = time.monotonic() + seconds
+        asked = 0.0
+        while True:
+            self.update()
+            deaf = [topic.name for topic in self._said if not self._transport.listeners(topic)]
+            mute = [name for name in self._inboxes if self._is_due(name) and not self.newest(name)]
+            if not deaf and not mute:
+                return
+            if time.monotonic() > ends:
+                problems = [f"nobody hears {', '.join(deaf)}"] if deaf else []
+                problems += [f"nothing comes on {', '.join(mute)}"] if mute else []
+                raise SurgicaiError(
+                    f"No robot answers: {'; '.join(problems)}. Is it on, in the same domain and on "
+                    "the same interface?"
+                )
+            if self._is_simulated and not deaf and time.monotonic() > asked + ASK_AGAIN_S:
+                asked = time.monotonic()
+                self.send(topics.ENTER.name, StringStamped(Header(self.stamp()), ""))
+            self._transport.wait(POLL_S)
+
+    def update(self) -> None:
+        """Take what has come."""
+        for name, inbox in self._inboxes.items():
+            for received in inbox():
+                self._newest[name] = Heard(received.message, time.monotonic())
+
+    def newest(self, topic: str) -> Heard | None:
+        """Return the newest message of a topic, None before the first."""
+        return self._newest.get(topic)
+
+    def age(self, topic: str) -> float:
+        """Return for how long nothing has come on a topic [s], infinity before the first."""
+        heard = self._newest.get(topic)
+        return float("inf") if heard is None else time.monotonic() - heard.arrived
+
+    def stamp(self) -> int:
+        """Return the present time [ns since the epoch], later than any before."""
+        self._last_stamp = max(time.time_ns(), self._last_stamp + 1)
+        return self._last_stamp
+
+    def send(self, topic: str, message: Message) -> None:
+        """Publish a message."""
+        self._publishers[topic](message)
+
+    def wait(self, seconds: float) -> None:
+        """Wait until something comes, or so long."""
+        self._transport.wait(seconds)
+
+    # -- a served simulation -----------------------------------------------------------------------
+
+    def step(self, sent: Sequence[str], stamp: int) -> int:
+        """Let a served simulation take one control step, and wait for all it publishes.
+
+        Args:
+            sent: topics on which a message with `stamp` was sent, which must be heard first.
+            stamp: of them.
+
+        Returns:
+            The stamp of the states that followed; `update` has taken them.
+
+        Raises:
+            SurgicaiError: no answer, or the step was not taken.
+        """
+        return self._ask(topics.STEP, " ".join(sent), stamp)
+
+    def reset(self, seed: int) -> int:
+        """Begin an episode of a served simulation; as `step`."""
+        return self._ask(topics.RESET, str(seed), self.stamp())
+
+    def enter(self, subtask: str) -> int:
+        """Tell a served simulation's judge which subtask is on; as `step`."""
+        return self._ask(topics.ENTER, subtask, self.stamp())
+
+    def _ask(self, topic: Topic, text: str, stamp: int) -> int:
+        self.send(topic.name, StringStamped(Header(stamp), text))
+        ends = time.monotonic() + STEP_S
+        while time.monotonic() < ends:
+            self.update()
+            heard = self.newest(topics.STEPPED.name)
+            if heard is not None and isinstance(heard.message, StringStamped):
+                answered, _, problem = heard.message.text.partition(" ")
+                if answered == str(stamp):
+                    if problem:
+                        raise InputError(f"the served simulation refused: {problem}.")
+                    self._wait_for(heard.message.header.stamp, ends)
+                    return heard.message.header.stamp
+            self._transport.wait(POLL_S)
+        raise SurgicaiError(
+            f"The served simulation has not answered on {topics.STEPPED.name} for {STEP_S:g} s; "
+            "is it served with --clock stepped, in the same domain and on the same interface?"
+        )
+
+    def _wait_for(self, stamp: int, ends: float) -> None:
+        """Wait until everything that is sent anew all the time bears `stamp` at least."""
+        while missing := [name for name in self._inboxes if not self._has(name, stamp)]:
+            if time.monotonic() > ends:
+                raise SurgicaiError(f"Nothing new has come on {', '.join(missing)}.")
+            self._transport.wait(POLL_S)
+            self.update()
+
+    def _has(self, name: str, stamp: int) -> bool:
+        """Return True if a topic's newest message is of `stamp`, or nothing is due on it."""
+        if not self._is_due(name):
+            return True
+        heard = self._newest.get(name)
+        if heard is None or isinstance(heard.message, String):
+            return False
+        return heard.message.header.stamp >= stamp
+
+    @staticmethod
+    def _is_due(name: str) -> bool:
+        """Return True if something comes on a topic all the time."""
+        return name.rpartition("/")[2] in _DUE
+
+
+def _renamed(topic: Topic, table: Mapping[str, str]) -> Topic:
+    """Return a topic under the robot's own name of it."""
+    return dataclasses.replace(topic, name=table.get(topic.name, topic.name))

@@ -1,0 +1,204 @@
+"""DDS: the transport that ROS 2 nodes speak, by cyclonedds, with no ROS installed.
+
+Nothing but the named interface is heard or reached. Cyclone DDS sends on the interface it is told,
+but its receiving sockets are bound to every address of the machine; each is therefore bound to the
+device as well (Linux: SO_BINDTODEVICE), and where that is refused nothing is opened. On the
+loopback there is no multicast: participants find each other at 127.0.0.1, as those of ROS 2 do with
+`ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`.
+"""
+
+import os
+import socket
+import struct
+from pathlib import Path
+from typing import Self, final
+from xml.sax.saxutils import quoteattr
+
+from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState
+from cyclonedds.core import WaitSet as Waiting
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.internal import SampleInfo
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic as DdsTopic
+from cyclonedds.util import duration
+
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.robot.idl import CODECS
+from surgicai_vision.robot.messages import Message
+from surgicai_vision.robot.topics import EVENT, IMAGE, LATCHED, SERVO, STATE, Topic
+from surgicai_vision.robot.transport import LOOPBACK, Inbox, Publish, Received
+
+LAST_DOMAIN = 232
+"""Highest domain number whose ports exist (DDSI-RTPS 9.6.1.1)."""
+PARTICIPANTS = 60
+"""Processes on the loopback that are looked for; ROS 2's own default is 32."""
+DEPTHS = {STATE: 10, EVENT: 10, LATCHED: 1, SERVO: 1, IMAGE: 2}
+STAYING = (EVENT, LATCHED)
+"""Qualities whose messages are also for those who come later."""
+BLOCKED_MS = 100
+"""Time for which a writer waits for a slow reader [ms]; ROS 2's default."""
+SO_BINDTODEVICE = socket.SO_BINDTODEVICE
+
+
+def configuration(interface: str) -> str:
+    """Return Cyclone DDS's configuration that keeps to one interface."""
+    is_loopback = interface == LOOPBACK
+    discovery = (
+        f"<ParticipantIndex>auto</ParticipantIndex>"
+        f"<MaxAutoParticipantIndex>{PARTICIPANTS}</MaxAutoParticipantIndex>"
+    )
+    if is_loopback:
+        discovery += "<Peers><Peer address='127.0.0.1'/></Peers>"
+    return (
+        "<CycloneDDS><Domain Id='any'><General>"
+        f"<Interfaces><NetworkInterface name={quoteattr(interface)}"
+        f"{' multicast=' + quoteattr('false') if is_loopback else ''}/></Interfaces>"
+        f"<AllowMulticast>{'false' if is_loopback else 'default'}</AllowMulticast>"
+        f"</General><Discovery>{discovery}</Discovery></Domain></CycloneDDS>"
+    )
+
+
+@final
+class CycloneTransport:
+    """Carries messages by Cyclone DDS; a context manager.
+
+    Args:
+        interface: name of the network interface.
+        domain: ROS's domain number.
+
+    Raises:
+        InputError: no such interface or domain, or this process has the domain open already, or
+            the sockets cannot be kept to the interface.
+    """
+
+    def __init__(self, interface: str, domain: int):
+        if not 0 <= domain <= LAST_DOMAIN:
+            raise InputError(f"The domain is {domain}; allowed: 0 to {LAST_DOMAIN}.")
+        names = [name for _, name in socket.if_nameindex()]
+        if interface not in names:
+            raise InputError(f"There is no interface '{interface}'; there are {', '.join(names)}.")
+        before = _sockets()
+        try:
+            self._domain = Domain(domain, configuration(interface))
+            self._participant = DomainParticipant(domain)
+        except DDSException as error:
+            raise InputError(
+                f"Cyclone DDS cannot open domain {domain} on {interface}: {error.msg}. Another "
+                "--domain may be free."
+            ) from None
+        self._entities: list[object] = []
+        self._writers: dict[str, DataWriter[IdlStruct]] = {}
+        self._topics: dict[str, DdsTopic[IdlStruct]] = {}
+        try:
+            _keep_to(_sockets() - before, interface)
+        except OSError as error:
+            self.__exit__()
+            raise InputError(
+                f"The sockets cannot be kept to {interface} ({error.strerror}); nothing was opened."
+            ) from None
+        self._waiting = Waiting(self._participant)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the domain."""
+        self._entities.clear()
+        self._writers.clear()
+        self._domain.__del__()
+
+    def publisher(self, topic: Topic) -> Publish:
+        """Return what publishes messages on a topic."""
+        codec = CODECS[topic.type]
+        writer = DataWriter(self._participant, self._topic(topic), qos=_quality(topic))
+        self._writers[topic.name] = writer
+
+        def publish(message: Message) -> None:
+            writer.write(codec.encode(message))
+
+        return publish
+
+    def inbox(self, topic: Topic) -> Inbox:
+        """Return what takes the messages that have come on a topic; what cannot be read is left."""
+        codec = CODECS[topic.type]
+        reader = DataReader(self._participant, self._topic(topic), qos=_quality(topic))
+        condition = ReadCondition(reader, ViewState.Any | SampleState.NotRead | InstanceState.Alive)
+        self._waiting.attach(condition)
+        self._entities += [reader, condition]
+
+        def take() -> list[Received]:
+            found: list[Received] = []
+            while True:
+                try:
+                    samples = reader.take(1)
+                    if not samples:
+                        return found
+                    info: SampleInfo = vars(samples[0])["sample_info"]
+                    if info.valid_data:
+                        message = codec.decode(samples[0])
+                        source = f"{info.publication_handle:x}"
+                        found.append(Received(message, source, info.source_timestamp))
+                except (InputError, ValueError, IndexError, struct.error):
+                    continue  # bytes that are no such message
+
+        return take
+
+    def listeners(self, topic: Topic) -> int:
+        """Return how many hear what a publisher of this transport says on a topic."""
+        return len(self._writers[topic.name].get_matched_subscriptions())
+
+    def wait(self, seconds: float) -> None:
+        """Wait until a message comes, or so long."""
+        self._waiting.wait(max(0, int(seconds * 1e9)))
+
+    def _topic(self, topic: Topic) -> DdsTopic[IdlStruct]:
+        """Return a topic under the name that ROS 2 gives it on the wire."""
+        if topic.name not in self._topics:
+            made = DdsTopic(self._participant, f"rt{topic.name}", CODECS[topic.type].type)
+            self._topics[topic.name] = made
+        return self._topics[topic.name]
+
+
+def _quality(topic: Topic) -> Qos:
+    """Return the QoS of a topic's messages."""
+    depth = DEPTHS[topic.quality]
+    stays = topic.quality in STAYING
+    policies = [
+        Policy.Reliability.Reliable(duration(milliseconds=BLOCKED_MS)),
+        Policy.History.KeepLast(depth),
+        Policy.Durability.TransientLocal if stays else Policy.Durability.Volatile,
+    ]
+    if stays:
+        policies.append(
+            Policy.DurabilityService(
+                cleanup_delay=0,
+                history=Policy.History.KeepLast(depth),
+                max_samples=depth,
+                max_instances=1,
+                max_samples_per_instance=depth,
+            )
+        )
+    return Qos(*policies)
+
+
+def _sockets() -> set[int]:
+    """Return the file descriptors of this process that are sockets."""
+    found = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            if os.readlink(entry).startswith("socket:"):
+                found.add(int(entry.name))
+        except OSError:  # the folder's own descriptor, closed by now
+            continue
+    return found
+
+
+def _keep_to(descriptors: set[int], interface: str) -> None:
+    """Let sockets hear nothing but what comes in by an interface; OSError: not allowed."""
+    for descriptor in descriptors:
+        with socket.socket(fileno=os.dup(descriptor)) as one:
+            if one.family in (socket.AF_INET, socket.AF_INET6):
+                one.setsockopt(socket.SOL_SOCKET, SO_BINDTODEVICE, interface.encode() + b"\0")

@@ -1,0 +1,130 @@
+"""Topics: what each message is called, of which type it is, and how it is kept.
+
+After docs/ros_crtk_contract.md of dvrk_simulator_base (names, types and the QoS of states), its
+ros_interface.py (queue depths) and ros_qos.py. Cameras are not in the contract: theirs are ROS's
+own (`<view>/image_raw`, `…/compressed`, `<view>/camera_info`). The topics under `/simulation` and
+the needle's pose are the simulation's, and no robot has them.
+"""
+
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from surgicai_vision.robot import messages as m
+
+STATE = "state"
+"""Reliable, the last ten; what is sent anew all the time."""
+EVENT = "event"
+"""Reliable, the last ten, also for those who come later."""
+LATCHED = "latched"
+"""Reliable, the last one, also for those who come later."""
+SERVO = "servo"
+"""Reliable, the last one: a set point supersedes the one before."""
+IMAGE = "image"
+"""Reliable, the last two: images are large."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic.
+
+    Attributes:
+        name: in full, "/PSM1/measured_js".
+        type: class of its messages.
+        quality: how messages are kept: `STATE`, `EVENT`, `LATCHED`, `SERVO` or `IMAGE`.
+    """
+
+    name: str
+    type: type[m.Message]
+    quality: str = STATE
+
+
+_STATES = MappingProxyType(
+    {
+        "measured_js": (m.JointState, STATE),
+        "setpoint_js": (m.JointState, STATE),
+        "measured_cp": (m.PoseStamped, STATE),
+        "setpoint_cp": (m.PoseStamped, STATE),
+        "measured_cv": (m.TwistStamped, STATE),
+        "operating_state": (m.OperatingState, EVENT),
+        "state": (m.StringStamped, EVENT),
+        "info": (m.StringStamped, STATE),
+        "warning": (m.StringStamped, STATE),
+        "error": (m.StringStamped, STATE),
+    }
+)
+"""What every arm says."""
+_COMMANDS = MappingProxyType(
+    {
+        "servo_jp": (m.JointState, SERVO),
+        "move_jp": (m.JointState, STATE),
+        "servo_cp": (m.PoseStamped, SERVO),
+        "move_cp": (m.PoseStamped, STATE),
+        "state_command": (m.StringStamped, STATE),
+    }
+)
+"""What every arm hears."""
+_PSM_STATES = MappingProxyType(
+    {
+        "jaw/measured_js": (m.JointState, STATE),
+        "jaw/setpoint_js": (m.JointState, STATE),
+        "tool_type": (m.String, LATCHED),
+        "local/measured_cp": (m.PoseStamped, STATE),
+        "local/setpoint_cp": (m.PoseStamped, STATE),
+    }
+)
+"""What a PSM says besides."""
+_PSM_COMMANDS = MappingProxyType(
+    {"jaw/servo_jp": (m.JointState, SERVO), "jaw/move_jp": (m.JointState, STATE)}
+)
+"""What a PSM hears besides."""
+
+NEEDLE = Topic("/needle/measured_cp", m.PoseStamped)
+"""Ground truth: the needle's pose in world. The name is that which `import-demos` looks for."""
+LABEL = Topic("/subtask", m.String)
+"""Ground truth: the subtask under way as the simulation judges it (`import-demos`' label)."""
+RESET = Topic("/simulation/reset", m.StringStamped)
+"""Asks for a new episode; the text is its seed."""
+ENTER = Topic("/simulation/enter", m.StringStamped)
+"""Tells the simulation's judge which subtask is on; the text is its name, or "" to change nothing:
+then everything is published once more."""
+STEP = Topic("/simulation/step", m.StringStamped)
+"""Asks for one control step, where the client sets the clock.
+
+The text names the topics, between blanks, whose message with the same stamp must come first.
+"""
+STEPPED = Topic("/simulation/stepped", m.StringStamped, EVENT)
+"""Answers `RESET`, `ENTER` and `STEP`: the text is the stamp that was asked with, its own stamp is
+that of the states published with it."""
+JUDGEMENT = Topic("/simulation/judgement", m.StringStamped, EVENT)
+"""Ground truth: the judged episode as JSON: seed, steps, subtask, progress, success, errors."""
+
+
+def psm_topics(name: str, *, heard: bool) -> dict[str, Topic]:
+    """Return channel → topic of a PSM, of what it hears or of what it says."""
+    tables = (_COMMANDS, _PSM_COMMANDS) if heard else (_STATES, _PSM_STATES)
+    return {
+        channel: Topic(f"/{name}/{channel}", *entry)
+        for table in tables
+        for channel, entry in table.items()
+    }
+
+
+def ecm_topics(name: str, *, heard: bool) -> dict[str, Topic]:
+    """Return channel → topic of the endoscope's arm."""
+    table = _COMMANDS if heard else _STATES
+    return {channel: Topic(f"/{name}/{channel}", *entry) for channel, entry in table.items()}
+
+
+def image_topic(view: str) -> Topic:
+    """Return the topic of a view's images."""
+    return Topic(f"/{view}/image_raw", m.Image, IMAGE)
+
+
+def compressed_topic(view: str) -> Topic:
+    """Return the topic of a view's compressed images."""
+    return Topic(f"/{view}/image_raw/compressed", m.CompressedImage, IMAGE)
+
+
+def info_topic(view: str) -> Topic:
+    """Return the topic of a view's camera info."""
+    return Topic(f"/{view}/camera_info", m.CameraInfo, STATE)

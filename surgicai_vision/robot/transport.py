@@ -1,0 +1,92 @@
+"""Transport: what carries messages, and the table of those there are.
+
+    with open_transport("cyclonedds", interface="lo", domain=0) as transport:
+        publish = transport.publisher(topic)
+        publish(message)
+        inbox = transport.inbox(topic)
+        for received in inbox():
+            received.message, received.source
+
+A transport has no threads that call back: whoever wants messages takes them, in the order they
+came. Nothing leaves this machine unless another interface than the loopback is named.
+"""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Protocol, Self
+
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.robot.messages import Message
+from surgicai_vision.robot.topics import Topic
+
+LOOPBACK = "lo"
+"""The loopback's name on Linux."""
+
+
+@dataclass(frozen=True)
+class Received:
+    """A message that came.
+
+    Attributes:
+        message: it.
+        source: who sent it, as the transport tells senders apart.
+        sent: when, by the sender's clock [ns]; it orders what came by several topics.
+    """
+
+    message: Message
+    source: str
+    sent: int
+
+
+Publish = Callable[[Message], None]
+Inbox = Callable[[], list[Received]]
+
+
+class Transport(Protocol):
+    """Carries messages; a context manager."""
+
+    def publisher(self, topic: Topic) -> Publish:
+        """Return what publishes messages on a topic."""
+
+    def inbox(self, topic: Topic) -> Inbox:
+        """Return what takes the messages that have come on a topic since it was last called."""
+
+    def listeners(self, topic: Topic) -> int:
+        """Return how many hear what a publisher of this transport says on a topic."""
+
+    def wait(self, seconds: float) -> None:
+        """Wait until a message comes, or so long."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+TRANSPORTS = MappingProxyType({"cyclonedds": "surgicai_vision.robot.dds:CycloneTransport"})
+"""Name → what carries messages by it, made with (interface, domain)."""
+
+
+def open_transport(name: str, interface: str = LOOPBACK, domain: int = 0) -> Transport:
+    """Return a transport.
+
+    Args:
+        name: a key of `TRANSPORTS`.
+        interface: the network interface, by its name or address.
+        domain: ROS's domain number, 0 to 232.
+
+    Raises:
+        UnknownName: no such transport.
+        InputError: what it needs is not installed, or the interface cannot be used.
+    """
+    check_name("transport", name, TRANSPORTS)
+    module, _, member = TRANSPORTS[name].partition(":")
+    try:
+        make: Callable[[str, int], Transport] = vars(importlib.import_module(module))[member]
+    except ImportError as error:
+        raise InputError(
+            f"The transport {name} needs a package that is not installed ({error.name}): "
+            "pip install 'surgicai-vision[ros]'."
+        ) from None
+    return make(interface, domain)

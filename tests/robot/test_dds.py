@@ -1,0 +1,187 @@
+"""CRTK over DDS: what is sent arrives, between two processes, and nowhere but on the loopback."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from served import DOMAIN, serving
+
+from surgicai_vision import envs
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.robot import frames, topics
+from surgicai_vision.robot import messages as m
+from surgicai_vision.robot.client import Client, ClientConfig
+from surgicai_vision.robot.topics import Topic
+from surgicai_vision.robot.transport import open_transport
+
+pytest.importorskip("cyclonedds", reason="the extra `ros` is not installed")
+from surgicai_vision.robot.dds import _sockets
+from surgicai_vision.robot.idl import CODECS
+
+HEADER = m.Header(1_795_000_000_123_456_789, "ECM_view")
+EXAMPLES = [
+    m.JointState(HEADER, ("yaw", "pitch"), (0.1, -0.2), (0.0, 1e-9), ()),
+    m.PoseStamped(HEADER, (0.1, 0.2, 0.3), (0.0, 0.6, 0.0, 0.8)),
+    m.TwistStamped(HEADER, (0.1, 0.2, 0.3), (1.0, 2.0, 3.0)),
+    m.OperatingState(HEADER, "ENABLED", True, False),
+    m.StringStamped(HEADER, "clear_fault"),
+    m.String("400006"),
+    m.Image(HEADER, 2, 3, bytes(range(18))),
+    m.CompressedImage(HEADER, "jpeg", b"\xff\xd8 and so on"),
+    m.CameraInfo(HEADER, 2, 3, tuple(float(value) for value in range(9))),
+]
+SEED = 900_001
+
+
+@pytest.fixture(scope="module")
+def transport():
+    with open_transport("cyclonedds", domain=DOMAIN) as opened:
+        yield opened
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_a_message_is_the_same_after_its_way(transport, message):
+    topic = Topic(f"/test/{type(message).__name__}", type(message), topics.EVENT)
+    inbox = transport.inbox(topic)
+    transport.publisher(topic)(message)
+    for _ in range(100):
+        found = inbox()
+        if found:
+            break
+        transport.wait(0.05)
+    assert [received.message for received in found] == [message]
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_a_type_has_the_name_that_ros_gives_it(message):
+    package = {
+        "JointState": "sensor_msgs",
+        "Image": "sensor_msgs",
+        "CompressedImage": "sensor_msgs",
+        "CameraInfo": "sensor_msgs",
+        "String": "std_msgs",
+        "OperatingState": "crtk_msgs",
+        "StringStamped": "crtk_msgs",
+    }.get(type(message).__name__, "geometry_msgs")
+    wanted = f"{package}::msg::dds_::{type(message).__name__}_"
+    assert CODECS[type(message)].type.__idl_typename__ == wanted
+
+
+def test_every_socket_hears_the_loopback_alone(transport):
+    """Bound to the device: what comes by another interface is dropped by the kernel."""
+    checked = 0
+    for descriptor in _sockets():
+        with socket.socket(fileno=os.dup(descriptor)) as one:
+            if one.family != socket.AF_INET or one.type != socket.SOCK_DGRAM:
+                continue
+            device = one.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16)
+            assert device.rstrip(b"\0") == b"lo", one.getsockname()
+            checked += 1
+    assert checked >= 2
+
+
+def test_what_cannot_be_opened_is_refused():
+    with pytest.raises(InputError, match="no interface 'moon0'; there are"):
+        open_transport("cyclonedds", "moon0")
+    with pytest.raises(InputError, match="allowed: 0 to 232"):
+        open_transport("cyclonedds", domain=233)
+    with pytest.raises(InputError, match="Unknown transport"):
+        open_transport("carrier_pigeon")
+
+
+def test_a_served_simulation_is_driven_from_another_process(transport):
+    """Stepped: the same motion as in this process, to rounding, and the images of its states."""
+    own = envs.make(TaskConfig("grasp"))
+    own.reset(seed=SEED)
+    config = ClientConfig(arms=("PSM2",), views=("front",), is_simulated=True)
+    options = ("--task", "grasp", "--clock", "stepped", "--view", "front", "--size", "64")
+    with serving(*options):
+        client = Client(transport, config)
+        client.connect()
+        client.reset(SEED)
+        for _ in range(8):
+            state = client.newest("/PSM2/measured_js").message
+            measured = own.simulation.reported_joints("psm2")
+            assert np.allclose(state.position, measured, atol=1e-9)
+            image = client.newest("/front/image_raw").message
+            frame = np.frombuffer(image.data, np.uint8).reshape(64, 64, 3)
+            assert image.header.stamp == state.header.stamp
+            assert np.abs(frame - own.image("front", (64, 64)).astype(int)).max() <= 1
+            told = client.newest("/PSM2/local/setpoint_cp").message
+            stamp = client.stamp()
+            x, y, z = told.position
+            header = m.Header(stamp, told.header.frame)
+            lower = m.PoseStamped(header, (x, y, z + 0.0005), told.quaternion)
+            client.send("/PSM2/servo_cp", lower)
+            client.step(["/PSM2/servo_cp"], stamp)
+            own.step(np.array([0, 0, 1, 0, 0, 0, 0], np.float32))
+        goal = frames.read_pose(client.newest("/PSM2/local/setpoint_cp").message)
+        assert np.allclose(goal, own.simulation.commands["psm2"].pose, atol=1e-9)
+    own.close()
+
+
+RCLPY = """
+import json, sys, time
+import rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+rclpy.init()
+node = rclpy.create_node("probe")
+heard = {"poses": 0, "joints": 0}
+last = {}
+def on_pose(message):
+    heard["poses"] += 1
+    last["pose"] = message
+def on_jaw(message):
+    last["jaw"] = message.position[0]
+def on_joints(message):
+    heard["joints"] += 1
+    last["joints"] = message
+node.create_subscription(PoseStamped, "/PSM1/measured_cp", on_pose, 10)
+node.create_subscription(JointState, "/PSM1/measured_js", on_joints, 10)
+node.create_subscription(JointState, "/PSM1/jaw/measured_js", on_jaw, 10)
+late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+node.create_subscription(String, "/PSM1/tool_type", lambda m: last.update(tool=m.data), late)
+jaw = node.create_publisher(JointState, "/PSM1/jaw/servo_jp", 1)
+ends = time.time() + 30
+while time.time() < ends:
+    rclpy.spin_once(node, timeout_sec=0.05)
+    jaw.publish(JointState(position=[0.5]))
+    if heard["poses"] > 50 and "tool" in last and abs(last["jaw"] - 0.5) < 0.05:
+        break
+print(json.dumps({**heard, "frame": last["pose"].header.frame_id, "tool": last.get("tool"),
+    "names": list(last["joints"].name), "jaw": last["jaw"]}))
+"""
+
+
+def test_a_real_rclpy_hears_and_moves_the_served_simulation():
+    """With ROS 2 itself, where `SURGICAI_RCLPY_PYTHON` names a Python that imports it."""
+    python = os.environ.get("SURGICAI_RCLPY_PYTHON", sys.executable)
+    imports = "import rclpy, geometry_msgs.msg, sensor_msgs.msg"
+    if subprocess.run([python, "-c", imports], capture_output=True).returncode:
+        pytest.skip("no rclpy here; SURGICAI_RCLPY_PYTHON may name a Python that has it")
+    domain = DOMAIN % 200 + 1
+    ros = {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+    with serving("--task", "grasp", domain=domain):
+        probe = subprocess.run(
+            [python, "-c", RCLPY], env=ros, capture_output=True, text=True, timeout=90
+        )
+    assert probe.returncode == 0, probe.stderr
+    said = json.loads(probe.stdout.splitlines()[-1])
+    assert said["frame"] == "ECM_view"
+    assert said["names"][:3] == ["yaw", "pitch", "insertion"]
+    assert said["tool"] == "400006"
+    assert said["jaw"] == pytest.approx(0.5, abs=0.05)
+    assert said["poses"] > 50
