@@ -1,6 +1,6 @@
 """`evaluate`: run a policy from held-out starts and count successes."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -57,6 +57,8 @@ class Options:
         dataset: Dataset whose mean demonstration replay plays.
         expert_swap: For a hierarchical policy, the subtask that the expert does, or all: each in
             turn.
+        upset: Let one thing go wrong in every episode, drawn from its start: the needle is pushed,
+            or jaws open (docs/evaluation.md).
         out: Folder for the rows; an earlier evaluation in it is replaced.
         video: Folder for videos of the episodes, one MP4 each; an earlier filming in it is
             replaced.
@@ -79,6 +81,7 @@ class Options:
     expert_swap: Annotated[
         str | None, Parameter(choices=(*names.SUBTASKS, ALL), metavar="SUBTASK")
     ] = None
+    upset: bool = False
     out: Annotated[
         Path | None,
         DIRECTORY,
@@ -94,12 +97,16 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Evaluate, keep the rows and print the summary."""
+    from surgicai_vision.envs.upset import check_upset_task
     from surgicai_vision.evaluation.run import evaluate_into
     from surgicai_vision.evaluation.storage import MARKER
 
     if options.expert_swap == ALL:
-        if options.video:
-            raise InputError(f"--video does not go with --expert-swap {ALL}; give one subtask.")
+        for option, given in (("--video", options.video), ("--upset", options.upset)):
+            if given:
+                raise InputError(
+                    f"{option} does not go with --expert-swap {ALL}; give one subtask."
+                )
         return _evaluate_swaps(options, console)
     spec = open_given(
         options.policy,
@@ -109,6 +116,9 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         WeightsSource.parse(options.weights, options.accept_licence),
         options.expert_swap,
     )
+    if options.upset:
+        check_upset_task(spec.config.task)
+        spec = replace(spec, run=replace(spec.run, upset=True))
     seeds = range(options.seed, options.seed + options.episodes)
     default = folders.evaluation_folder(spec.config.task, spec.name, options.seed, options.episodes)
     out = options.out or default
@@ -217,5 +227,9 @@ def summary_line(result: dict[str, Any]) -> str:
     if "subtasks" in result:
         line += "; reached " + ", ".join(
             f"{stage['subtask']} {stage['k']}" for stage in result["subtasks"]
+        )
+    if "upsets" in result:
+        line += "; recovered " + ", ".join(
+            f"{kind} {count['k']}/{count['n']}" for kind, count in result["upsets"].items()
         )
     return line

@@ -1,5 +1,6 @@
 """Agents: the expert, the baselines, blind replay, and a policy with its frozen encoder."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, final
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import clock
 from surgicai_vision.core.errors import UnreachablePose
+from surgicai_vision.demos.demonstrator import make_demonstrator
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
@@ -24,24 +26,30 @@ from surgicai_vision.training.threads import one_thread
 if TYPE_CHECKING:
     from encoders.base import Encoder
     from policies.base import Policy
-    from surgicai_vision.demos.expert import Expert
+    from surgicai_vision.demos.demonstrator import Demonstrator
+
+EXPERT = "expert"
+RECOVER = "recover"
+"""The expert, and the one of the whole procedure that goes back to what was lost."""
 
 
 @final
 class ExpertAgent(Agent):
-    """The scripted expert: reads the env's state, needs no images."""
+    """A scripted expert: reads the env's state, needs no images.
 
-    name = "expert"
+    Args:
+        name: which one, a key of `demos.demonstrator.DEMONSTRATORS`.
+    """
+
     privileged = True
 
-    def __init__(self) -> None:
-        self._experts: dict[int, Expert] = {}
+    def __init__(self, name: str = EXPERT) -> None:
+        self.name = self._kind = name
+        self._experts: dict[int, Demonstrator] = {}
 
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Make an expert for the slot's episode."""
-        from surgicai_vision.demos.expert import Expert
-
-        self._experts[slot] = Expert(simulated(robot))
+        self._experts[slot] = make_demonstrator(self._kind, simulated(robot))
 
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
@@ -152,7 +160,12 @@ VECTORS: Mapping[str, Callable[[Robot], NDArray[np.float32]]] = MappingProxyType
 """What a policy may be fed beside features: dataset key → how the robot says it."""
 
 BASELINES: Mapping[str, Callable[[], Agent]] = MappingProxyType(
-    {ExpertAgent.name: ExpertAgent, RandomAgent.name: RandomAgent, ZeroAgent.name: ZeroAgent}
+    {
+        EXPERT: ExpertAgent,
+        RECOVER: functools.partial(ExpertAgent, RECOVER),
+        RandomAgent.name: RandomAgent,
+        ZeroAgent.name: ZeroAgent,
+    }
 )
 """Name → agent that needs no checkpoint."""
 

@@ -70,6 +70,9 @@ class EpisodeMetrics:
         tears: how often the tissue tore; NaN where it cannot.
         thread_mm: thread drawn out of the exit [mm]; NaN without a thread.
         paper_success: whether the paper's own success was reached.
+        upset: what went wrong, one of `envs.upset.KINDS`; "" where nothing did.
+        upset_step: control steps taken when it did; -1 where nothing did.
+        recovered: something went wrong, and the task succeeded all the same.
     """
 
     task: str
@@ -98,6 +101,9 @@ class EpisodeMetrics:
     tears: float = math.nan
     thread_mm: float = math.nan
     paper_success: bool = False
+    upset: str = ""
+    upset_step: int = -1
+    recovered: bool = False
 
 
 def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, held: bool) -> str:
@@ -147,6 +153,7 @@ def summary(rows: Sequence[EpisodeMetrics]) -> dict[str, Any]:
             if first.task == names.SUTURE
             else {}
         ),
+        **({"upsets": upset_recoveries(rows)} if any(row.upset for row in rows) else {}),
     }
 
 
@@ -160,6 +167,17 @@ def subtask_successes(rows: Sequence[EpisodeMetrics]) -> list[dict[str, Any]]:
         low, high = clopper_pearson(k, len(rows))
         stages.append({"subtask": subtask, "k": k, "n": len(rows), "low": low, "high": high})
     return stages
+
+
+def upset_recoveries(rows: Sequence[EpisodeMetrics]) -> dict[str, dict[str, Any]]:
+    """Return each kind of upset that happened: k of n recovered, with the exact interval."""
+    found = {}
+    for kind in sorted({row.upset for row in rows} - {""}):
+        mine = [row for row in rows if row.upset == kind]
+        k = sum(row.recovered for row in mine)
+        low, high = clopper_pearson(k, len(mine))
+        found[kind] = {"k": k, "n": len(mine), "low": low, "high": high}
+    return found
 
 
 def _reached(rows: Sequence[EpisodeMetrics]) -> dict[str, int]:

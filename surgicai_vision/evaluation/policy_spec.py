@@ -27,6 +27,7 @@ from surgicai_vision.evaluation import lerobot_agent
 from surgicai_vision.evaluation.agent import Agent, MakeAgent
 from surgicai_vision.evaluation.agents import (
     BASELINES,
+    RECOVER,
     PolicyAgent,
     ReplayAgent,
     mean_demonstration,
@@ -124,7 +125,7 @@ def open_policy(
             raise InputError("replay plays the mean demonstration of a dataset; give a dataset.")
         spec = _replay(dataset)
     elif text in BASELINES:
-        config = TaskConfig(task or "grasp")
+        config = TaskConfig(_task_of_baseline(text, task))
         spec = PolicySpec(RunConfig(config, policy=text), BASELINES[text])
     elif path.suffix in SUFFIXES:
         spec = hierarchical_policy(read_hierarchical(path), expert_swap, weights)
@@ -143,6 +144,18 @@ def open_policy(
             "leave the task out, or give a policy of that task."
         )
     return _in_env(spec, env)
+
+
+def _task_of_baseline(name: str, task: str | None) -> str:
+    """Return the task of a baseline; the expert that goes back acts in whole procedures alone."""
+    if name != RECOVER:
+        return task or "grasp"
+    if task not in (None, names.SUTURE):
+        raise InputError(
+            f"'{RECOVER}' goes back to earlier subtasks, and '{task}' has none; "
+            f"give --task {names.SUTURE}, or expert."
+        )
+    return names.SUTURE
 
 
 def _names_code(text: str) -> bool:

@@ -17,6 +17,7 @@ from surgicai_vision.core import processes
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.progress import Progress
+from surgicai_vision.envs.upset import check_upset_task
 from surgicai_vision.evaluation.agent import MakeAgent
 from surgicai_vision.evaluation.films import Filming
 from surgicai_vision.evaluation.slot import Episode, Slot
@@ -33,6 +34,7 @@ def evaluate(
     workers: int | None = None,
     progress: Progress | None = None,
     filming: Filming | None = None,
+    upset: bool = False,
 ) -> list[Episode]:
     """Run one episode for each seed and return them in the order of `seeds`.
 
@@ -45,10 +47,13 @@ def evaluate(
         progress: called as progress(steps done, steps at most).
         filming: which episodes become videos, written by the process that ran them; None films
             nothing.
+        upset: let one thing go wrong in every episode (`envs.upset`), drawn from its seed.
 
     Raises:
-        InputError: no seeds, repeated seeds, or numbers below 1.
+        InputError: no seeds, repeated seeds, numbers below 1, or upsets in a task that has none.
     """
+    if upset:
+        check_upset_task(task_config.task)
     if not seeds or len(set(seeds)) != len(seeds):
         raise InputError(
             f"{len(seeds)} start seeds, {len(set(seeds))} of them different; give each once."
@@ -61,7 +66,9 @@ def evaluate(
     if filming is not None:
         filming = filming.begun(seeds)
     jobs = [
-        functools.partial(run_share, make_agent, task_config, share, batch, filming=filming)
+        functools.partial(
+            run_share, make_agent, task_config, share, batch, filming=filming, upset=upset
+        )
         for share in shares
     ]
     if len(jobs) == 1:
@@ -84,13 +91,16 @@ def run_share(
     batch: int,
     report: Callable[[int], None],
     filming: Filming | None = None,
+    upset: bool = False,
 ) -> list[Episode]:
     """Run the episodes of one process.
 
     `report` is told the steps done; a finished episode counts as all of its own.
     """
     agent = make_agent()
-    slots = [Slot(index, agent, task_config) for index in range(min(batch, len(seeds)))]
+    slots = [
+        Slot(index, agent, task_config, upset=upset) for index in range(min(batch, len(seeds)))
+    ]
     waiting, finished = list(seeds)[::-1], []
     for slot in slots:
         slot.begin(waiting.pop())

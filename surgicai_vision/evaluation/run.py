@@ -48,7 +48,13 @@ def evaluate_into(
         filming: which episodes become videos; None films nothing.
     """
     episodes = evaluate(
-        spec.make_agent, spec.config, seeds, workers=workers, progress=progress, filming=filming
+        spec.make_agent,
+        spec.config,
+        seeds,
+        workers=workers,
+        progress=progress,
+        filming=filming,
+        upset=spec.run.upset,
     )
     about = {
         "command": command_line(),

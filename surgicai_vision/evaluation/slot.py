@@ -23,6 +23,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import PhysicsError
 from surgicai_vision.envs.episode_monitor import EpisodeMonitor
 from surgicai_vision.envs.moment import Moment, present_moment
+from surgicai_vision.envs.upset import Upset, plan_upset
 from surgicai_vision.evaluation.agent import Agent, Env, Observation
 from surgicai_vision.evaluation.metrics import EpisodeMetrics, failure_kind
 
@@ -67,6 +68,7 @@ class Slot:
         index: the slot's number, by which the agent tells its episodes apart.
         agent: what acts.
         task_config: the task.
+        upset: let one thing go wrong in every episode (`envs.upset`).
     """
 
     index: int
@@ -82,9 +84,11 @@ class Slot:
     info: dict[str, Any] = field(default_factory=dict)
     states: list[NDArray[np.float64]] = field(default_factory=list)
     moments: list[Moment] = field(default_factory=list)
+    upset: bool = False
 
     def __post_init__(self) -> None:
         self.env = env_of(self.agent, self.task_config)
+        self._mishap = Upset(self.env, None)
         self.monitor = EpisodeMonitor(self.env)
 
     def begin(self, seed: int) -> None:
@@ -103,6 +107,10 @@ class Slot:
             self.agent.reset(self.index, self.env, seed)
         except PhysicsError as error:
             self.info, self.ended, self.error = {}, True, str(error)
+        else:
+            plan = plan_upset(seed, self.task_config.task) if self.upset else None
+            self._mishap = Upset(self.env, plan)
+            self._let_happen()
         self._keep()
 
     def step(self, action: NDArray[np.float32]) -> None:
@@ -111,7 +119,8 @@ class Slot:
             self.ended, self.error = True, "the policy's action is not finite"
             return
         try:
-            self.observation, _, terminated, truncated, self.info = self.env.step(action)
+            step = self.env.step(self._mishap.altered(action))
+            self.observation, _, terminated, truncated, self.info = step
         except PhysicsError as error:
             terminated, truncated, self.error, self.diverged = True, False, str(error), True
         else:
@@ -123,8 +132,15 @@ class Slot:
         self.ended = bool(
             terminated or truncated or self.error or self.steps >= self.task_config.max_steps
         )
+        if not self.ended:
+            self._let_happen()
         if not self.error:
             self._keep()
+
+    def _let_happen(self) -> None:
+        """Let go wrong what is due now, and look again where the needle was pushed."""
+        if self._mishap.before_step():
+            self.observation = self.env.observe()
 
     def take(self) -> Episode:
         """Return the ended episode and free the slot."""
@@ -162,6 +178,9 @@ class Slot:
             tears=monitor.tears,
             thread_mm=1e3 * monitor.thread_drawn,
             paper_success=monitor.paper_success and not self.error,
+            upset=self._mishap.kind,
+            upset_step=self._mishap.step,
+            recovered=success and bool(self._mishap.kind),
         )
         self.seed = None
         return Episode(row, self._film())

@@ -52,7 +52,9 @@ def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
     found = []
     for task in task_names():
         mine = [
-            item for item in groups if _evaluated(item, task) and not item.condition.expert_swap
+            item
+            for item in groups
+            if _evaluated(item, task) and not (item.condition.expert_swap or item.condition.upset)
         ]
         for axis in dict.fromkeys(item.condition.axis for item in mine if item.condition.axis):
             members = _by_condition(_with_zero(mine, axis), _base)

@@ -26,6 +26,7 @@ class Condition:
         axis: what is shifted in a robustness evaluation, or "".
         strength: how much.
         expert_swap: subtask of a hierarchical policy in which the expert acts, or "".
+        upset: whether one thing went wrong in every episode.
         trained: whether a policy was trained.
         place: where it stands, if another evaluation of the same condition and training seed stands
             elsewhere.
@@ -43,6 +44,7 @@ class Condition:
     axis: str = ""
     strength: float = 0.0
     expert_swap: str = ""
+    upset: bool = False
     trained: bool = True
     place: str = ""
 
@@ -75,12 +77,13 @@ class Condition:
         parts = [self.policy + (f" on {self.view}" if self.views else "")]
         parts += [f"{self.axis} {self.strength:g}"] if self.axis else []
         parts += [f"expert in {self.expert_swap}"] if self.expert_swap else []
+        parts += ["each episode upset"] if self.upset else []
         return ", ".join(parts)
 
     @property
     def plain(self) -> bool:
-        """Whether neither the world was shifted nor the expert swapped in."""
-        return not self.axis and not self.expert_swap
+        """Whether the world was not shifted, the expert not swapped in, and nothing upset."""
+        return not (self.axis or self.expert_swap or self.upset)
 
 
 def condition_of(run: RunConfig, place: str = "") -> Condition:
@@ -108,12 +111,13 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         axis=run.shift.axis if run.shift else "",
         strength=run.shift.strength if run.shift else 0.0,
         expert_swap=run.expert_swap or "",
+        upset=run.upset,
         trained=run.is_trained,
         place=place,
     )
 
 
-type Order = tuple[int, bool, bool, str, int, list[int], str, int, str, float, str]
+type Order = tuple[int, bool, bool, str, int, list[int], str, int, str, float, str, bool]
 
 
 def order(condition: Condition) -> Order:
@@ -138,4 +142,5 @@ def order(condition: Condition) -> Order:
         condition.axis,
         condition.strength,
         condition.expert_swap,
+        condition.upset,
     )

@@ -120,9 +120,9 @@ def _policy(item: Group) -> str:
     condition = item.condition
     parts = [condition.policy] + ([item.demonstrations] if item.several else [])
     parts += [f"{condition.axis} {condition.strength:g}"] if condition.axis else []
-    return ", ".join(
-        parts + ([f"expert in {condition.expert_swap}"] if condition.expert_swap else [])
-    )
+    parts += [f"expert in {condition.expert_swap}"] if condition.expert_swap else []
+    parts += ["each episode upset"] if condition.upset else []
+    return ", ".join(parts)
 
 
 def _paired(

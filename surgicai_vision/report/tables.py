@@ -149,6 +149,7 @@ def _identity(condition: Condition) -> dict[str, object]:
         "shift": condition.axis,
         "strength": condition.strength,
         "expert_in": condition.expert_swap,
+        "upset": condition.upset,
         "trained": condition.trained,
     }
 

@@ -17,7 +17,7 @@ from surgicai_vision.core.errors import InputError, check_name
 
 OWN = "own"
 """Stands for an encoder: a network of the policy's own, trained with it on the images."""
-REFERENCES = ("expert", "random", "zero", "replay")
+REFERENCES = ("expert", "random", "zero", "replay", "recover")
 """Policies that are not trained: what the trained ones stand beside."""
 LEROBOT_POLICIES = ("act", "diffusion")
 """Policies that a sweep trains by `lerobot-train`."""
@@ -85,6 +85,7 @@ class RunConfig:
         expert_swap: the subtask of a hierarchical policy that the expert does.
         starts: start states of the evaluation; None before it.
         shift: what is shifted in an evaluation of robustness.
+        upset: one thing goes wrong in every episode of the evaluation (`envs.upset`).
     """
 
     env: TaskConfig = field(default_factory=TaskConfig)
@@ -108,6 +109,7 @@ class RunConfig:
     expert_swap: str | None = None
     starts: Starts | None = None
     shift: Shift | None = None
+    upset: bool = False
 
     def __post_init__(self) -> None:
         for view in self.views:
@@ -160,7 +162,15 @@ class RunConfig:
 
     @property
     def name(self) -> str:
-        """How tables and folders call the policy: its inputs and whatever is not as usual."""
+        """How tables and folders call the policy: its inputs and whatever is not as usual.
+
+        With `upset` it ends in "-upset", so that disturbed rows are never taken for others.
+        """
+        return f"{self._name}-upset" if self.upset else self._name
+
+    @property
+    def _name(self) -> str:
+        """The name of the policy itself."""
         if not self.is_trained:
             return self.policy
         parts = [f"hierarchical-{self.termination}"] if self.is_hierarchical else []
@@ -188,4 +198,4 @@ def with_epochs(changes: tuple[str, ...], epochs: int | None) -> tuple[str, ...]
 
 def of_training(run: RunConfig) -> RunConfig:
     """Return a run without what belongs to one evaluation of it."""
-    return dataclasses.replace(run, starts=None, shift=None, expert_swap=None)
+    return dataclasses.replace(run, starts=None, shift=None, expert_swap=None, upset=False)
