@@ -39,6 +39,7 @@ VECTORS: Mapping[str, int] = MappingProxyType(
         names.CLOCKED_STATE: len(names.STATE_NAMES) + CLOCK_SIZE,
         names.BOTH_ARMS: len(names.BOTH_ARMS_NAMES),
         names.PRIVILEGED_STATE: len(names.PRIVILEGED_NAMES),
+        names.RELATIVE_STATE: len(names.RELATIVE_NAMES),
     }
 )
 """What may be fed beside features: dataset key → length."""
@@ -146,7 +147,7 @@ class Inputs:
             raise InputError(
                 "A policy needs at least one view or proprioception; this one would be blind."
             )
-        if self.visual and self.vector == names.PRIVILEGED_STATE:
+        if self.visual and self.vector in names.STATES_WITH_GOAL:
             raise InputError(
                 "A policy with images may not see the privileged state; give one or the other."
             )

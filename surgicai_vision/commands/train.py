@@ -1,4 +1,4 @@
-"""`train`: train a policy on a dataset's features."""
+"""`train`: train a policy on a dataset's features, or with `--algo` by reinforcement learning."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +13,7 @@ from surgicai_vision.commands.options import (
     ACCEPT_LICENCE,
     COUNT,
     DIRECTORY,
+    FILE_ONLY,
     NOT_NEGATIVE,
     POOL,
     SUBTASK,
@@ -20,11 +21,13 @@ from surgicai_vision.commands.options import (
     VIEWS,
     WEIGHTS,
     default_text,
+    task_config,
 )
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import TaskConfig, read_changes
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.features import encoders
+from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import Checkpoint, read_checkpoint
 from surgicai_vision.training.run_config import RunConfig, with_epochs
@@ -33,7 +36,11 @@ if TYPE_CHECKING:
     from surgicai_vision.dataset import Dataset
 
 app = App(
-    name="train", help_epilogue="example:\n  surgicai-vision train --encoder random --view back"
+    name="train",
+    help_epilogue="""\
+examples:
+  surgicai-vision train --encoder random --view back
+  surgicai-vision train --algo td3-her-bc --env-steps 25000""",
 )
 NO_ENCODER = "none"
 """`--encoder`: proprioception alone."""
@@ -66,6 +73,17 @@ class Options:
         log: Where losses are drawn.
         seed: Training seed.
         out: Checkpoint folder to make or to continue.
+        algo: Train an actor on the state by this algorithm of reinforcement or offline learning
+            (docs/rl.md); --change then changes its settings.
+        demos: Folder of the demonstrations that it learns from.
+        demonstrations: Take the first N of them.
+        observation: What the actor sees of the state.
+        env_steps: Control steps in the env; offline algorithms take none.
+        updates: Updates of an offline algorithm.
+        validation: Episodes of each evaluation on the way.
+        seeds: Train so many seeds, from --seed on, side by side.
+        workers: Processes that train seeds, or step the envs of a single one; 0 for this one.
+        env: Fields of the env, such as hold_jaw.
     """
 
     task: Annotated[str, TASK] = "grasp"
@@ -103,11 +121,23 @@ class Options:
     out: Annotated[
         Path | None, DIRECTORY, default_text("outputs/train/<task>-<policy>-seed<seed>")
     ] = None
+    algo: Annotated[str | None, Parameter(choices=tuple(ALGORITHMS))] = None
+    demos: Annotated[Path | None, DIRECTORY, default_text("outputs/demos/<task>")] = None
+    demonstrations: Annotated[int | None, COUNT, default_text("all")] = None
+    observation: Annotated[str, Parameter(choices=("relative", "state"))] = "relative"
+    env_steps: Annotated[int, COUNT] = 50_000
+    updates: Annotated[int, COUNT] = 10_000
+    validation: Annotated[int, NOT_NEGATIVE] = 20
+    seeds: Annotated[int, COUNT] = 1
+    workers: Annotated[int, NOT_NEGATIVE] = 0
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode what is not in the cache, train and print where the checkpoint is."""
+    if options.algo:
+        return _reinforce(options, options.algo, console)
     weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     encoder = None if options.encoder in (NO_ENCODER, STATE) else options.encoder
     if encoder:
@@ -180,3 +210,69 @@ def _views(options: Options, encoder: str | None) -> tuple[str, ...]:
             )
         return ()
     return ("front", "back") if options.view is None else options.view
+
+
+IMITATION = ("dataset", "subtask", "view", "start", "epochs")
+"""Options that only imitation from a dataset reads."""
+
+
+def _reinforce(options: Options, algo: str, console: Console) -> dict[str, object]:
+    """Train an actor by reinforcement or offline learning; print where the checkpoints are."""
+    from surgicai_vision.demos.store import demos_digest, list_demos
+    from surgicai_vision.rl.extra import check_extra
+    from surgicai_vision.rl.settings import Request, settings_of
+
+    algorithm = ALGORITHMS[algo]
+    check_extra(f"--algo {algo}", "stable_baselines3", "sb3_contrib", algorithm.library)
+    for name in IMITATION:
+        if getattr(options, name) is not None:
+            raise InputError(f"--{name} is for imitation from a dataset; leave it or --algo out.")
+    config = task_config(options.task, options.env)
+    settings = settings_of(algo, read_changes(options.change))
+    demos: list[Path] = []
+    if algorithm.needs_demos:
+        demos = list_demos(options.demos or folders.demos_folder(options.task))
+        demos = demos[: options.demonstrations]
+    elif options.demos or options.demonstrations:
+        raise InputError(f"--algo {algo} learns from no demonstrations; leave --demos out.")
+    requests = [
+        Request(
+            algo=algo,
+            env=config,
+            observation=options.observation,
+            settings=settings,
+            changes=options.change,
+            env_steps=options.env_steps if algorithm.is_online else 0,
+            updates=0 if algorithm.is_online else options.updates,
+            seed=options.seed + index,
+            demonstrations=len(demos),
+            demos=demos_digest(demos) if demos else "",
+            validation=options.validation,
+            save_every=options.save_every or 5000,
+        )
+        for index in range(options.seeds)
+    ]
+    if options.out and options.seeds > 1:
+        raise InputError("--out names one folder; leave it out where --seeds trains several.")
+    from surgicai_vision.rl.train import REQUEST, run_of, train_seeds
+
+    outs = []
+    for request in requests:
+        run = run_of(request)
+        out = options.out or folders.train_folder(run.task, run.name, run.seed)
+        folders.check_folder(out, REQUEST)
+        outs.append(out)
+    unit = "control steps" if algorithm.is_online else "updates"
+    with console.stage(f"policy: {run_of(requests[0]).name}", unit) as progress:
+        train_seeds(
+            requests,
+            demos,
+            outs,
+            workers=options.workers,
+            progress=progress,
+            tensorboard=options.log in ("auto", "tensorboard"),
+        )
+    for out in outs:
+        console.say(f"checkpoint: {out}")
+    console.say(f"next: surgicai-vision evaluate {outs[0]}")
+    return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}

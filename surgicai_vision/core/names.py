@@ -114,6 +114,9 @@ PRIVILEGED_STATE = "privileged_state"
 RELATIVE_STATE = "relative_state"
 """The 24 values of obs_type "relative" with the goal; in no dataset, the env says it."""
 
+STATES_WITH_GOAL = (PRIVILEGED_STATE, RELATIVE_STATE)
+"""What no policy with images may be fed."""
+
 CLOCKED_STATE = "clocked_state"
 """STATE and, last, the time since the subtask began as `config.clock` tells it."""
 STAGE = "stage"

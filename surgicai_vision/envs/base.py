@@ -326,6 +326,17 @@ class SuturingEnv(gymnasium.Env):
         """Return the whole state of the episode as one vector."""
         return self.simulation.get_state()
 
+    @property
+    def snapshot(self) -> tuple[NDArray[np.float64], dict[str, object]]:
+        """The whole state and that of the generator that draws the next starts; may be set."""
+        return self.get_state(), dict(self.np_random.bit_generator.state)
+
+    @snapshot.setter
+    def snapshot(self, snapshot: tuple[NDArray[np.float64], dict[str, object]]) -> None:
+        state, generator = snapshot
+        self.set_state_vector(state)
+        self.np_random.bit_generator.state = generator
+
     def set_state_vector(self, state: NDArray[np.float64]) -> None:
         """Restore a state of `get_state`: what follows is what followed then."""
         before = self.simulation.draws

@@ -155,6 +155,7 @@ VECTORS: Mapping[str, Callable[[Robot], NDArray[np.float32]]] = MappingProxyType
         names.CLOCKED_STATE: lambda robot: robot.agent_pos(),  # the agent itself adds the clock
         names.BOTH_ARMS: lambda robot: robot.both_arms(),
         names.PRIVILEGED_STATE: lambda robot: simulated(robot).state_vector(),
+        names.RELATIVE_STATE: lambda robot: simulated(robot).relative_state(),
     }
 )
 """What a policy may be fed beside features: dataset key → how the robot says it."""
@@ -197,7 +198,7 @@ class PolicyAgent(Agent):
         self.image_size = image_size
         self.cameras = tuple(dict.fromkeys(map(names.camera_of, views)))
         self.depth = any(map(names.is_depth_view, views))
-        self.privileged = vector == names.PRIVILEGED_STATE
+        self.privileged = vector in names.STATES_WITH_GOAL
         self._policy = policy
         self._encoder = encoder
         self._vector = VECTORS[vector]

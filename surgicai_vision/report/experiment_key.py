@@ -93,7 +93,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         run: the run.
         place: where its evaluation stands, if another one of the same run stands elsewhere.
     """
-    encoder = run.encoder or ("state" if run.privileged else "proprioception")
+    encoder = run.encoder or run.inputs
     if not run.is_trained:
         encoder = run.policy
     elif run.parts:
@@ -103,7 +103,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         encoder=encoder,
         views=run.views,
         hierarchical=run.termination or "",
-        trained_by=run.policy if run.is_trained else Condition.trained_by,
+        trained_by=(run.algo or run.policy) if run.is_trained else Condition.trained_by,
         pool=run.pool,
         recipe=Path(run.recipe).stem,
         changes=run.changes,

@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from policies.base import Plugin, Policy, Recipe
 
 POLICIES: Final = Registry["Plugin"](
-    "policy", POLICIES_GROUP, {"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP"}
+    "policy",
+    POLICIES_GROUP,
+    {"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP", "actor": "policies.actor:ACTOR"},
 )
 """Policy name → its `policies.base.Plugin`."""
 

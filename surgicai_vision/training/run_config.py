@@ -79,6 +79,9 @@ class RunConfig:
         updates: updates of the weights and `batch_size`, for LeRobot's policies.
         batch_size: frames of an update, for LeRobot's policies.
         seed: training seed.
+        algo: the algorithm of reinforcement or offline learning (`rl.algorithms`) that trained an
+            `actor`; None for imitation from a dataset.
+        env_steps: control steps that it took in the env to learn; 0 offline.
         termination: how subtasks end, where this is a hierarchical policy (`TERMINATIONS`).
         parts: digest of the file that names the policies of a hierarchical policy; empty where
             they are trained by this run.
@@ -104,6 +107,8 @@ class RunConfig:
     updates: int | None = None
     batch_size: int | None = None
     seed: int = 0
+    algo: str | None = None
+    env_steps: int | None = None
     termination: str | None = None
     parts: str = ""
     expert_swap: str | None = None
@@ -153,7 +158,9 @@ class RunConfig:
         """What the policy is fed, in words."""
         if self.encoder:
             return f"{self.encoder}-{'+'.join(self.views)}"
-        return "state" if self.privileged else "proprioception"
+        if self.privileged:
+            return "state"
+        return "relative" if self.algo else "proprioception"
 
     @property
     def recipe_label(self) -> str:
@@ -176,6 +183,8 @@ class RunConfig:
         parts = [f"hierarchical-{self.termination}"] if self.is_hierarchical else []
         if self.parts:
             parts.append(self.parts[:8])
+        elif self.algo:
+            parts += [self.algo, self.inputs, *self.changes]
         else:
             parts += [self.policy] if self.policy != "bc" else []
             parts.append(self.inputs)

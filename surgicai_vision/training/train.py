@@ -439,7 +439,7 @@ class _Training:
             image_size=dataset.image_size,
             encoder=_record(task.features[0]) if task.features else None,
             proprioception=self.vector is not None
-            and self.policy.inputs.vector != names.PRIVILEGED_STATE,
+            and self.policy.inputs.vector not in names.STATES_WITH_GOAL,
             epoch=len(self.losses),
             dataset=dataset.fingerprint,
             frames=len(self.rows),

@@ -1,0 +1,148 @@
+"""Algorithms by name: whose code they are, what they need and which settings they read.
+
+Light to import, for the command line. What a library lacks is a small class beside this file:
+`nair.DemonstrationTD3` (behaviour cloning with a Q-filter), `buffers.HindsightBuffer` (relabelled
+success ends an episode), `rlpd.LayerNormPolicy`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import final
+
+from surgicai_vision.core.config import JSON
+
+SB3 = "stable_baselines3"
+SB3_CONTRIB = "sb3_contrib"
+D3RLPY = "d3rlpy"
+
+COMMON = ("hidden", "learning_rate", "gamma", "batch_size")
+ONLINE = (*COMMON, "envs")
+OFF_POLICY = (*ONLINE, "tau", "train_every", "updates", "learning_starts", "critics")
+DETERMINISTIC = (*OFF_POLICY, "exploration_noise")
+TWIN_DELAYED = (*DETERMINISTIC, "policy_delay", "target_noise", "target_noise_clip")
+HINDSIGHT = ("goals", "relabel_demand")
+CLONING = ("demo_share", "bc_weight", "q_filter", "normalise_q", "clip_q")
+OFFLINE = (*COMMON, "tau", "critics", "samples")
+
+
+@final
+@dataclass(frozen=True)
+class Algorithm:
+    """One algorithm.
+
+    Attributes:
+        library: package whose code it is.
+        kind: its class there.
+        paper: where it is described.
+        settings: fields of `Settings` that it reads.
+        defaults: settings that differ from those of `Settings`.
+        needs_demos: it learns from demonstrations.
+        is_online: it takes steps in the env.
+    """
+
+    library: str
+    kind: str
+    paper: str
+    settings: tuple[str, ...]
+    defaults: Mapping[str, JSON] = field(default_factory=dict)
+    needs_demos: bool = False
+    is_online: bool = True
+
+    @property
+    def has_hindsight(self) -> bool:
+        """Whether it relabels goals (HER)."""
+        return "goals" in self.settings
+
+    @property
+    def is_cloning(self) -> bool:
+        """Whether a loss of behaviour cloning is added to the actor's."""
+        return "bc_weight" in self.settings
+
+
+def _offline(kind: str, paper: str, *settings: str, **defaults: JSON) -> Algorithm:
+    return Algorithm(D3RLPY, kind, paper, (*OFFLINE, *settings), defaults, True, False)
+
+
+HER = "Andrychowicz et al., Hindsight experience replay, NeurIPS 2017, arXiv:1707.01495"
+NAIR = (
+    "Nair et al., Overcoming exploration in reinforcement learning with demonstrations, ICRA 2018, "
+    "arXiv:1709.10089"
+)
+
+ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType(
+    {
+        "ppo": Algorithm(
+            SB3,
+            "PPO",
+            "Schulman et al., Proximal policy optimization algorithms, arXiv:1707.06347",
+            (*ONLINE, "rollout"),
+        ),
+        "ddpg": Algorithm(
+            SB3,
+            "DDPG",
+            "Lillicrap et al., Continuous control with deep reinforcement learning, ICLR 2016, "
+            "arXiv:1509.02971",
+            DETERMINISTIC,
+            {"critics": 1},
+        ),
+        "sac": Algorithm(
+            SB3,
+            "SAC",
+            "Haarnoja et al., Soft actor-critic, ICML 2018, arXiv:1801.01290",
+            OFF_POLICY,
+        ),
+        "td3": Algorithm(
+            SB3,
+            "TD3",
+            "Fujimoto et al., Addressing function approximation error in actor-critic methods, "
+            "ICML 2018, arXiv:1802.09477",
+            TWIN_DELAYED,
+        ),
+        "tqc": Algorithm(
+            SB3_CONTRIB,
+            "TQC",
+            "Kuznetsov et al., Controlling overestimation bias with truncated mixture of "
+            "continuous distributional quantile critics, ICML 2020, arXiv:2005.04269",
+            OFF_POLICY,
+        ),
+        "ddpg-her": Algorithm(SB3, "DDPG", HER, (*DETERMINISTIC, *HINDSIGHT), {"critics": 1}),
+        "sac-her": Algorithm(SB3, "SAC", HER, (*OFF_POLICY, *HINDSIGHT)),
+        "td3-her": Algorithm(SB3, "TD3", HER, (*TWIN_DELAYED, *HINDSIGHT)),
+        "td3-bc": Algorithm(SB3, "TD3", NAIR, (*TWIN_DELAYED, *CLONING), needs_demos=True),
+        "td3-her-bc": Algorithm(
+            SB3, "TD3", NAIR, (*TWIN_DELAYED, *HINDSIGHT, *CLONING), needs_demos=True
+        ),
+        "rlpd": Algorithm(
+            SB3,
+            "SAC",
+            "Ball et al., Efficient online reinforcement learning with offline data, ICML 2023, "
+            "arXiv:2302.02948",
+            (*OFF_POLICY, "demo_share"),
+            {"demo_share": 0.5, "hidden": [256, 256]},
+            needs_demos=True,
+        ),
+        "bc": _offline("BC", "Pomerleau, ALVINN, NeurIPS 1988"),
+        "awac": _offline(
+            "AWAC",
+            "Nair et al., AWAC: accelerating online reinforcement learning with offline datasets, "
+            "arXiv:2006.09359",
+        ),
+        "bcq": _offline(
+            "BCQ",
+            "Fujimoto et al., Off-policy deep reinforcement learning without exploration, "
+            "ICML 2019, arXiv:1812.02900",
+        ),
+        "iql": _offline(
+            "IQL",
+            "Kostrikov et al., Offline reinforcement learning with implicit Q-learning, ICLR 2022, "
+            "arXiv:2110.06169",
+        ),
+        "cal-ql": _offline(
+            "CalQL",
+            "Nakamoto et al., Cal-QL: calibrated offline RL pre-training for efficient online "
+            "fine-tuning, NeurIPS 2023, arXiv:2303.05479",
+        ),
+    }
+)
+"""Name → algorithm, in the order of SurgicAI's tables."""

@@ -1,0 +1,226 @@
+"""Export: transitions in the formats of other libraries.
+
+    write(transitions, "d3rlpy", Path("outputs/transitions/grasp"))
+
+| format | file in the folder | read by |
+|---|---|---|
+| npz | `transitions.npz` | `numpy.load`, `transitions.read_transitions` |
+| sb3 | `buffer.pkl` | `model.load_replay_buffer`; of obs_type "goal" a `HerReplayBuffer` |
+| d3rlpy | `dataset.h5` | `d3rlpy.dataset.ReplayBuffer.load(file, InfiniteBuffer())` |
+| minari | `minari/` | `minari.load_dataset(id)` with `MINARI_DATASETS_PATH` there |
+
+`fill(buffer, transitions)` puts them into the replay buffer of a Stable-Baselines3 model of one's
+own, HER's included. d3rlpy keeps no observation after the last action of an episode, which it does
+not need: an episode ends with its success.
+"""
+
+import io
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from surgicai_vision.core.errors import check_name
+from surgicai_vision.core.files import write_bytes, write_json
+from surgicai_vision.core.tasks import env_id
+from surgicai_vision.envs.observation import ObservationConfig
+from surgicai_vision.rl.extra import check_extra
+from surgicai_vision.rl.transitions import OBSERVATION, Transitions, write_transitions
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
+
+NPZ = "transitions.npz"
+CARD = "transitions.json"
+"""What the folder holds, in words."""
+ACTIONS = spaces.Box(-1.0, 1.0, (7,), np.float32)
+
+
+def write(transitions: Transitions, format: str, out: Path) -> Path:
+    """Write transitions into a folder; return the file or folder that a library reads.
+
+    Args:
+        transitions: of one env.
+        format: one of `FORMATS`.
+        out: the folder, which is made.
+
+    Raises:
+        InputError: the format's package is not installed, or takes no goal dicts.
+    """
+    check_name("format", format, FORMATS)
+    check_extra(f"--format {format}", *PACKAGES[format])
+    out.mkdir(parents=True, exist_ok=True)
+    written = FORMATS[format](transitions, out)
+    write_json(
+        out / CARD,
+        {
+            "task": transitions.config.task,
+            "obs_type": transitions.obs_type,
+            "format": format,
+            "transitions": len(transitions),
+            "episodes": transitions.episodes,
+            "failed": transitions.failed,
+            "demos": transitions.demos,
+        },
+    )
+    return written
+
+
+def _write_npz(transitions: Transitions, out: Path) -> Path:
+    path = out / NPZ
+    write_transitions(path, transitions)
+    return path
+
+
+def _write_sb3(transitions: Transitions, out: Path) -> Path:
+    from stable_baselines3.common.save_util import save_to_pkl
+
+    content = io.BytesIO()
+    save_to_pkl(content, buffer_of(transitions))
+    path = out / "buffer.pkl"
+    write_bytes(path, content.getvalue())
+    return path
+
+
+def _write_d3rlpy(transitions: Transitions, out: Path) -> Path:
+    from d3rlpy.dataset import MDPDataset
+
+    dataset = MDPDataset(
+        observations=transitions.vector,
+        actions=transitions.action,
+        rewards=transitions.reward,
+        terminals=transitions.terminated.astype(np.float32),
+        timeouts=(ends(transitions) & ~transitions.terminated).astype(np.float32),
+    )
+    content = io.BytesIO()
+    dataset.dump(content)
+    path = out / "dataset.h5"
+    write_bytes(path, content.getvalue())
+    return path
+
+
+def _write_minari(transitions: Transitions, out: Path) -> Path:
+    folder = out / "minari"
+    os.environ["MINARI_DATASETS_PATH"] = str(folder.absolute())
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    config = transitions.config
+    episodes = [
+        EpisodeBuffer(
+            id=index,
+            seed=int(transitions.seeds[index]) if transitions.seeds[index] >= 0 else None,
+            observations=_whole(transitions, rows),
+            actions=transitions.action[rows],
+            rewards=transitions.reward[rows].tolist(),
+            terminations=transitions.terminated[rows].tolist(),
+            truncations=transitions.truncated[rows].tolist(),
+        )
+        for index, rows in enumerate(_rows(transitions))
+    ]
+    minari.create_dataset_from_buffers(
+        f"surgicai/{config.task}/{transitions.obs_type}-v0",
+        episodes,
+        action_space=ACTIONS,
+        observation_space=space_of(transitions),
+        algorithm_name="surgicai-vision demonstrations",
+        description=f"{env_id(config.task)}, obs_type {transitions.obs_type}, "
+        f"reward {config.reward}; {json.dumps({'demos': transitions.demos})}",
+    )
+    return folder
+
+
+FORMATS: Mapping[str, Callable[[Transitions, Path], Path]] = MappingProxyType(
+    {"npz": _write_npz, "sb3": _write_sb3, "d3rlpy": _write_d3rlpy, "minari": _write_minari}
+)
+"""Format → what writes it."""
+PACKAGES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"npz": (), "sb3": ("stable_baselines3",), "d3rlpy": ("d3rlpy",), "minari": ("minari",)}
+)
+"""Format → what must be installed."""
+
+
+def space_of(transitions: Transitions) -> spaces.Space[object]:
+    """Return the observation space of transitions."""
+    return ObservationConfig(transitions.obs_type).space()
+
+
+def buffer_of(transitions: Transitions) -> "ReplayBuffer":
+    """Return a replay buffer of Stable-Baselines3 that holds the transitions and no more.
+
+    Of obs_type "goal" it is a `HerReplayBuffer`; give it an env (`set_env`) before it relabels.
+    """
+    from stable_baselines3 import HerReplayBuffer
+    from stable_baselines3.common.buffers import ReplayBuffer
+    from stable_baselines3.common.vec_env import VecEnv
+
+    space = space_of(transitions)
+    buffer: ReplayBuffer
+    if isinstance(space, spaces.Dict):
+        without = cast(VecEnv, None)
+        buffer = HerReplayBuffer(len(transitions), space, ACTIONS, env=without, device="cpu")
+    else:
+        buffer = ReplayBuffer(len(transitions), space, ACTIONS, device="cpu")
+    fill(buffer, transitions)
+    return buffer
+
+
+def fill(buffer: "BaseBuffer", transitions: Transitions) -> None:
+    """Add transitions to a replay buffer of Stable-Baselines3 for one env, in their order.
+
+    Args:
+        buffer: a `ReplayBuffer`, or a `HerReplayBuffer` where they are goal dicts.
+        transitions: whose observations the buffer's space holds.
+    """
+    last = ends(transitions)
+    for row in range(len(transitions)):
+        buffer.add(
+            _at(transitions, transitions.observation, row),
+            _at(transitions, transitions.next_observation, row),
+            transitions.action[row : row + 1],
+            transitions.reward[row : row + 1],
+            last[row : row + 1],
+            [{"TimeLimit.truncated": bool(last[row] and not transitions.terminated[row])}],
+        )
+
+
+def ends(transitions: Transitions) -> NDArray[np.bool_]:
+    """Return whether each transition is its episode's last, (N,)."""
+    after = np.append(transitions.episode[1:], -1)
+    last: NDArray[np.bool_] = after != transitions.episode
+    return last
+
+
+def _at(
+    transitions: Transitions, parts: Mapping[str, NDArray[np.float32]], row: int
+) -> NDArray[np.float32] | dict[str, NDArray[np.float32]]:
+    """Return one observation as a batch of one."""
+    if transitions.is_goal:
+        return {key: part[row : row + 1] for key, part in parts.items()}
+    return parts[OBSERVATION][row : row + 1]
+
+
+def _rows(transitions: Transitions) -> Iterator[slice]:
+    """Yield the rows of each episode."""
+    stops = np.flatnonzero(ends(transitions)) + 1
+    start = 0
+    for stop in stops.tolist():
+        yield slice(start, stop)
+        start = stop
+
+
+def _whole(
+    transitions: Transitions, rows: slice
+) -> NDArray[np.float32] | dict[str, NDArray[np.float32]]:
+    """Return an episode's T + 1 observations."""
+    parts = {
+        key: np.concatenate([part[rows], transitions.next_observation[key][rows][-1:]])
+        for key, part in transitions.observation.items()
+    }
+    return parts if transitions.is_goal else parts[OBSERVATION]

@@ -1,0 +1,166 @@
+"""Offline learning by d3rlpy: from demonstrations alone, without a step in an env."""
+
+import io
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, final
+
+import d3rlpy
+import numpy as np
+import torch
+from d3rlpy.algos import AWACConfig, BCConfig, BCQConfig, CalQLConfig, IQLConfig
+from d3rlpy.models.encoders import VectorEncoderFactory
+from numpy.typing import NDArray
+from torch import nn
+
+from surgicai_vision.rl.learner import Learner, State, random_state, set_random_state
+from surgicai_vision.rl.settings import Request, Settings
+from surgicai_vision.rl.transitions import Transitions
+
+
+def _actor_critic(settings: Settings) -> dict[str, Any]:
+    """Return what all configurations with actor and critics share."""
+    encoder = VectorEncoderFactory(list(settings.hidden))
+    return {
+        "actor_learning_rate": settings.learning_rate,
+        "critic_learning_rate": settings.learning_rate,
+        "actor_encoder_factory": encoder,
+        "critic_encoder_factory": encoder,
+        "batch_size": settings.batch_size,
+        "gamma": settings.gamma,
+        "tau": settings.tau,
+    }
+
+
+def _bc(settings: Settings) -> Any:
+    return BCConfig(
+        learning_rate=settings.learning_rate,
+        batch_size=settings.batch_size,
+        gamma=settings.gamma,
+        encoder_factory=VectorEncoderFactory(list(settings.hidden)),
+    )
+
+
+def _awac(settings: Settings) -> Any:
+    return AWACConfig(n_critics=settings.critics, **_actor_critic(settings))
+
+
+def _bcq(settings: Settings) -> Any:
+    encoder = VectorEncoderFactory(list(settings.hidden))
+    return BCQConfig(
+        imitator_learning_rate=settings.learning_rate,
+        imitator_encoder_factory=encoder,
+        n_critics=settings.critics,
+        n_action_samples=settings.samples,
+        **_actor_critic(settings),
+    )
+
+
+def _iql(settings: Settings) -> Any:
+    encoder = VectorEncoderFactory(list(settings.hidden))
+    return IQLConfig(
+        n_critics=settings.critics, value_encoder_factory=encoder, **_actor_critic(settings)
+    )
+
+
+def _cal_ql(settings: Settings) -> Any:
+    return CalQLConfig(
+        n_critics=settings.critics, n_action_samples=settings.samples, **_actor_critic(settings)
+    )
+
+
+CONFIGS: Mapping[str, Callable[[Settings], Any]] = MappingProxyType(
+    {"BC": _bc, "AWAC": _awac, "BCQ": _bcq, "IQL": _iql, "CalQL": _cal_ql}
+)
+"""`Algorithm.kind` → its configuration."""
+
+
+@final
+class OfflineLearner(Learner):
+    """An algorithm of d3rlpy and its dataset.
+
+    Args:
+        request: what is trained.
+        transitions: the demonstrations.
+        mean: what is removed from each input, (n,).
+        std: what each input is then divided by, (n,).
+    """
+
+    def __init__(
+        self,
+        request: Request,
+        transitions: Transitions,
+        mean: NDArray[np.float64],
+        std: NDArray[np.float64],
+    ):
+        self.request = request
+        self.mean = torch.from_numpy(mean).float()
+        self.std = torch.from_numpy(std).float()
+        d3rlpy.seed(request.seed)
+        rows = ((transitions.vector - mean) / std).astype(np.float32)
+        self._dataset = d3rlpy.dataset.MDPDataset(
+            observations=rows,
+            actions=transitions.action,
+            rewards=transitions.reward,
+            terminals=transitions.terminated.astype(np.float32),
+        )
+        self._algo = CONFIGS[request.algorithm.kind](request.settings).create(device=False)
+        self._algo.create_impl((rows.shape[1],), transitions.action.shape[1])
+
+    @property
+    def done(self) -> int:
+        """Return the updates taken."""
+        return self.updates
+
+    @property
+    def updates(self) -> int:
+        """Return the updates of the weights."""
+        return int(self._algo.grad_step)
+
+    def advance(self, target: int) -> dict[str, float]:
+        """Take updates until there are so many; return the mean losses."""
+        losses: dict[str, list[float]] = {}
+        while self.updates < target:
+            batch = self._dataset.sample_transition_batch(self.request.settings.batch_size)
+            for name, value in self._algo.update(batch).items():
+                losses.setdefault(name, []).append(float(value))
+        return {name: float(np.mean(values)) for name, values in losses.items()}
+
+    def layers(self) -> list[nn.Linear]:
+        """Return the linear layers of the actor, in order."""
+        policy = self.policy
+        head = policy._mu if hasattr(policy, "_mu") else policy._fc
+        return [m for m in policy._encoder.modules() if isinstance(m, nn.Linear)] + [head]
+
+    @property
+    def policy(self) -> Any:
+        """The library's actor."""
+        return self._algo.impl.policy
+
+    @property
+    def modules(self) -> Any:
+        """All networks and optimisers of the algorithm, as the library names them."""
+        return self._algo.impl.modules
+
+    def get_state(self) -> State:
+        """Return networks, optimisers, counter and random state."""
+        content = io.BytesIO()
+        self._algo.impl.save_model(content)
+        content.seek(0)
+        return {
+            "model": torch.load(content, weights_only=True),
+            "updates": self.updates,
+            "random": random_state(),
+        }
+
+    def set_state(self, state: State) -> None:
+        """Go on from what `get_state` returned."""
+        content = io.BytesIO()
+        torch.save(state["model"], content)
+        content.seek(0)
+        self._algo.impl.load_model(content)
+        self._algo.set_grad_step(state["updates"])
+        set_random_state(state["random"])
+
+    def close(self) -> None:
+        """Nothing to free."""

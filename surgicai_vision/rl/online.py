@@ -1,0 +1,280 @@
+"""Online learning by Stable-Baselines3: models from a request, and their whole state."""
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, cast, final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sb3_contrib import TQC
+from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
+from torch import nn
+
+from surgicai_vision.rl.buffers import HindsightBuffer, MixedBuffer, demonstrations_of
+from surgicai_vision.rl.extractor import RelativeExtractor, StandardExtractor
+from surgicai_vision.rl.learner import Arrays, Learner, State, random_state, set_random_state
+from surgicai_vision.rl.nair import DemonstrationTD3
+from surgicai_vision.rl.rlpd import LayerNormPolicy
+from surgicai_vision.rl.settings import Request
+from surgicai_vision.rl.transitions import Transitions
+from surgicai_vision.rl.vec_env import SuturingVecEnv
+
+KINDS: Mapping[str, type[BaseAlgorithm]] = MappingProxyType(
+    {"PPO": PPO, "DDPG": DDPG, "SAC": SAC, "TD3": TD3, "TQC": TQC}
+)
+"""`Algorithm.kind` → the library's class."""
+FIRST_RANDOM_STEPS = 1000
+"""Random steps before the first update of an algorithm without demonstrations."""
+BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+EPISODES = ("ep_start", "ep_length")
+COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
+
+
+@final
+class OnlineLearner(Learner):
+    """A model of Stable-Baselines3 and its envs.
+
+    Args:
+        request: what is trained.
+        transitions: the demonstrations of an algorithm that learns from some, else None.
+        mean: what is removed from each input, (n,).
+        std: what each input is then divided by, (n,).
+        workers: worker processes of the envs.
+    """
+
+    def __init__(
+        self,
+        request: Request,
+        transitions: Transitions | None,
+        mean: NDArray[np.float64],
+        std: NDArray[np.float64],
+        workers: int = 0,
+    ):
+        self.request = request
+        self.mean = torch.from_numpy(mean).float()
+        self.std = torch.from_numpy(std).float()
+        settings = request.settings
+        has_goal = request.algorithm.has_hindsight
+        obs_type = "goal" if has_goal else request.observation
+        self.env = SuturingVecEnv.of(request.env, obs_type, settings.envs, workers)
+        self.model = self._model()
+        if transitions is not None:
+            buffer = self._buffer
+            assert isinstance(buffer, MixedBuffer | HindsightBuffer)
+            source = demonstrations_of(transitions, self.env, request.keeps_demand, settings.goals)
+            buffer.mix(source, settings.demo_share)
+        self.squash = "clip" if isinstance(self.model, PPO) else "tanh"
+
+    # -- the model ---------------------------------------------------------------------------------
+
+    def _model(self) -> BaseAlgorithm:
+        """Return the untrained model of the request."""
+        request = self.request
+        settings = request.settings
+        algorithm = request.algorithm
+        kind = KINDS[algorithm.kind]
+        has_goal = algorithm.has_hindsight
+        options: dict[str, Any] = {
+            "learning_rate": settings.learning_rate,
+            "gamma": settings.gamma,
+            "batch_size": settings.batch_size,
+            "seed": request.seed,
+            "device": "cpu",
+        }
+        network: dict[str, Any] = {
+            "activation_fn": nn.ReLU,
+            "features_extractor_class": RelativeExtractor if has_goal else StandardExtractor,
+            "features_extractor_kwargs": {
+                "mean": self.mean.tolist(),
+                "std": self.std.tolist(),
+                **({"task": request.env.task} if has_goal else {}),
+            },
+        }
+        hidden = list(settings.hidden)
+        if kind is PPO:
+            network["net_arch"] = {"pi": hidden, "vf": hidden}
+            options["n_steps"] = max(settings.rollout // settings.envs, 1)
+            return PPO("MlpPolicy", self.env, policy_kwargs=network, **options)
+        network["net_arch"] = {"pi": hidden, "qf": hidden}
+        network["n_critics"] = settings.critics
+        options |= {
+            "tau": settings.tau,
+            "buffer_size": request.env_steps + settings.envs,
+            "train_freq": settings.train_every,
+            "gradient_steps": settings.updates * settings.envs,
+            "learning_starts": self._learning_starts(),
+            "replay_buffer_class": HindsightBuffer if has_goal else MixedBuffer,
+        }
+        if has_goal:
+            options["replay_buffer_kwargs"] = {
+                "keeps_demand": request.keeps_demand,
+                "n_sampled_goal": settings.goals,
+            }
+        if "exploration_noise" in algorithm.settings:
+            spread = settings.exploration_noise * np.ones(7)
+            options["action_noise"] = NormalActionNoise(np.zeros(7), spread)
+        if "policy_delay" in algorithm.settings:
+            options["policy_delay"] = settings.policy_delay
+            options["target_policy_noise"] = settings.target_noise
+            options["target_noise_clip"] = settings.target_noise_clip
+        if algorithm.is_cloning:
+            kind = DemonstrationTD3
+            for name in ("bc_weight", "q_filter", "normalise_q", "clip_q"):
+                options[name] = getattr(settings, name)
+        policy: Any = "MultiInputPolicy" if has_goal else "MlpPolicy"
+        if request.algo == "rlpd":
+            policy = LayerNormPolicy
+        return kind(policy, self.env, policy_kwargs=network, **options)
+
+    def _learning_starts(self) -> int:
+        """Return the steps of random actions: hindsight needs an episode that has ended."""
+        settings = self.request.settings
+        if settings.learning_starts:
+            return settings.learning_starts
+        env = self.request.env
+        episode = (env.max_steps // env.action_repeat + 1) * settings.envs
+        if self.request.algorithm.needs_demos:
+            return episode
+        return max(episode, FIRST_RANDOM_STEPS)
+
+    @property
+    def _buffer(self) -> MixedBuffer | HindsightBuffer | None:
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            return None
+        return cast(MixedBuffer | HindsightBuffer, self.model.replay_buffer)
+
+    # -- learning ----------------------------------------------------------------------------------
+
+    @property
+    def done(self) -> int:
+        """Return the control steps taken: an action is held for `action_repeat` of them."""
+        return self.model.num_timesteps * self.request.env.action_repeat
+
+    @property
+    def updates(self) -> int:
+        """Return the updates of the weights."""
+        return int(self.model._n_updates)
+
+    def log_to(self, logger: Logger) -> None:
+        """Log to TensorBoard."""
+        self.model.set_logger(logger)
+
+    def advance(self, target: int) -> dict[str, float]:
+        """Go on until so many control steps are done."""
+        decisions = -(-target // self.request.env.action_repeat)
+        self.model.learn(
+            decisions - self.model.num_timesteps, reset_num_timesteps=False, log_interval=4
+        )
+        successes = self.model.ep_success_buffer
+        return {"training success": float(np.mean(successes))} if successes else {}
+
+    def layers(self) -> list[nn.Linear]:
+        """Return the linear layers of the actor, in order."""
+        policy: Any = self.model.policy
+        if isinstance(self.model, PPO):
+            parts = [policy.mlp_extractor.policy_net, policy.action_net]
+        elif isinstance(self.model, TD3):  # DDPG too
+            parts = [policy.actor.mu]
+        else:
+            parts = [policy.actor.latent_pi, policy.actor.mu]
+        modules = [module for part in parts for module in part.modules()]
+        return [module for module in modules if isinstance(module, nn.Linear)]
+
+    # -- the whole state ---------------------------------------------------------------------------
+
+    def get_state(self) -> State:
+        """Return networks, optimisers, replay buffer, envs, counters and random state."""
+        model = self.model
+        snapshots, returns, lengths = self.env.get_state()
+        _, variables = model._get_torch_save_params()
+        state: State = {
+            "parameters": model.get_parameters(),
+            "variables": {name: recursive_getattr(model, name) for name in variables},
+            "counters": {name: int(getattr(model, name)) for name in COUNTERS},
+            "last": _tensors(model._last_obs),
+            "starts": _tensors(model._last_episode_starts),
+            "successes": [float(value) for value in model.ep_success_buffer or ()],
+            "episodes": [_plain(value) for value in model.ep_info_buffer or ()],
+            "envs": [torch.from_numpy(vector) for vector, _ in snapshots],
+            "generators": json.dumps([generator for _, generator in snapshots]),
+            "returns": torch.from_numpy(returns),
+            "lengths": torch.from_numpy(lengths),
+            "actions": json.dumps(model.action_space.np_random.bit_generator.state),
+            "random": random_state(),
+        }
+        buffer = self._buffer
+        if buffer is not None:
+            rows = buffer.buffer_size if buffer.full else buffer.pos
+            names = (*BUFFER, *EPISODES) if isinstance(buffer, HindsightBuffer) else BUFFER
+            state["buffer"] = Arrays.of(buffer, names, rows)
+            state["position"] = [int(buffer.pos), int(buffer.full)]
+            if isinstance(buffer, HindsightBuffer):
+                state["episode"] = torch.from_numpy(buffer._current_ep_start.copy())
+        return state
+
+    def set_state(self, state: State) -> None:
+        """Go on from what `get_state` returned."""
+        model = self.model
+        if model._last_obs is None:
+            model._setup_learn(0, None, reset_num_timesteps=False)
+        model.set_parameters(state["parameters"], exact_match=True)
+        for name, value in state["variables"].items():
+            recursive_setattr(model, f"{name}.data", value.data)
+        for name, value in state["counters"].items():
+            setattr(model, name, value)
+        model._last_obs = _arrays(state["last"])
+        model._last_episode_starts = _arrays(state["starts"])
+        assert model.ep_success_buffer is not None and model.ep_info_buffer is not None
+        model.ep_success_buffer.extend(state["successes"])
+        model.ep_info_buffer.extend(state["episodes"])
+        buffer = self._buffer
+        if buffer is not None:
+            Arrays.put(buffer, state["buffer"])
+            buffer.pos, full = state["position"]
+            buffer.full = bool(full)
+            if isinstance(buffer, HindsightBuffer):
+                buffer._current_ep_start = state["episode"].numpy().copy()
+        generators = json.loads(state["generators"])
+        vectors = [vector.numpy() for vector in state["envs"]]
+        snapshots = list(zip(vectors, generators, strict=True))
+        self.env.set_state(snapshots, state["returns"].numpy(), state["lengths"].numpy())
+        model.action_space.np_random.bit_generator.state = json.loads(state["actions"])
+        set_random_state(state["random"])
+
+    def save(self, path: Path) -> None:
+        """Write the model as Stable-Baselines3 does, for use with that library."""
+        content = io.BytesIO()
+        self.model.save(content)
+        path.write_bytes(content.getvalue())
+
+    def close(self) -> None:
+        """End the workers."""
+        self.env.close()
+
+
+def _tensors(value: Any) -> Any:
+    """Return an array, or a dict of arrays, as tensors."""
+    if isinstance(value, Mapping):
+        return {key: _tensors(part) for key, part in value.items()}
+    return torch.from_numpy(np.array(value))
+
+
+def _arrays(value: Any) -> Any:
+    """Return what `_tensors` made as arrays again."""
+    if isinstance(value, Mapping):
+        return {key: _arrays(part) for key, part in value.items()}
+    return value.numpy().copy()
+
+
+def _plain(episode: Mapping[str, float]) -> dict[str, float]:
+    """Return an episode's statistics as plain numbers."""
+    return {name: float(value) for name, value in episode.items()}

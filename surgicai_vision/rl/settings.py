@@ -1,0 +1,198 @@
+"""Settings of all algorithms, and what a training is asked for, as frozen data."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import final
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import JSON, TaskConfig, from_mapping
+from surgicai_vision.core.errors import InputError, UnknownName, check_name
+from surgicai_vision.core.tasks import load_subtask
+from surgicai_vision.rl.algorithms import ALGORITHMS, Algorithm
+
+OBSERVATIONS = ("relative", "state")
+DEMANDS = ("auto", "achieved", "kept")
+
+
+@final
+@dataclass(frozen=True)
+class Settings:
+    """Settings; each algorithm reads those that `Algorithm.settings` names.
+
+    The paper is SurgicAI's (appendix), the code its release. Where nothing is said the default is
+    the library's.
+
+    Attributes:
+        hidden: width of each hidden layer of actor and critics (paper 4 × 256, code 3 × 256).
+        learning_rate: Adam's (code 2e-4).
+        gamma: discount a decision (paper .99, code .995).
+        batch_size: transitions an update (code 256).
+        envs: envs that are stepped at a time; the number of worker processes changes no result.
+        tau: Polyak factor of the target networks (code .005).
+        train_every: steps of an env from update to update.
+        updates: updates each time, for each env.
+        learning_starts: env steps by random actions before the first update; 0 takes 1,000, with
+            demonstrations one episode.
+        critics: number of critics, of which the smallest counts.
+        exploration_noise: standard deviation of the noise on actions (code .05).
+        policy_delay: updates of the critics for one of the actor (code 2).
+        target_noise: standard deviation of the noise on the target's action (code .2).
+        target_noise_clip: where it is clipped (code .5).
+        goals: relabelled transitions for each real one (paper 3, code 4); a future state's goal.
+        relabel_demand: what a relabelled goal asks for besides the pose: "achieved", what then
+            held, as in the paper; "kept", what the task asks for; "auto" keeps it where the task
+            asks for holes or for the needle being out, which "go there" would else replace.
+        demo_share: share of a batch that is drawn from the demonstrations (code .3).
+        bc_weight: λ2, weight of the cloning loss; λ1 = 1 - λ2 is that of the critic's (paper .2,
+            .5, .8; .5 by default).
+        q_filter: clone only where the critic values the demonstrated action above the actor's.
+        normalise_q: divide the critic's value in the actor's loss by its mean size, so that λ2
+            weighs the same at every scale of reward (Fujimoto and Gu, A minimalist approach to
+            offline reinforcement learning, NeurIPS 2021).
+        clip_q: clip targets to the range of a return of the reward, [-1 / (1 - γ), 0].
+        rollout: steps of all envs from update to update (PPO).
+        samples: actions sampled a state by BCQ and Cal-QL (their papers' code: 100 and 10).
+    """
+
+    hidden: tuple[int, ...] = (256, 256, 256)
+    learning_rate: float = 1e-3
+    gamma: float = 0.99
+    batch_size: int = 256
+    envs: int = 1
+    tau: float = 0.005
+    train_every: int = 2
+    updates: int = 1
+    learning_starts: int = 0
+    critics: int = 2
+    exploration_noise: float = 0.1
+    policy_delay: int = 2
+    target_noise: float = 0.2
+    target_noise_clip: float = 0.5
+    goals: int = 4
+    relabel_demand: str = "auto"
+    demo_share: float = 0.3
+    bc_weight: float = 0.5
+    q_filter: bool = True
+    normalise_q: bool = True
+    clip_q: bool = True
+    rollout: int = 2048
+    samples: int = 10
+
+    def __post_init__(self) -> None:
+        check_name("relabel_demand", self.relabel_demand, DEMANDS)
+        positive = ("learning_rate", "batch_size", "envs", "train_every", "updates", "critics")
+        for name in (*positive, "policy_delay", "goals", "rollout", "samples"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be above 0.")
+        for name in ("gamma", "tau", "demo_share", "bc_weight"):
+            if not 0 < getattr(self, name) < 1:
+                raise InputError(
+                    f"{name} is {getattr(self, name)}; it must be between 0 and 1, both left out."
+                )
+        if not self.hidden or min(self.hidden) < 1:
+            raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1.")
+
+
+@final
+@dataclass(frozen=True)
+class Request:
+    """Everything that decides the result of a training.
+
+    Attributes:
+        algo: a key of `ALGORITHMS`.
+        env: the task, with its options.
+        observation: "relative" or "state", what the policy is fed.
+        settings: as they are, defaults of the algorithm included.
+        changes: which of them were changed, "key=value" each; they name the run.
+        env_steps: control steps taken in the env; 0 for offline algorithms.
+        updates: updates of offline algorithms; 0 online.
+        seed: of networks, batches, noise and starts.
+        demonstrations: how many it learns from; 0 for none.
+        demos: sha256 over their files.
+        validation: episodes of each evaluation on the way, from validation starts.
+        save_every: control steps (offline: updates) between evaluations and training states.
+    """
+
+    algo: str
+    env: TaskConfig = field(default_factory=TaskConfig)
+    observation: str = "relative"
+    settings: Settings = field(default_factory=Settings)
+    changes: tuple[str, ...] = ()
+    env_steps: int = 0
+    updates: int = 0
+    seed: int = 0
+    demonstrations: int = 0
+    demos: str = ""
+    validation: int = 20
+    save_every: int = 5000
+
+    def __post_init__(self) -> None:
+        algorithm = self.algorithm
+        check_name("observation", self.observation, OBSERVATIONS)
+        given, needed = (
+            ("env_steps", "updates") if algorithm.is_online else ("updates", "env_steps")
+        )
+        if getattr(self, given) < 1 or getattr(self, needed):
+            raise InputError(f"'{self.algo}' needs {given} of at least 1, and no {needed}.")
+        if algorithm.needs_demos and not self.demonstrations:
+            raise InputError(f"'{self.algo}' learns from demonstrations; give some.")
+        if not algorithm.needs_demos and self.demonstrations:
+            raise InputError(f"'{self.algo}' learns from no demonstrations; leave them out.")
+        if algorithm.has_hindsight and self.observation != "relative":
+            raise InputError(
+                f"'{self.algo}' relabels goals, which obs_type 'state' does not show apart; "
+                "give observation relative."
+            )
+        if algorithm.has_hindsight and self.env.task not in names.SUBTASKS:
+            raise InputError(
+                f"'{self.algo}' relabels the goal of one subtask; '{self.env.task}' has several."
+            )
+        if algorithm.has_hindsight and self.env.reward != "sparse":
+            raise InputError(f"'{self.algo}' needs the sparse reward, not '{self.env.reward}'.")
+        if self.save_every < 1 or self.validation < 0 or self.seed < 0:
+            raise InputError(
+                f"save_every is {self.save_every}, validation {self.validation}, seed {self.seed}; "
+                "at least 1, 0 and 0."
+            )
+
+    @property
+    def algorithm(self) -> Algorithm:
+        """The algorithm."""
+        return ALGORITHMS[check_name("algo", self.algo, ALGORITHMS)]
+
+    @property
+    def total(self) -> int:
+        """Control steps to take, or updates of an offline algorithm."""
+        return self.env_steps if self.algorithm.is_online else self.updates
+
+    @property
+    def keeps_demand(self) -> bool:
+        """Whether a relabelled goal keeps asking for what the task asks for."""
+        if self.settings.relabel_demand != "auto":
+            return self.settings.relabel_demand == "kept"
+        demands = load_subtask(self.env.task).demands[self.env.tolerance]
+        return bool(demands.holes or demands.out)
+
+
+def settings_of(algo: str, changes: Mapping[str, JSON]) -> Settings:
+    """Return the settings of an algorithm with changes.
+
+    Args:
+        algo: a key of `ALGORITHMS`.
+        changes: settings to replace.
+
+    Raises:
+        UnknownName: an algorithm, or a setting that it does not read.
+        InputError: a value that is not allowed.
+    """
+    algorithm = ALGORITHMS[check_name("algo", algo, ALGORITHMS)]
+    for key in changes:
+        if key not in algorithm.settings:
+            raise UnknownName(f"setting of '{algo}'", key, algorithm.settings)
+    return from_mapping(Settings, {**algorithm.defaults, **changes}, f"settings of '{algo}'")
+
+
+def read_by(algo: str, settings: Settings) -> dict[str, JSON]:
+    """Return the settings that an algorithm reads, as data."""
+    values = asdict(settings)
+    return {key: values[key] for key in ALGORITHMS[algo].settings}

@@ -1,0 +1,393 @@
+"""Train by reinforcement or offline learning: from a request to a checkpoint.
+
+`train(request, demos, out)` goes on where it was broken off: a kill costs at most the steps since
+the last training state, and the result is what it would have been. See the package's docstring for
+the folder.
+"""
+
+import dataclasses
+import functools
+import io
+import pickle
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from policies.actor import VECTORS, Actor, ActorRecipe
+from surgicai_vision import __version__, envs
+from surgicai_vision.core import names, processes
+from surgicai_vision.core.config import to_mapping
+from surgicai_vision.core.errors import InputError, OutputExists
+from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
+from surgicai_vision.core.progress import Progress
+from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.evaluation.rollout import run_share
+from surgicai_vision.rl.extra import check_extra
+from surgicai_vision.rl.learner import Learner
+from surgicai_vision.rl.settings import Request, read_by
+from surgicai_vision.rl.transitions import Transitions, of_demos
+from surgicai_vision.training.checkpoint import (
+    CARD,
+    Checkpoint,
+    read_checkpoint,
+    write_checkpoint,
+)
+from surgicai_vision.training.run_config import RunConfig
+from surgicai_vision.training.threads import one_thread
+
+REQUEST = "training.json"
+STATE = "training_state.pt"
+CURVE = "curve.json"
+IMAGE_SIZE = 224
+"""Of a checkpoint without images; nothing reads it."""
+SMALLEST_STD = 0.1
+"""Inputs that vary less (cm, rad or a share) are divided by this: exploration leaves the narrow way
+of the demonstrations, and would see inputs of many standard deviations."""
+RANDOM_EPISODES = 5
+"""Episodes of random actions that give the statistics of the inputs without demonstrations."""
+EVALUATED_AT_ONCE = 10
+
+
+@dataclass(frozen=True)
+class Point:
+    """One point of a learning curve.
+
+    Attributes:
+        env_steps: control steps taken in the env so far.
+        updates: updates of the weights so far.
+        minutes: spent on learning so far, evaluations left out.
+        successes: episodes that succeeded.
+        episodes: episodes evaluated, from validation starts.
+        distance_mm: median distance to the goal at their end.
+    """
+
+    env_steps: int
+    updates: int
+    minutes: float
+    successes: int
+    episodes: int
+    distance_mm: float
+
+
+def train(
+    request: Request,
+    demos: Sequence[Path],
+    out: Path,
+    *,
+    workers: int = 0,
+    progress: Progress | None = None,
+    tensorboard: bool = True,
+) -> Checkpoint:
+    """Train, or go on where it was broken off, and write the checkpoint.
+
+    Args:
+        request: what is trained.
+        demos: files of the demonstrations; none for an algorithm without.
+        out: the checkpoint folder; new, or one of the same request.
+        workers: worker processes that step the envs; they change no result.
+        progress: called with (control steps or updates done, in all).
+        tensorboard: draw curves into `<out>-tensorboard`.
+
+    Raises:
+        InputError: the extra is not installed, or demonstrations of another env.
+        OutputExists: `out` holds something else.
+    """
+    check_extra(f"--algo {request.algo}", *_packages(request))
+    check_output(out, may_resume=REQUEST)
+    wanted = {"algo": request.algo, "code_version": __version__, "request": to_mapping(request)}
+    if (out / REQUEST).exists() and read_json(out / REQUEST) != wanted:
+        raise OutputExists(
+            f"--out {out} holds another training; give a folder that does not exist yet."
+        )
+    if (out / CARD).exists():
+        return read_checkpoint(out)
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / REQUEST, wanted)
+    with torch.random.fork_rng(devices=[]), one_thread():
+        learner = _learner(request, demos, workers)
+        try:
+            checkpoint = _run(request, learner, out, progress, tensorboard)
+        finally:
+            learner.close()
+    (out / STATE).unlink(missing_ok=True)
+    return checkpoint
+
+
+def train_seeds(
+    requests: Sequence[Request],
+    demos: Sequence[Path],
+    outs: Sequence[Path],
+    *,
+    workers: int = 0,
+    progress: Progress | None = None,
+    tensorboard: bool = True,
+) -> None:
+    """Train several requests, side by side in `workers` processes; see `train`.
+
+    A single one is trained in this process, and the workers step its envs.
+    """
+    jobs = list(zip(requests, outs, strict=True))
+    if len(jobs) == 1 or not workers:
+        for request, out in jobs:
+            train(request, demos, out, workers=workers, progress=progress, tensorboard=tensorboard)
+        return
+    total = sum(request.total for request in requests)
+    done = 0
+    for start in range(0, len(jobs), workers):
+        batch = jobs[start : start + workers]
+        calls = [
+            functools.partial(_train_reporting, request, list(demos), out, tensorboard)
+            for request, out in batch
+        ]
+        before = done
+        processes.run_all(
+            calls,
+            "the training",
+            lambda steps, before=before: progress(before + sum(steps), total) if progress else None,
+        )
+        done += sum(request.total for request, _ in batch)
+
+
+def _train_reporting(
+    request: Request,
+    demos: Sequence[Path],
+    out: Path,
+    tensorboard: bool,
+    report: Callable[[int], None],
+) -> None:
+    """Train in a worker process; `report` is told the steps done."""
+    train(request, demos, out, progress=lambda done, _: report(done), tensorboard=tensorboard)
+
+
+def _packages(request: Request) -> tuple[str, ...]:
+    """Return what must be installed: curves are logged by Stable-Baselines3 in any case."""
+    return ("stable_baselines3", request.algorithm.library)
+
+
+def _learner(request: Request, demos: Sequence[Path], workers: int) -> Learner:
+    """Return the untrained learner of a request."""
+    algorithm = request.algorithm
+    transitions = None
+    if algorithm.needs_demos:
+        obs_type = "goal" if algorithm.has_hindsight else request.observation
+        transitions = of_demos(demos, request.env, obs_type)
+    mean, std = _statistics(request, demos if algorithm.needs_demos else (), transitions)
+    if algorithm.is_online:
+        from surgicai_vision.rl.online import OnlineLearner
+
+        return OnlineLearner(request, transitions, mean, std, workers)
+    from surgicai_vision.rl.offline import OfflineLearner
+
+    assert transitions is not None
+    return OfflineLearner(request, transitions, mean, std)
+
+
+def _statistics(
+    request: Request, demos: Sequence[Path], transitions: Transitions | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mean and standard deviation of the inputs: of demonstrations, else of random play."""
+    if transitions is None:
+        rows = _random_play(request)
+    elif transitions.is_goal:
+        rows = of_demos(demos, request.env, request.observation).vector
+    else:
+        rows = transitions.vector
+    values = rows.astype(np.float64)
+    return values.mean(axis=0), np.maximum(values.std(axis=0), SMALLEST_STD)
+
+
+def _random_play(request: Request) -> NDArray[np.float32]:
+    """Return what episodes of random actions observe, (n, inputs)."""
+    env = envs.make(request.env, request.observation)
+    rng = np.random.default_rng(request.seed)
+    rows = []
+    for episode in range(RANDOM_EPISODES):
+        seen, _ = env.reset(seed=names.TRAIN_SEED + episode)
+        ended = False
+        while not ended:
+            rows.append(seen)
+            action = rng.uniform(-1.0, 1.0, 7).astype(np.float32)
+            seen, _, terminated, truncated, _ = env.step(action)
+            ended = terminated or truncated
+    env.close()
+    return np.stack([np.asarray(row) for row in rows])
+
+
+def _run(
+    request: Request,
+    learner: Learner,
+    out: Path,
+    progress: Progress | None,
+    tensorboard: bool,
+) -> Checkpoint:
+    """Learn to the end, with an evaluation and a training state every so often."""
+    curve: list[Point] = _resume(learner, out)
+    log = _Log(out if tensorboard else None, learner)
+    minutes = curve[-1].minutes if curve else 0.0
+    if progress:
+        progress(min(learner.done, request.total), request.total)
+    while learner.done < request.total:
+        target = min((learner.done // request.save_every + 1) * request.save_every, request.total)
+        began = time.monotonic()
+        losses = learner.advance(target)
+        minutes += (time.monotonic() - began) / 60.0
+        curve.append(_evaluate(request, learner, minutes))
+        log.draw(curve[-1], losses)
+        write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
+        if learner.done < request.total:
+            _save(learner, curve, out / STATE)
+        if progress:
+            progress(min(learner.done, request.total), request.total)
+    log.close()
+    return _write(request, learner, out)
+
+
+def _save(learner: Learner, curve: Sequence[Point], path: Path) -> None:
+    """Write the training state, whole."""
+    content = io.BytesIO()
+    points = [dataclasses.asdict(point) for point in curve]
+    torch.save({"learner": learner.get_state(), "curve": points}, content)
+    write_bytes(path, content.getvalue())
+
+
+def _resume(learner: Learner, out: Path) -> list[Point]:
+    """Go on from the training state, if there is a whole one; return the curve so far."""
+    try:
+        state = torch.load(out / STATE, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
+        return []
+    learner.set_state(state["learner"])
+    return [Point(**point) for point in state["curve"]]
+
+
+class _Log:
+    """Draws curves for TensorBoard, by Stable-Baselines3's logger; nothing without a folder."""
+
+    def __init__(self, out: Path | None, learner: Learner):
+        self._logger: Any = None
+        if out is None:
+            return
+        from stable_baselines3.common.logger import configure
+
+        folder = out.with_name(f"{out.name}-tensorboard")
+        self._logger = configure(str(folder), ["tensorboard"])
+        if hasattr(learner, "log_to"):
+            learner.log_to(self._logger)
+
+    def draw(self, point: Point, losses: dict[str, float]) -> None:
+        """Add a point of the curve and losses by name."""
+        if self._logger is None:
+            return
+        step = point.env_steps or point.updates
+        if point.episodes:
+            self._logger.record("eval/success_rate", point.successes / point.episodes)
+            self._logger.record("eval/distance_mm", point.distance_mm)
+        for name, value in losses.items():
+            self._logger.record(f"train/{name.replace(' ', '_')}", value)
+        self._logger.dump(step)
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self._logger is not None:
+            self._logger.close()
+
+
+# -- the policy ------------------------------------------------------------------------------------
+
+
+def actor_recipe(request: Request, squash: str) -> ActorRecipe:
+    """Return what a checkpoint says of its actor."""
+    return ActorRecipe(
+        hidden=request.settings.hidden,
+        learning_rate=request.settings.learning_rate,
+        batch_size=request.settings.batch_size,
+        validation=0.0,
+        privileged=request.observation == "state",
+        observation=request.observation,
+        squash=squash,
+        algo=request.algo,
+        settings=read_by(request.algo, request.settings),
+    )
+
+
+def actor_of(request: Request, learner: Learner) -> Actor:
+    """Return the learner's actor as a policy of ours."""
+    actor = Actor(actor_recipe(request, learner.squash), ())
+    actor.take(learner.layers(), learner.mean, learner.std)
+    actor.eval().requires_grad_(False)
+    return actor
+
+
+def _evaluate(request: Request, learner: Learner, minutes: float) -> Point:
+    """Count successes from validation starts, with the generators left as they are."""
+    steps = learner.done if request.algorithm.is_online else 0
+    if not request.validation:
+        return Point(steps, learner.updates, minutes, 0, 0, 0.0)
+    make = functools.partial(
+        PolicyAgent,
+        request.algo,
+        actor_of(request, learner),
+        None,
+        (),
+        IMAGE_SIZE,
+        VECTORS[request.observation],
+    )
+    seeds = range(names.VALIDATION_SEED, names.VALIDATION_SEED + request.validation)
+    episodes = run_share(make, request.env, seeds, EVALUATED_AT_ONCE, report=lambda _: None)
+    rows = [episode.row for episode in episodes]
+    return Point(
+        env_steps=steps,
+        updates=learner.updates,
+        minutes=minutes,
+        successes=sum(row.success for row in rows),
+        episodes=len(rows),
+        distance_mm=float(np.median([row.d_trans_mm for row in rows])),
+    )
+
+
+def run_of(request: Request) -> RunConfig:
+    """Return the run that a request is."""
+    return RunConfig(
+        env=request.env,
+        policy="actor",
+        privileged=request.observation == "state",
+        recipe="rl",
+        changes=request.changes,
+        demonstrations=request.demonstrations or None,
+        updates=request.updates or None,
+        seed=request.seed,
+        algo=request.algo,
+        env_steps=request.env_steps,
+    )
+
+
+def _write(request: Request, learner: Learner, out: Path) -> Checkpoint:
+    """Write the trained actor."""
+    actor = actor_of(request, learner)
+    if not all(torch.isfinite(parameter).all() for parameter in actor.parameters()):
+        raise InputError(
+            f"'{request.algo}' diverged: weights are not finite; lower the learning rate."
+        )
+    recipe = actor_recipe(request, learner.squash)
+    checkpoint = Checkpoint(
+        run=run_of(request),
+        recipe=to_mapping(recipe),
+        image_size=IMAGE_SIZE,
+        encoder=None,
+        proprioception=False,
+        epoch=0,
+        dataset=request.demos,
+        frames=learner.done,
+        validation_episodes=(),
+        train_losses=(),
+        validation_losses=(),
+        device="cpu",
+        code_version=__version__,
+    )
+    return write_checkpoint(out, checkpoint, actor.state_dict())
