@@ -25,7 +25,7 @@ from surgicai_vision.core import names, processes
 from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
-from surgicai_vision.core.progress import Progress
+from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.rollout import run_share
 from surgicai_vision.rl.extra import check_extra
@@ -145,12 +145,8 @@ def train_seeds(
             functools.partial(_train_reporting, request, list(demos), out, tensorboard)
             for request, out in batch
         ]
-        before = done
-        processes.run_all(
-            calls,
-            "the training",
-            lambda steps, before=before: progress(before + sum(steps), total) if progress else None,
-        )
+        hear = functools.partial(_show, progress or silent, done, total)
+        processes.run_all(calls, "the training", hear)
         done += sum(request.total for request, _ in batch)
 
 
@@ -162,7 +158,16 @@ def _train_reporting(
     report: Callable[[int], None],
 ) -> None:
     """Train in a worker process; `report` is told the steps done."""
-    train(request, demos, out, progress=lambda done, _: report(done), tensorboard=tensorboard)
+
+    def show(done: int, total: int, unit: str = "", /) -> None:
+        report(done)
+
+    train(request, demos, out, progress=show, tensorboard=tensorboard)
+
+
+def _show(progress: Progress, before: int, total: int, steps: Sequence[int]) -> None:
+    """Show what the worker processes reported."""
+    progress(before + sum(steps), total)
 
 
 def _packages(request: Request) -> tuple[str, ...]:

@@ -151,7 +151,7 @@ def test_a_relabelled_success_ends_the_episode(goal_demos, task, keeps):
         # Nothing is reached without the holes, however near the pose is.
         assert (achieved[batch.rewards.numpy()[:, 0] == 0][:, DEMAND] == 1).all()
     else:
-        assert (asked == 0).mean() > 0.3 and reached > 0.1
+        assert (asked == 0).mean() > 0.3 and reached > 0.03
     env.close()
 
 
