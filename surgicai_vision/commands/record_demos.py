@@ -22,6 +22,7 @@ from surgicai_vision.commands.options import (
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.demos.demonstrator import CHOOSING_DEMONSTRATORS, SOURCES
 
 if TYPE_CHECKING:
     from surgicai_vision.demos.record import Learner
@@ -42,9 +43,11 @@ class Options:
         episodes: Successful episodes to keep.
         demonstrator: Who acts: expert; search, the expert without the grasp's goal; recover, the
             expert of the whole procedure that goes back to what was lost; dmp, movement primitives
-            learned from --from.
-        from_: Demonstrations to learn from (--demonstrator dmp).
-        demos_used: How many of them to learn from.
+            learned from --from; multiply, the demonstrations of --from re-posed to new starts.
+        from_: Demonstrations to learn from (--demonstrator dmp) or to re-pose (multiply).
+        demos_used: How many of them.
+        source: Which of them an episode re-poses (--demonstrator multiply): the one whose start
+            was most alike, or one drawn at random.
         seed: Seed of the first start; each episode takes the next.
         noise: Standard deviation of the noise on executed motions, in units of an action's range;
             labels stay the expert's.
@@ -63,7 +66,8 @@ class Options:
     episodes: Annotated[int, COUNT] = 50
     demonstrator: str = "expert"
     from_: Annotated[Path | None, Parameter(metavar="DEMOS")] = None
-    demos_used: Annotated[int, COUNT] = 1
+    demos_used: Annotated[int | None, COUNT, default_text("1 of dmp, all of multiply")] = None
+    source: Annotated[str | None, Parameter(choices=SOURCES), default_text("nearest")] = None
     seed: Annotated[int, NOT_NEGATIVE] = names.TRAIN_SEED
     noise: Annotated[float, FRACTION, Parameter(metavar="SIGMA")] = 0.0
     noise_from: Annotated[
@@ -98,7 +102,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     config = task_config(options.task, options.env)
     out = options.out or folders.demos_folder(options.task)
     folders.check_folder(out, "demos.json")
-    demos = _first_demos(options.from_, options.demos_used) if options.from_ else []
+    demos = _demos(options)
     learner = _learner(options.learner, config) if options.learner else None
     paths = record(
         config,
@@ -114,6 +118,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         ),
         post_success_steps=options.post_success_steps,
         demos=demos,
+        source=options.source or "",
         learner=learner,
         context=context,
     )
@@ -147,11 +152,15 @@ def _learner(folder: Path, config: TaskConfig) -> "Learner":
     return learner_of(folder, config)
 
 
-def _first_demos(folder: Path, count: int) -> list[Path]:
-    """Return the first `count` demonstrations of a folder."""
+def _demos(options: Options) -> list[Path]:
+    """Return the demonstrations to learn from or to re-pose."""
     from surgicai_vision.demos.store import list_demos
 
-    paths = list_demos(folder)
+    if options.from_ is None:
+        return []
+    paths = list_demos(options.from_)
+    chooses = options.demonstrator in CHOOSING_DEMONSTRATORS
+    count = options.demos_used or (len(paths) if chooses else 1)
     if count > len(paths):
-        raise InputError(f"--demos-used is {count}; {folder} holds {len(paths)}.")
+        raise InputError(f"--demos-used is {count}; {options.from_} holds {len(paths)}.")
     return paths[:count]

@@ -35,6 +35,11 @@ class Demonstrator(ABC):
         """Return why the demonstrator knows no way on, or ""; the episode ends as a failure."""
         return ""
 
+    @property
+    def source(self) -> str:
+        """Return the sha256 of the file of the demonstration that the episode re-poses, or ""."""
+        return ""
+
     @abstractmethod
     def action(self) -> NDArray[np.float32]:
         """Return the action for the env's present state, (7,) in [-1, 1]."""
@@ -58,27 +63,43 @@ DEMONSTRATORS: Mapping[str, str] = MappingProxyType(
         "dmp": "surgicai_vision.demos.dmp.controller:DmpController",
         "search": "surgicai_vision.demos.search_expert:SearchExpert",
         "recover": "surgicai_vision.demos.recovery_expert:RecoveryExpert",
+        "multiply": "surgicai_vision.demos.multiply.multiplier:Multiplier",
     }
 )
 """Name → "module:class", imported on first use."""
 
-LEARNING_DEMONSTRATORS = frozenset({"dmp"})
+LEARNING_DEMONSTRATORS = frozenset({"dmp", "multiply"})
 """Those that learn from demonstrations, which their class takes as a second argument."""
+
+CHOOSING_DEMONSTRATORS = frozenset({"multiply"})
+"""Those that take one of them an episode; how is their class's third argument."""
+
+NEAREST = "nearest"
+RANDOM = "random"
+SOURCES = (NEAREST, RANDOM)
+"""How a choosing demonstrator takes one: that whose start was most alike, or any."""
+
+GOAL_FREE_DEMONSTRATORS = frozenset({"search"})
+"""Those that do not know which point of the needle a grasp is asked for, and try several."""
 
 SCRIPTED_DEMONSTRATORS = tuple(name for name in DEMONSTRATORS if name not in LEARNING_DEMONSTRATORS)
 
 
-def make_demonstrator(name: str, env: "SuturingEnv", demos: Sequence[str] = ()) -> Demonstrator:
+def make_demonstrator(
+    name: str, env: "SuturingEnv", demos: Sequence[str] = (), source: str = ""
+) -> Demonstrator:
     """Return a demonstrator for an episode of `env`.
 
     Args:
         name: a key of `DEMONSTRATORS`.
         env: the env.
         demos: files of the demonstrations that a learning demonstrator learns from.
+        source: how a choosing one takes one of them an episode; "" for its default.
 
     Raises:
         UnknownName: no demonstrator is called so.
     """
     kind = resolve(DEMONSTRATORS[check_name("demonstrator", name, DEMONSTRATORS)])
-    demonstrator: Demonstrator = kind(env, demos) if demos else kind(env)
+    arguments = [*([demos] if demos else []), *([source] if source else [])]
+    demonstrator: Demonstrator = kind(env, *arguments)
     return demonstrator

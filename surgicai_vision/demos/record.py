@@ -31,6 +31,7 @@ from surgicai_vision.core.files import (
 )
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.demos.demonstrator import (
+    CHOOSING_DEMONSTRATORS,
     DEMONSTRATORS,
     LEARNING_DEMONSTRATORS,
     BehaviourPolicy,
@@ -94,12 +95,13 @@ def record_into(
     upset_fraction: float = 0.0,
     post_success_steps: int = 0,
     demos: Sequence[str] = (),
+    source: str = "",
     behaviour: BehaviourPolicy | None = None,
 ) -> None:
     """Run `seed` in `env` and write the episode, or why it failed, into `folder`."""
     result = rollout(
         env,
-        make_demonstrator(demonstrator, env, demos),
+        make_demonstrator(demonstrator, env, demos, source),
         seed,
         demonstrator,
         Disturbance(noise, perturb_start_fraction, noise_from, upset_fraction),
@@ -109,6 +111,8 @@ def record_into(
     if result.success:
         write_demo(folder, 0, result.demo)
     told = {"seed": seed, "success": result.success, "reason": result.reason}
+    if result.demo.source:
+        told["source"] = result.demo.source
     write_json(folder / "result.json", told | ({"upset": result.upset} if upset_fraction else {}))
 
 
@@ -122,6 +126,7 @@ def record(
     disturbance: Disturbance = UNDISTURBED,
     post_success_steps: int = 0,
     demos: Sequence[Path] = (),
+    source: str = "",
     learner: Learner | None = None,
     context: RunContext = RunContext(),
 ) -> list[Path]:
@@ -137,13 +142,15 @@ def record(
         post_success_steps: control steps recorded after an episode's success.
         demos: files of the demonstrations that a demonstrator in `LEARNING_DEMONSTRATORS` learns
             from; their seeds are left out.
+        source: how a demonstrator in `CHOOSING_DEMONSTRATORS` takes one of them an episode; "" for
+            its default.
         learner: acts until a step drawn by chance, while the labels stay the demonstrator's.
         context: workers, engine and display.
 
     Raises:
         InputError: fewer than one episode, a negative seed or post_success_steps, an unknown
             demonstrator, demonstrations for a demonstrator that learns from none, or none for one
-            that does; upsets in a task that has none.
+            that does, a source for one that chooses none; upsets in a task that has none.
         OutputExists: `out` holds something else.
         SurgicaiError: the demonstrator failed at too many seeds.
     """
@@ -154,6 +161,12 @@ def record(
             "they must be at least 1, 0 and 0."
         )
     _check_demos(demonstrator, demos)
+    if source and demonstrator not in CHOOSING_DEMONSTRATORS:
+        choosing = ", ".join(sorted(CHOOSING_DEMONSTRATORS))
+        raise InputError(
+            f"source is '{source}', and demonstrator '{demonstrator}' chooses no demonstration; "
+            f"leave it out or take demonstrator {choosing}."
+        )
     if disturbance.upset_fraction:
         check_upset_task(config.task)
     # What decides the result: a finished folder of the same request is left as it is.
@@ -168,6 +181,8 @@ def record(
         request["post_success_steps"] = post_success_steps
     if demos:
         request["demos"] = [sha256_file(path) for path in demos]
+    if source:
+        request["source"] = source
     if learner:
         request["learner"] = learner.digest
     check_output(out, may_resume=MARKER)
@@ -183,8 +198,15 @@ def record(
             details = {"request": request, "skipped": skipped, "episodes": episodes}
             if disturbance.upset_fraction:
                 details["upsets"] = upsets
+            details |= _sources(kept)
             write_marker(folder, config.task, demonstrator, **details)
     return list_demos(out)
+
+
+def _sources(kept: Sequence[Path]) -> dict[str, list[str]]:
+    """Return the sha256 of each kept episode's source demonstration, where they have such."""
+    results = [read_json(path.parent / "result.json") for path in kept]
+    return {"sources": [row["source"] for row in results]} if "source" in results[0] else {}
 
 
 def _check_demos(demonstrator: str, demos: Sequence[Path]) -> None:

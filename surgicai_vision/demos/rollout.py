@@ -154,8 +154,13 @@ class EpisodeRecorder:
         """Take the env's present state for the last one: it was changed between two steps."""
         self._states[-1] = self._env.get_state()
 
-    def demo(self, with_executed: bool = False) -> Demo:
-        """Return the episode as a demonstration, with the executed actions beside the labels."""
+    def demo(self, with_executed: bool = False, source: str = "") -> Demo:
+        """Return the episode as a demonstration.
+
+        Args:
+            with_executed: with the executed actions beside the labels.
+            source: sha256 of the file of the demonstration that it re-poses.
+        """
         labels, actions, phases, rewards, successes, contacts = zip(*self._rows, strict=True)
         return Demo(
             config=self._env.config,
@@ -170,6 +175,7 @@ class EpisodeRecorder:
             success=np.asarray(successes, dtype=bool),
             contact=np.asarray(contacts, dtype=bool),
             executed=np.stack(actions) if with_executed else None,
+            source=source,
         )
 
 
@@ -245,7 +251,8 @@ def rollout(
         ended = finished or recorder.truncated or not recorder.is_physical
         ended = ended or bool(demonstrator.gives_up)
 
-    demo = recorder.demo(with_executed=bool(disturbance.noise or behaviour or fraction))
+    with_executed = bool(disturbance.noise or behaviour or fraction)
+    demo = recorder.demo(with_executed, demonstrator.source)
     if not recorder.is_physical:
         return Rollout(demo, False, "physics error", upset.kind)
     reason = demonstrator.gives_up or f"no success in {len(demo)} steps"

@@ -40,6 +40,8 @@ ARRAYS = {
 """Array → (dtype, number of axes) as stored."""
 EXECUTED = "executed"
 """The array that only disturbed episodes have."""
+SOURCE = "source"
+"""What only re-posed episodes say."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class Demo:
         contact: jaws touch the needle after the step, (T,) bool.
         executed: the executed actions where those were not `action`, the labels: (T, 7) float32,
             or None.
+        source: sha256 of the file of the demonstration that this one re-poses; "" of its own.
 
     Raises:
         InputError: lengths, shapes or numbers that do not match.
@@ -77,6 +80,7 @@ class Demo:
     success: NDArray[np.bool_]
     contact: NDArray[np.bool_]
     executed: NDArray[np.float32] | None = None
+    source: str = ""
 
     def __post_init__(self) -> None:
         # Types and axes, then lengths, then the numbers themselves.
@@ -140,6 +144,7 @@ def demo_bytes(demo: Demo) -> bytes:
         "demonstrator": demo.demonstrator,
         "scene_hash": demo.scene_hash,
         "code_version": demo.code_version,
+        **({SOURCE: demo.source} if demo.source else {}),
     }
     arrays = {name: np.ascontiguousarray(array) for name, array in demo.arrays.items()}
     if demo.executed is not None:
@@ -169,8 +174,8 @@ def read_demo(path: Path) -> Demo:
             raise BadFile(f"{path} is not a demonstration (no '{FORMAT}' in its metadata).")
         _check_version(path, details.pop("version"))
         details["config"] = from_mapping(TaskConfig, details["config"], str(path))
-        fields = {field.name for field in dataclasses.fields(Demo)} - {*ARRAYS, EXECUTED}
-        if set(details) != fields:
+        fields = {field.name for field in dataclasses.fields(Demo)} - {*ARRAYS, EXECUTED, SOURCE}
+        if set(details) - {SOURCE} != fields:
             raise BadFile(f"{path}: its metadata has {sorted(details)}; expected {sorted(fields)}.")
         return Demo(**details, **arrays)
     except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:

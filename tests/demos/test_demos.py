@@ -32,7 +32,7 @@ CONFIG = TaskConfig(max_steps=12)
 def fake(monkeypatch):
     """Record from the stand-in environment, in this process."""
     monkeypatch.setattr(recording, "_env", lambda config: FakeEnv(config))
-    monkeypatch.setattr(recording, "make_demonstrator", lambda name, env, demos: FakeExpert(env))
+    monkeypatch.setattr(recording, "make_demonstrator", lambda name, env, *_: FakeExpert(env))
 
 
 @pytest.fixture
