@@ -37,6 +37,7 @@ VECTORS: Mapping[str, int] = MappingProxyType(
     {
         names.STATE: len(names.STATE_NAMES),
         names.CLOCKED_STATE: len(names.STATE_NAMES) + CLOCK_SIZE,
+        names.PROGRESSED_STATE: len(names.STATE_NAMES) + 1,
         names.BOTH_ARMS: len(names.BOTH_ARMS_NAMES),
         names.PRIVILEGED_STATE: len(names.PRIVILEGED_NAMES),
         names.RELATIVE_STATE: len(names.RELATIVE_NAMES),
@@ -65,6 +66,8 @@ class Recipe:
             arms'.
         clock: feed the time since the subtask began as well (needs proprioception), for
             demonstrators that act by it.
+        progress_input: feed how far the subtask is, as a high-level policy with `progress` says it,
+            in the place of the clock (`train --progress-from`; needs proprioception).
         map_head: what takes in a feature map: "softmax" (where each of 32 patterns lies) or
             "convolutions".
         frame_stride: train on each N-th frame of an episode alone, from its first: neighbours show
@@ -89,6 +92,7 @@ class Recipe:
     validation: float = 0.1
     proprioception: bool = True
     clock: bool = False
+    progress_input: bool = False
     map_head: str = "softmax"
     frame_stride: int = 1
     privileged: bool = False
@@ -114,6 +118,11 @@ class Recipe:
             raise InputError(f"learning_rate is {self.learning_rate}; it must be above 0.")
         if self.clock and (self.privileged or not self.proprioception):
             raise InputError("clock goes with proprioception; switch it on, and privileged off.")
+        if self.progress_input and (self.clock or self.privileged or not self.proprioception):
+            raise InputError(
+                "progress_input goes with proprioception, in the place of the clock; switch "
+                "proprioception on, clock and privileged off."
+            )
         if not self.weight_decay >= 0:
             raise InputError(f"weight_decay is {self.weight_decay}; it must be at least 0.")
         if not self.proprioception_noise >= 0 or self.map_shift < 0:

@@ -40,6 +40,8 @@ def _vector(recipe: Recipe) -> str | None:
         return names.PRIVILEGED_STATE
     if recipe.clock:
         return names.CLOCKED_STATE
+    if recipe.progress_input:
+        return names.PROGRESSED_STATE
     return names.STATE if recipe.proprioception else None
 
 

@@ -69,6 +69,8 @@ class Options:
         change: Replace values of the recipe, such as clock=false,map_head=softmax.
         epochs: Passes over the frames.
         start: Checkpoint, or released:NAME, to start from, with the same inputs (fine-tuning).
+        progress_from: Checkpoint, or released:NAME, of a high-level policy whose progress a recipe
+            with progress_input=true feeds.
         save_every: Also keep a checkpoint every N epochs; 0 keeps the last alone.
         log: Where losses are drawn.
         seed: Training seed.
@@ -115,6 +117,7 @@ class Options:
     ] = ()
     epochs: Annotated[int | None, COUNT, default_text("the recipe's")] = None
     start: Annotated[Path | None, DIRECTORY] = None
+    progress_from: Annotated[Path | None, DIRECTORY] = None
     save_every: Annotated[int, NOT_NEGATIVE] = 0
     log: Annotated[str, Parameter(choices=LOGS)] = "auto"
     seed: Annotated[int, NOT_NEGATIVE] = 0
@@ -161,7 +164,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         changes=with_epochs(options.change, options.epochs),
         seed=options.seed,
     )
-    policies.recipe_of(run)  # refuses a recipe that does not exist before any work
+    # Refuses a recipe that does not exist before any work.
+    policies.check_progress_from(policies.recipe_of(run), options.progress_from)
     label = f"{options.subtask}-of-{task}" if options.subtask else task
     out = options.out or folders.train_folder(label, run.name, run.seed)
     folders.check_folder(out, "training.json")
@@ -179,6 +183,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             console.stage,
             weights,
             start=options.start,
+            progress_from=options.progress_from,
             save_every=options.save_every,
             log=log,
         )

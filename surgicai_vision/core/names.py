@@ -119,6 +119,10 @@ STATES_WITH_GOAL = (PRIVILEGED_STATE, RELATIVE_STATE)
 
 CLOCKED_STATE = "clocked_state"
 """STATE and, last, the time since the subtask began as `config.clock` tells it."""
+PROGRESSED_STATE = "progressed_state"
+"""STATE and, last, the progress of the subtask as another policy says it
+(`training.progress_input`).
+"""
 STAGE = "stage"
 """The subtask that is due and the progress within the present one (`training.visits.stages`)."""
 

@@ -135,6 +135,7 @@ class DatasetSubset:
         config: TaskConfig | None = None,
         fps: int | None = None,
         restart_time: bool = False,
+        added: Mapping[str, NDArray[np.generic]] | None = None,
     ):
         """Select `rows` of `whole`.
 
@@ -146,10 +147,12 @@ class DatasetSubset:
             fps: frames per second; the whole's by default.
             restart_time: let `frame_index` and `timestamp` begin anew in every run of neighbouring
                 rows of one episode.
+            added: columns that the whole does not have, (N,) or (N, n); `selection` says which.
         """
         self._whole = whole
         self._selection = dict(selection)
         self._restart_time = restart_time
+        self._added = dict(added or {})
         self.rows = rows
         self.path: Path = whole.path
         self.config = config or whole.config
@@ -181,7 +184,7 @@ class DatasetSubset:
             first = first_of_visit(self.rows, self.episode_index)
             for key in ("frame_index", "timestamp"):
                 columns[key] = np.subtract(columns[key], columns[key][first])
-        return columns
+        return columns | self._added
 
     def frames(self, view: str, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
         """Return the images of one of the `policy_views`, (stop - start, H, W, 3) uint8 RGB."""

@@ -21,6 +21,7 @@ from surgicai_vision.evaluation.agent import (
     frame_of,
     simulated,
 )
+from surgicai_vision.training.progress_input import PROGRESS_AT
 from surgicai_vision.training.threads import one_thread
 
 if TYPE_CHECKING:
@@ -153,6 +154,7 @@ VECTORS: Mapping[str, Callable[[Robot], NDArray[np.float32]]] = MappingProxyType
     {
         names.STATE: lambda robot: robot.agent_pos(),
         names.CLOCKED_STATE: lambda robot: robot.agent_pos(),  # the agent itself adds the clock
+        names.PROGRESSED_STATE: lambda robot: robot.agent_pos(),  # the agent adds the progress
         names.BOTH_ARMS: lambda robot: robot.both_arms(),
         names.PRIVILEGED_STATE: lambda robot: simulated(robot).state_vector(),
         names.RELATIVE_STATE: lambda robot: simulated(robot).relative_state(),
@@ -182,6 +184,7 @@ class PolicyAgent(Agent):
         views: the policy's views, in the order of its features.
         image_size: height and width the policy was trained on [px].
         vector: what it is fed beside its features, a key of `VECTORS`.
+        progress: says the progress that the policy is fed with `names.PROGRESSED_STATE`.
     """
 
     def __init__(
@@ -192,23 +195,28 @@ class PolicyAgent(Agent):
         views: tuple[str, ...],
         image_size: int,
         vector: str = names.STATE,
+        progress: "PolicyAgent | None" = None,
     ):
         self.name = name
         self.views = views
         self.image_size = image_size
-        self.cameras = tuple(dict.fromkeys(map(names.camera_of, views)))
-        self.depth = any(map(names.is_depth_view, views))
+        seen = (*views, *(progress.views if progress else ()))
+        self.cameras = tuple(dict.fromkeys(map(names.camera_of, seen)))
+        self.depth = any(map(names.is_depth_view, seen))
         self.privileged = vector in names.STATES_WITH_GOAL
         self._policy = policy
         self._encoder = encoder
         self._vector = VECTORS[vector]
         self._clocked = vector == names.CLOCKED_STATE
+        self._progress = progress
         self._ticks: dict[int, int] = {}
         self._shared: FeatureTable | None = None
 
     def share(self, features: FeatureTable) -> None:
         """Look features up in a table that agents share, and put new ones there."""
         self._shared = features
+        if self._progress is not None:
+            self._progress.share(features)
 
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Start the slot's clock; the policy has no other memory."""
@@ -244,6 +252,9 @@ class PolicyAgent(Agent):
             if self._clocked and ticks is not None:
                 clocks = clock(np.array(ticks))
                 vectors = np.concatenate([vectors, clocks], axis=1, dtype=np.float32)
+            if self._progress is not None:
+                said = self._progress.answer(robots, observations)[:, PROGRESS_AT:]
+                vectors = np.concatenate([vectors, said], axis=1, dtype=np.float32)
             return np.asarray(self._policy.act(self._features(observations), vectors), np.float32)
 
     def _features(self, observations: Sequence[Observation]) -> NDArray[np.float32] | None:

@@ -41,6 +41,7 @@ from surgicai_vision.evaluation.hierarchical import (
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.training import policies, released
+from surgicai_vision.training.progress_input import progress_policy_folder
 from surgicai_vision.training.run_config import OWN, RunConfig
 
 if TYPE_CHECKING:
@@ -246,7 +247,7 @@ def _from_checkpoint(folder: Path, weights: WeightsSource) -> PolicySpec:
     """Return the policy of a checkpoint folder of ours.
 
     Raises:
-        BadFile: no checkpoint folder.
+        BadFile: no checkpoint folder, or one without the policy whose progress it is fed.
         InputError: a high-level policy.
         MissingWeights: the encoder's weights are not at hand.
     """
@@ -258,9 +259,11 @@ def _from_checkpoint(folder: Path, weights: WeightsSource) -> PolicySpec:
             f"{folder} chooses subtasks and does not act; "
             "name it as hlp: in the file of a hierarchical policy (docs/hierarchical.md)."
         )
+    progress = progress_policy_folder(checkpoint)
     encoder = checkpoint.encoder
-    if encoder:
-        encoders.find_weights(encoder.name, weights)
+    for record in (encoder, read_checkpoint(progress).encoder if progress else None):
+        if record:
+            encoders.find_weights(record.name, weights)
     about: dict[str, JSON] = {
         "checkpoint": {
             "weights_sha256": encoder.weights_sha256 if encoder else None,
@@ -277,10 +280,12 @@ def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent
 
     Raises:
         InputError: the encoder at hand is not the one the policy was trained on.
+        BadFile: the policy whose progress it is fed is not in its folder.
     """
     policy = policies.load_policy(folder)
     checkpoint = policy.checkpoint
     encoder = policies.load_encoder_of(checkpoint, weights)
+    progress = progress_policy_folder(checkpoint)
     return PolicyAgent(
         checkpoint.run.name,
         policy,
@@ -288,6 +293,7 @@ def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent
         checkpoint.views,
         checkpoint.image_size,
         policy.inputs.vector or names.STATE,
+        policy_agent(progress, weights) if progress else None,
     )
 
 

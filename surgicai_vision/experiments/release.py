@@ -88,7 +88,7 @@ def run_release(
     chosen = [name for name in plan.names if name in only or not only]
     encoders.find_weights(plan.encoder)
     for policy in plan.policies:
-        policies.recipe_of(plan.run(policy))
+        policies.check_progress_from(policies.recipe_of(plan.run(policy)), None)
     _check_writable(released_folder())
     check_opengl()
     scene = build_scene(plan.task_config(names.SUTURE).scene).hash

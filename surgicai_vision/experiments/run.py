@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from policies.base import Policy
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.subset import (
@@ -21,6 +22,7 @@ from surgicai_vision.dataset.subset import (
 from surgicai_vision.features.cache import Features, encode
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training import policies
+from surgicai_vision.training.progress_input import check_progress_policy, with_progress
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.train import train
 
@@ -33,6 +35,7 @@ def train_run(
     weights: WeightsSource = ANYWHERE,
     *,
     start: Path | None = None,
+    progress_from: Path | None = None,
     subtask: str | None = None,
     save_every: int = 0,
     log: Callable[[int, dict[str, float]], None] | None = None,
@@ -46,14 +49,26 @@ def train_run(
         stage: shows progress.
         weights: where pretrained weights come from.
         start: checkpoint folder to start from (fine-tuning).
+        progress_from: checkpoint folder of the policy whose progress a recipe with
+            `progress_input` feeds.
         subtask: train on this subtask's frames of the dataset's whole procedures.
         save_every: also keep a checkpoint every so many epochs.
         log: called with (epoch, losses by name).
     """
     recipe = policies.recipe_of(run)
+    policies.check_progress_from(recipe, progress_from)
     dataset = with_frame_stride(dataset, recipe.frame_stride)
+    progress_policy = policies.load_policy(progress_from) if progress_from else None
+    if progress_policy is not None:
+        check_progress_policy(progress_policy.checkpoint, dataset)
     start_policy = policies.load_policy(start) if start else None
     features = _encode(run, dataset, stage, weights)
+    if progress_policy is not None:
+        fed = with_progress(
+            dataset, progress_policy, _seen_by(progress_policy, dataset, stage, weights)
+        )
+        dataset = fed
+        features = [entry.part(fed.rows, fed.fingerprint) for entry in features]
     subsets: list[Callable[[Dataset], DatasetSubset]] = []
     if run.demonstrations not in (None, len(np.unique(dataset.episode_index))):
         subsets.append(functools.partial(first_episodes, count=run.demonstrations))
@@ -74,9 +89,24 @@ def train_run(
             progress=progress,
             run=run,
             start=start_policy,
+            progress_policy=progress_policy.checkpoint if progress_policy else None,
             save_every=save_every,
             log=log,
         )
+
+
+def _seen_by(
+    policy: Policy, dataset: Dataset, stage: Stage, weights: WeightsSource
+) -> list[Features]:
+    """Return the features of a dataset as a trained policy sees it, cached or encoded now."""
+    encoder = policies.load_encoder_of(policy.checkpoint, weights)
+    if encoder is None:
+        return []
+    features = []
+    for view in policy.checkpoint.views:
+        with stage(f"features of the progress: {view}", "frames") as progress:
+            features.append(encode(dataset, view, encoder, progress=progress))
+    return features
 
 
 def encode_run(

@@ -2,7 +2,7 @@
 
 * `with_noise(observed, inputs, deviation)`: Gaussian noise on the measured poses (the recipe's
   `proprioception_noise`), so that a policy does not trust the joints further than they can be
-  trusted. The clock is not measured and stays as it is.
+  trusted. The clock and the progress are not measured and stay as they are.
 * `with_shift(observed, shapes, places)`: feature maps moved by whole places (the recipe's
   `map_shift`), as where a crop lies beside the jaws; DrQ moves images so (Kostrikov et al., Image
   augmentation is all you need, ICLR 2021).
@@ -11,13 +11,19 @@ Both draw from torch's own random state, which `train` seeds, stores and restore
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import torch
 
 from policies.base import VECTORS, Inputs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import CLOCK_SIZE
+
+NOT_MEASURED: Mapping[str, int] = MappingProxyType(
+    {names.CLOCKED_STATE: CLOCK_SIZE, names.PROGRESSED_STATE: 1}
+)
+"""What is fed beside features → how many of its last values are no measured pose."""
 
 
 def with_noise(observed: torch.Tensor, inputs: Inputs, deviation: float) -> torch.Tensor:
@@ -30,8 +36,7 @@ def with_noise(observed: torch.Tensor, inputs: Inputs, deviation: float) -> torc
     """
     if inputs.vector is None:
         return observed
-    clock = CLOCK_SIZE if inputs.vector == names.CLOCKED_STATE else 0
-    measured = VECTORS[inputs.vector] - clock
+    measured = VECTORS[inputs.vector] - NOT_MEASURED.get(inputs.vector, 0)
     noise = torch.zeros_like(observed)
     drawn = deviation * torch.randn(len(observed), measured)
     noise[:, inputs.features : inputs.features + measured] = drawn.to(noise.device)

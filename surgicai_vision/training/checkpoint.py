@@ -105,6 +105,7 @@ class Checkpoint:
         policy_sha256: hash of `policy.safetensors`.
         stage_errors: a high-level policy's errors on the episodes held out; None for another
             policy, or where nothing was held out.
+        progress_sha256: hash of the weights of the policy whose progress it is fed; "" for none.
         format: version of this file's layout.
         folder: where it lies (not stored).
     """
@@ -124,6 +125,7 @@ class Checkpoint:
     code_version: str
     policy_sha256: str = ""
     stage_errors: StageErrors | None = None
+    progress_sha256: str = ""
     format: int = FORMAT
     folder: Path = field(default=Path("."), compare=False)
 

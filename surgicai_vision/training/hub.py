@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output
 from surgicai_vision.core.hub import connect, refusals_in_one_line
@@ -170,12 +170,17 @@ def push_policy(
         api: the Hub's client; made here by default.
 
     Raises:
-        InputError: a bad name.
+        InputError: a bad name, or a policy that is fed another one's progress.
         BadFile: no whole checkpoint.
         SurgicaiError: offline, or the Hub refuses.
     """
     checkpoint = read_checkpoint(folder)
     restore(checkpoint)
+    if checkpoint.progress_sha256:
+        raise InputError(
+            f"{folder} is fed the progress that another policy says, and one repository holds one "
+            "policy; push a policy without progress_input."
+        )
     api = connect(repo, api)
     from huggingface_hub import CommitOperationAdd
 

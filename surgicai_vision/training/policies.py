@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import yaml
 
 from surgicai_vision.core.config import JSON, from_mapping
-from surgicai_vision.core.errors import BadFile, check_name
+from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.core.plugins import POLICIES_GROUP, Registry
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
@@ -100,6 +100,19 @@ def recipe_of(run: RunConfig) -> "Recipe":
         InputError: a value that is not allowed.
     """
     return load_recipe(run.policy, run.recipe, run.recipe_changes)
+
+
+def check_progress_from(recipe: "Recipe", progress_from: Path | None) -> None:
+    """Refuse a recipe that is fed progress without a policy that says it, and the reverse."""
+    if recipe.progress_input and progress_from is None:
+        raise InputError(
+            "The recipe feeds progress; give the policy that says it (--progress-from DIR)."
+        )
+    if progress_from is not None and not recipe.progress_input:
+        raise InputError(
+            f"The recipe feeds no progress; leave --progress-from {progress_from} out, or give "
+            "--change progress_input=true (and clock=false)."
+        )
 
 
 def load_policy(folder: Path | str) -> "Policy":

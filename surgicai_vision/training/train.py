@@ -53,6 +53,7 @@ from surgicai_vision.training.checkpoint import (
     write_checkpoint,
 )
 from surgicai_vision.training.data import column, cuts, over_places, split
+from surgicai_vision.training.progress_input import copy_progress_policy
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.stage_errors import stage_errors
 from surgicai_vision.training.threads import one_thread
@@ -81,6 +82,7 @@ def train(
     run: RunConfig | None = None,
     save_every: int = 0,
     start: Policy | None = None,
+    progress_policy: Checkpoint | None = None,
     device: str = "cpu",
     log: Log | None = None,
 ) -> Checkpoint:
@@ -99,6 +101,8 @@ def train(
             task, inputs and number of demonstrations.
         save_every: also keep a checkpoint every so many epochs; 0 keeps the last alone.
         start: a trained policy with the same inputs to start from (fine-tuning).
+        progress_policy: checkpoint of the policy that said the dataset's progress
+            (`training.progress_input`), where the recipe feeds it; it is copied into `out`.
         device: torch device to train on.
         log: called with (epoch, losses by name) after each epoch.
 
@@ -108,7 +112,7 @@ def train(
         SurgicaiError: the loss is not finite.
     """
     run = run or RunConfig(recipe="custom")
-    task = _Task(dataset, tuple(features), policy, recipe, seed, run)
+    task = _Task(dataset, tuple(features), policy, recipe, seed, run, progress_policy)
     out = Path(out)
     _check(task)
     request = _request(task, start)
@@ -152,6 +156,7 @@ class _Task:
     recipe: Recipe
     seed: int
     run: RunConfig
+    progress_policy: Checkpoint | None = None
 
     @property
     def trained_run(self) -> RunConfig:
@@ -433,6 +438,9 @@ class _Training:
         task = self.task
         dataset = task.dataset
         folder.mkdir(parents=True, exist_ok=True)
+        fed = task.progress_policy
+        if fed is not None:
+            copy_progress_policy(fed, folder)
         checkpoint = Checkpoint(
             run=task.trained_run,
             recipe=to_mapping(task.recipe),
@@ -449,6 +457,7 @@ class _Training:
             device=str(self.device),
             code_version=__version__,
             stage_errors=errors,
+            progress_sha256=fed.policy_sha256 if fed else "",
         )
         return write_checkpoint(folder, checkpoint, self.policy.state_dict())
 

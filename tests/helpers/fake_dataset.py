@@ -57,6 +57,25 @@ class FakeDataset(FakeData):
         return dict(self._columns)
 
 
+def fake_procedures(episodes: int = 6, steps: int = 40) -> FakeDataset:
+    """Return whole procedures whose arms tell the phase and the time since it began."""
+    dataset = FakeDataset(episodes, 5 * steps, TaskConfig(names.SUTURE), names.SUTURE)
+    phase = np.tile(np.repeat(np.arange(5), steps), episodes)
+    since = np.tile(np.arange(steps), 5 * episodes)
+    arms = np.random.default_rng(2).normal(size=(dataset.length, 14)) * 0.1
+    arms[:, :5] += np.eye(5)[phase]
+    arms[:, 5] += since / steps
+    seconds = np.tile(np.arange(5 * steps) / names.FPS, episodes)
+    dataset._columns |= {
+        names.PHASE: phase,
+        names.SUCCESS: np.tile(np.arange(5 * steps) == 5 * steps - 1, episodes),
+        names.BOTH_ARMS: arms.astype(np.float32),
+        "timestamp": seconds.astype(np.float32),
+        "frame_index": np.tile(np.arange(5 * steps), episodes),
+    }
+    return dataset
+
+
 def features_of(fake: FakeDataset, view: str = "back", **changes: object) -> Features:
     card = dict.fromkeys(
         ("input_size", "input_range", "mean", "std", "interpolation", "channel_order"), 0

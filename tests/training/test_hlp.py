@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fake_dataset import FakeDataset, features_of
+from fake_dataset import fake_procedures as procedures
+from fake_dataset import features_of
 
 from policies.hlp import HLP, HLPRecipe, fit_temperature
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.training.checkpoint import read_checkpoint, read_tensors, write_checkpoint
 from surgicai_vision.training.policies import load_policy, load_recipe
@@ -19,24 +19,6 @@ from surgicai_vision.training.train import train
 from surgicai_vision.training.visits import UNKNOWN, stages
 
 RECIPE = HLPRecipe(hidden=(32, 32), epochs=40, batch_size=32, learning_rate=1e-2, progress=1.0)
-
-
-def procedures(episodes: int = 6, steps: int = 40) -> FakeDataset:
-    """Return whole procedures whose arms tell the phase and the time since it began."""
-    dataset = FakeDataset(episodes, 5 * steps, TaskConfig(names.SUTURE), names.SUTURE)
-    phase = np.tile(np.repeat(np.arange(5), steps), episodes)
-    since = np.tile(np.arange(steps), 5 * episodes)
-    arms = np.random.default_rng(2).normal(size=(dataset.length, 14)) * 0.1
-    arms[:, :5] += np.eye(5)[phase]
-    arms[:, 5] += since / steps
-    success = np.tile(np.arange(5 * steps) == 5 * steps - 1, episodes)
-    dataset._columns |= {
-        names.PHASE: phase,
-        names.SUCCESS: success,
-        names.BOTH_ARMS: arms.astype(np.float32),
-        "timestamp": np.tile(np.arange(5 * steps) / names.FPS, episodes).astype(np.float32),
-    }
-    return dataset
 
 
 @pytest.fixture(scope="module")

@@ -100,10 +100,11 @@ def plan(grid: Grid, out: Path, choice: Choice = EVERYTHING) -> list[RunState]:
 
     Raises:
         UnknownName: a recipe, or a change of one, that does not exist.
+        InputError: a recipe that is fed progress, which no sweep says.
     """
     for run in grid.runs:
         if run.policy not in LEROBOT_POLICIES:
-            _recipe_digest(run.policy, run.recipe, run.changes, run.privileged)
+            policies.check_progress_from(policies.recipe_of(run), None)
     jobs = Jobs(grid, out)
     weights = WeightsSource(accept_licence=grid.accept_licence)
     missing = functools.lru_cache(functools.partial(_missing, weights=weights))

@@ -1,0 +1,112 @@
+"""Progress as an input: what a high-level policy says of the progress, fed to a low-level one.
+
+A recipe with `progress_input` feeds, in the place of the clock, how far the subtask is as another
+policy says it (`policies.hlp` with `progress`). In training that is its prediction on the dataset's
+frames and not the label, so that the input errs as it will when the policy acts; when it acts, it
+is the prediction from the same images. The checkpoint has the other policy's in its folder
+`progress`, and its hash in its card.
+
+Interface:
+
+* `check_progress_policy(checkpoint, dataset)`: refuse what says no progress of this dataset's task.
+* `with_progress(dataset, policy, features) -> Dataset`: the dataset with the column
+  `names.PROGRESSED_STATE`.
+* `copy_progress_policy(checkpoint, folder)`, `progress_policy_folder(checkpoint)`.
+"""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.dataset.protocol import Dataset
+from surgicai_vision.dataset.subset import DatasetSubset
+from surgicai_vision.features.cache import Features
+from surgicai_vision.training.checkpoint import CARD, WEIGHTS, Checkpoint, read_checkpoint
+
+if TYPE_CHECKING:
+    from policies.base import Policy
+
+FOLDER = "progress"
+ROWS = 1024
+"""Frames that are asked about at a time."""
+PROGRESS_AT = len(names.SUBTASKS)
+"""Place of the progress in a high-level policy's answer, after the logits."""
+
+
+def check_progress_policy(checkpoint: Checkpoint, dataset: Dataset) -> None:
+    """Refuse a policy that says no progress in this dataset's task.
+
+    Raises:
+        InputError: it says none, or of another task, or it sees images of another size.
+    """
+    folder = checkpoint.folder
+    if not checkpoint.recipe.get("progress"):
+        raise InputError(
+            f"{folder} says no progress; train one with --policy hlp --recipe high-level."
+        )
+    known = (dataset.config.task, names.SUTURE)
+    if checkpoint.task.task not in known:
+        raise InputError(
+            f"{folder} says the progress of '{checkpoint.task.task}'; allowed here: "
+            f"{', '.join(dict.fromkeys(known))}."
+        )
+    if checkpoint.views and checkpoint.image_size != dataset.image_size:
+        raise InputError(
+            f"{folder} sees images of {checkpoint.image_size} pixels; the dataset has "
+            f"{dataset.image_size}."
+        )
+
+
+def with_progress(
+    dataset: Dataset, policy: "Policy", features: Sequence[Features]
+) -> DatasetSubset:
+    """Return the dataset with `names.PROGRESSED_STATE`: its state and the predicted progress.
+
+    Args:
+        dataset: any dataset.
+        policy: says the progress; one that `check_progress_policy` lets pass.
+        features: of the dataset's frames as the policy sees them, one entry a view.
+    """
+    arms = np.asarray(dataset.columns()[names.BOTH_ARMS], np.float32)
+    said = []
+    for at in range(0, dataset.length, ROWS):
+        rows = slice(at, at + ROWS)
+        seen = [np.asarray(entry.rows[rows], np.float32) for entry in features]
+        answers = policy.act(np.concatenate(seen, axis=1) if seen else None, arms[rows])
+        said.append(answers[:, PROGRESS_AT:])
+    state = np.asarray(dataset.columns()[names.STATE], np.float32)
+    return DatasetSubset(
+        dataset,
+        np.arange(dataset.length),
+        {"progress": policy.checkpoint.policy_sha256},
+        added={names.PROGRESSED_STATE: np.concatenate([state, np.concatenate(said)], axis=1)},
+    )
+
+
+def copy_progress_policy(checkpoint: Checkpoint, folder: Path) -> None:
+    """Copy a progress policy into the checkpoint folder of the policy that is fed by it."""
+    (folder / FOLDER).mkdir(parents=True, exist_ok=True)
+    for name in (WEIGHTS, CARD):
+        shutil.copyfile(checkpoint.folder / name, folder / FOLDER / name)
+
+
+def progress_policy_folder(checkpoint: Checkpoint) -> Path | None:
+    """Return the folder of the policy whose progress a policy is fed; None where it is fed none.
+
+    Raises:
+        BadFile: it is not there, or it is another one.
+    """
+    if not checkpoint.progress_sha256:
+        return None
+    folder = checkpoint.folder / FOLDER
+    if read_checkpoint(folder).policy_sha256 != checkpoint.progress_sha256:
+        raise BadFile(
+            f"{folder} is not the policy whose progress {checkpoint.folder} was trained with "
+            "(its hash differs); train again."
+        )
+    return folder
