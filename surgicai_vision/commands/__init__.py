@@ -60,7 +60,7 @@ COMMANDS = MappingProxyType(
         "cache": "List, measure or prune the cached features.",
         "train": "Train a policy on a dataset's features.",
         "policies": "List the policies that come with the product.",
-        "policy": "Share a trained policy.",
+        "policy": "Share a trained policy, or tune one.",
         "evaluate": "Run a policy from held-out starts and count successes.",
         "watch": "Look at a policy while it acts, in the browser or in a window.",
         "robustness": "Run a policy while light, cameras, images or the arm shift.",

@@ -232,4 +232,8 @@ def summary_line(result: dict[str, Any]) -> str:
         line += "; recovered " + ", ".join(
             f"{kind} {count['k']}/{count['n']}" for kind, count in result["upsets"].items()
         )
+    if "ends" in result:
+        late = result["end_delay_s"]["mean"]
+        line += f"; {result['false_ends']['mean']:.2f} false ends a procedure"
+        line += "" if late is None else f", the others {late:.2f} s after the measured success"
     return line

@@ -18,6 +18,7 @@
   worth 0 would teach to drop it.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from typing import TYPE_CHECKING, ClassVar, cast
@@ -37,6 +38,7 @@ from surgicai_vision.envs.camera_rig import Images
 from surgicai_vision.envs.control import Command, StepSize
 from surgicai_vision.envs.feasibility import refuse_impossible
 from surgicai_vision.envs.geometry import Stitch
+from surgicai_vision.envs.lazy_frames import LazyFrames
 from surgicai_vision.envs.observation import ObservationConfig
 from surgicai_vision.envs.relative import relative_features
 from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
@@ -61,7 +63,7 @@ RENDER_SIZE = (480, 640)
 """Height and width of what `render` returns [px]."""
 RENDER_MODES = ("human", "rgb_array")
 
-Observation = NDArray[np.float32] | dict[str, Frame]
+Observation = NDArray[np.float32] | Mapping[str, Frame]
 
 
 class SuturingEnv(gymnasium.Env):
@@ -113,6 +115,8 @@ class SuturingEnv(gymnasium.Env):
             self.calibration.window(camera, view.image_size)  # a crop that does not fit is refused
         self._images = Images(self.simulation, self.calibration)
         self._human: Human | None = None
+        self._defers = False
+        self._moves = 0
 
     # -- gymnasium ---------------------------------------------------------------------------------
 
@@ -127,6 +131,7 @@ class SuturingEnv(gymnasium.Env):
                 `info["randomisation"]` reports them; the env must have some randomisation.
         """
         super().reset(seed=seed)
+        self._moves += 1
         given = cast(Mapping[str, Sequence[float]], (options or {}).get("randomisation", {}))
         simulation = self.simulation
         first = self._subtasks[0]
@@ -169,6 +174,7 @@ class SuturingEnv(gymnasium.Env):
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, Info]:
         """Take one control step of 20 ms."""
+        self._moves += 1
         simulation = self.simulation
         return self._after(
             simulation.advance(self.subtask.arm, self._checked(action), self._step_size)
@@ -183,6 +189,7 @@ class SuturingEnv(gymnasium.Env):
             commands: arm → its new command; an arm left out keeps its own.
             halfway: called after half of the step (`Simulation.advance_to`).
         """
+        self._moves += 1
         return self._after(self.simulation.advance_to(commands, halfway))
 
     def _after(self, is_physical: bool) -> tuple[Observation, float, bool, bool, Info]:
@@ -340,6 +347,7 @@ class SuturingEnv(gymnasium.Env):
     def set_state_vector(self, state: NDArray[np.float64]) -> None:
         """Restore a state of `get_state`: what follows is what followed then."""
         before = self.simulation.draws
+        self._moves += 1
         self.simulation.set_state(state)
         if self.simulation.draws is not before:
             self._meet_draws()
@@ -351,6 +359,7 @@ class SuturingEnv(gymnasium.Env):
                 f"set_state got shapes {np.shape(qpos)} and {np.shape(qvel)}; "
                 f"this scene needs ({self.model.nq},) and ({self.model.nv},)."
             )
+        self._moves += 1
         self.data.qpos[:] = qpos
         self.data.qvel[:] = qvel
         self.simulation.refresh()
@@ -423,10 +432,35 @@ class SuturingEnv(gymnasium.Env):
             return self._state_vector(target)
         if self.view.obs_type == "relative":
             return self._relative_state(target)
-        seen = self._images.look(self.view)
-        if self.view.obs_type == "pixels_agent_pos":
-            seen["agent_pos"] = self.agent_pos()
-        return seen
+        beside = {"agent_pos": self.agent_pos()} if self.view.shows_agent_pos else {}
+        if self._defers:
+            return LazyFrames(self._makers(), beside)
+        return self._images.look(self.view) | beside
+
+    def defer_images(self) -> None:
+        """Render each image of an observation when it is first looked at (`envs.lazy_frames`).
+
+        For who looks at few of many views; an observation is then no plain dict.
+        """
+        self._defers = True
+
+    def _makers(self) -> dict[str, Callable[[], Frame]]:
+        """Return what makes each frame of an observation of the present state."""
+        moves = self._moves
+
+        def frame(view: str, modality: str) -> Frame:
+            if self._moves != moves:
+                raise InputError(
+                    f"'{view}' of an observation is looked at for the first time after the env has "
+                    "moved on; look at it before the next step."
+                )
+            return self.image(view, self.view.image_size, modality)
+
+        return {
+            names.frame_key(view, modality): functools.partial(frame, view, modality)
+            for view in self.view.cameras
+            for modality in self.view.modalities
+        }
 
     def _state_vector(self, target: Target) -> NDArray[np.float32]:
         simulation = self.simulation

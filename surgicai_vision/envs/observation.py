@@ -81,6 +81,11 @@ class ObservationConfig:
         return self.obs_type in ("pixels", "pixels_agent_pos")
 
     @property
+    def shows_agent_pos(self) -> bool:
+        """Return True if the active arm's measured pose stands beside the images."""
+        return self.obs_type == "pixels_agent_pos"
+
+    @property
     def modalities(self) -> tuple[str, ...]:
         """Return what is rendered of each camera, a part of `names.MODALITIES`."""
         shown = {names.RGB: True, names.DEPTH: self.depth, names.SEGMENTATION: self.segmentation}
@@ -107,7 +112,7 @@ class ObservationConfig:
             for camera in self.cameras
             for modality in self.modalities
         }
-        if self.obs_type == "pixels_agent_pos":
+        if self.shows_agent_pos:
             parts["agent_pos"] = _box(7)
         return spaces.Dict(parts)
 

@@ -43,8 +43,8 @@ def simulated(robot: Robot) -> Env:
     return cast("base.SuturingEnv", robot)
 
 
-type FeatureTable = dict[tuple[str, tuple[str, ...]], dict[int, NDArray[np.float32]]]
-"""(encoder's fingerprint, views) → id of an observation → its features."""
+type FeatureTable = dict[tuple[str, str, int], NDArray[np.float32]]
+"""Encoder's fingerprint, view, id of an observation → the features of that image."""
 
 
 def frame_of(observation: Observation, key: str) -> "Frame":

@@ -259,21 +259,24 @@ class PolicyAgent(Agent):
 
     def _features(self, observations: Sequence[Observation]) -> NDArray[np.float32] | None:
         """Encode all views of all slots in one call, (n, views · dim)."""
-        if self._encoder is None:
+        encoder = self._encoder
+        if encoder is None:
             return None
-        if self._shared is None:
-            return self._encode(self._encoder, observations)
-        known = self._shared.setdefault((self._encoder.fingerprint, self.views), {})
-        new = [observation for observation in observations if id(observation) not in known]
+        known: FeatureTable = {} if self._shared is None else self._shared
+        keys = [
+            [(encoder.fingerprint, view, id(observation)) for view in self.views]
+            for observation in observations
+        ]
+        new = {
+            key: _image(observation, view)
+            for observation, row in zip(observations, keys, strict=True)
+            for view, key in zip(self.views, row, strict=True)
+            if key not in known
+        }
         if new:
-            known.update(zip(map(id, new), self._encode(self._encoder, new), strict=True))
-        return np.stack([known[id(observation)] for observation in observations])
-
-    def _encode(
-        self, encoder: "Encoder", observations: Sequence[Observation]
-    ) -> NDArray[np.float32]:
-        images = np.stack([_image(o, view) for o in observations for view in self.views])
-        return np.asarray(encoder(images), np.float32).reshape(len(observations), -1)
+            features = np.asarray(encoder(np.stack(list(new.values()))), np.float32)
+            known.update(zip(new, features.reshape(len(new), -1), strict=True))
+        return np.stack([np.concatenate([known[key] for key in row]) for row in keys])
 
 
 def _image(observation: Observation, view: str) -> NDArray[np.uint8]:

@@ -7,12 +7,16 @@ All lengths, angles and forces are read from the measured physical state, never 
 
 import dataclasses
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from surgicai_vision.core import names
 from surgicai_vision.evaluation.statistics import clopper_pearson, mean_and_std
+
+if TYPE_CHECKING:
+    from surgicai_vision.envs.visits import Visit
 
 KINDS = ("missed", "dropped", "wrong_hole", "time", "physics", "error")
 """Kinds of failure, see `failure_kind`, in the order in which charts stack them."""
@@ -34,6 +38,8 @@ MEASURED = (
     "tissue_impulse_ns",
     "tears",
     "thread_mm",
+    "false_ends",
+    "end_delay_s",
 )
 """Columns a summary averages over all episodes where they were measured."""
 
@@ -73,6 +79,10 @@ class EpisodeMetrics:
         upset: what went wrong, one of `envs.upset.KINDS`; "" where nothing did.
         upset_step: control steps taken when it did; -1 where nothing did.
         recovered: something went wrong, and the task succeeded all the same.
+        false_ends: of the whole procedure, subtasks that were ended before their success was
+            measured (`envs.visits`); NaN for another task.
+        end_delay_s: median time from a subtask's measured success to its end [s]; NaN where none
+            was ended after it.
     """
 
     task: str
@@ -104,6 +114,8 @@ class EpisodeMetrics:
     upset: str = ""
     upset_step: int = -1
     recovered: bool = False
+    false_ends: float = math.nan
+    end_delay_s: float = math.nan
 
 
 def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, held: bool) -> str:
@@ -155,6 +167,27 @@ def summary(rows: Sequence[EpisodeMetrics]) -> dict[str, Any]:
         ),
         **({"upsets": upset_recoveries(rows)} if any(row.upset for row in rows) else {}),
     }
+
+
+def measured_ends(visits: "Sequence[Visit]") -> list[dict[str, Any]]:
+    """Return for each subtask how often it was ended, how often falsely, and how late.
+
+    Args:
+        visits: of all episodes of one policy.
+    """
+    rows = []
+    for index, subtask in enumerate(names.SUBTASKS):
+        ends = [visit for visit in visits if visit.subtask == index and visit.is_end]
+        delays = [visit.delay for visit in ends if visit.delay is not None]
+        rows.append(
+            {
+                "subtask": subtask,
+                "ends": len(ends),
+                "false_ends": sum(visit.is_false_end for visit in ends),
+                "median_delay_s": statistics.median(delays) if delays else None,
+            }
+        )
+    return rows
 
 
 def subtask_successes(rows: Sequence[EpisodeMetrics]) -> list[dict[str, Any]]:

@@ -12,6 +12,7 @@ take the same steps, so what is watched is what is counted.
 """
 
 import math
+import statistics
 from dataclasses import dataclass, field
 from typing import Any, final
 
@@ -23,7 +24,9 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import PhysicsError
 from surgicai_vision.envs.episode_monitor import EpisodeMonitor
 from surgicai_vision.envs.moment import Moment, present_moment
+from surgicai_vision.envs.suture import Suture
 from surgicai_vision.envs.upset import Upset, plan_upset
+from surgicai_vision.envs.visits import Visit, VisitWatch
 from surgicai_vision.evaluation.agent import Agent, Env, Observation
 from surgicai_vision.evaluation.metrics import EpisodeMetrics, failure_kind
 
@@ -41,22 +44,26 @@ class Film:
 
 @dataclass(frozen=True)
 class Episode:
-    """A row and the film of its episode."""
+    """A row, the film of its episode, and the visits of a whole procedure."""
 
     row: EpisodeMetrics
     film: Film
+    visits: tuple[Visit, ...] = ()
 
 
 def env_of(agent: Agent, config: TaskConfig) -> Env:
-    """Make an env that shows what the agent sees."""
+    """Make an env that shows what the agent sees, and renders what it looks at."""
     cameras = tuple(agent.cameras)
-    return envs.make(
+    env = envs.make(
         config,
         obs_type="pixels_agent_pos" if cameras else "state",
         cameras=cameras,
         image_size=agent.image_size,
         depth=agent.depth,
     )
+    if cameras:
+        env.defer_images()
+    return env
 
 
 @final
@@ -90,6 +97,7 @@ class Slot:
         self.env = env_of(self.agent, self.task_config)
         self._mishap = Upset(self.env, None)
         self.monitor = EpisodeMonitor(self.env)
+        self.watch = VisitWatch(self.env) if isinstance(self.env, Suture) else None
 
     def begin(self, seed: int) -> None:
         """Start the episode of `seed`."""
@@ -104,6 +112,8 @@ class Slot:
             self.observation, self.info = self.env.reset(seed=seed)
             self.touched = bool(self.info.get("contact"))
             self.monitor.reset()
+            if self.watch:
+                self.watch.begin()
             self.agent.reset(self.index, self.env, seed)
         except PhysicsError as error:
             self.info, self.ended, self.error = {}, True, str(error)
@@ -125,6 +135,8 @@ class Slot:
             terminated, truncated, self.error, self.diverged = True, False, str(error), True
         else:
             self.monitor.update(self.info)
+            if self.watch:
+                self.watch.update(self.info)
         if self.info.get("physics_error"):
             self.error, self.diverged = self.error or "the physics diverged", True
         self.steps += 1
@@ -150,6 +162,8 @@ class Slot:
         monitor = self.monitor
         bite = monitor.bite
         held = not self.error and monitor.is_held()
+        visits = self.watch.visits() if self.watch else ()
+        delays = [visit.delay for visit in visits if visit.delay is not None]
         failure = failure_kind(self.error, self.diverged, self.touched, bite.wrong_hole, held)
         row = EpisodeMetrics(
             task=self.task_config.task,
@@ -181,9 +195,11 @@ class Slot:
             upset=self._mishap.kind,
             upset_step=self._mishap.step,
             recovered=success and bool(self._mishap.kind),
+            false_ends=sum(visit.is_false_end for visit in visits) if self.watch else math.nan,
+            end_delay_s=statistics.median(delays) if delays else math.nan,
         )
         self.seed = None
-        return Episode(row, self._film())
+        return Episode(row, self._film(), visits)
 
     def _keep(self) -> None:
         if self.error:

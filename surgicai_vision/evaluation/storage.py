@@ -1,9 +1,11 @@
 """Results: an evaluation as a folder, for reports and for anyone's own analysis.
 
 `evaluation.json` (written last: it marks a whole folder) holds the run, the summary and how it was
-made, `episodes.parquet` one row an episode, `films.safetensors` a few states of each episode.
+made, `episodes.parquet` one row an episode, `films.safetensors` a few states of each episode. Of a
+whole procedure `visits.parquet` has one row a visit of a subtask (`envs.visits`).
 """
 
+import dataclasses
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,16 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.core import files
+from surgicai_vision.core import files, names
 from surgicai_vision.core.config import JSON, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile
-from surgicai_vision.evaluation.metrics import as_table, summary
+from surgicai_vision.envs.visits import LAST, Visit
+from surgicai_vision.evaluation.metrics import as_table, measured_ends, summary
 from surgicai_vision.evaluation.slot import Episode, Film
 from surgicai_vision.training.run_config import RunConfig
 
 MARKER = "evaluation.json"
 EPISODES = "episodes.parquet"
 FILMS = "films.safetensors"
+VISITS = "visits.parquet"
 RUN_FILE = "run.json"
 GRID_FILE = "sweep.json"
 RESULT_FILE = "result.json"
@@ -103,9 +107,26 @@ def write_evaluation(
         arrays[f"{episode.row.seed}.states"] = episode.film.states
     files.write_bytes(folder / FILMS, save(arrays))
     result = summary(rows)
+    visits = [(episode.row.seed, visit) for episode in episodes for visit in episode.visits]
+    if visits:
+        files.write_bytes(folder / VISITS, parquet_bytes([_visit_row(*one) for one in visits]))
+        result["ends"] = measured_ends([visit for _, visit in visits])
     stored = {"format": FORMAT, "run": to_mapping(run), "summary": result, "about": dict(about)}
     files.write_json(folder / MARKER, stored)
     return result
+
+
+def _visit_row(seed: int, visit: Visit) -> Row:
+    """Return one visit of the episode of a start as plain data."""
+    is_last = visit.following == LAST
+    return {
+        "seed": seed,
+        **dataclasses.asdict(visit),
+        "subtask": names.SUBTASKS[visit.subtask],
+        "following": "" if is_last else names.SUBTASKS[visit.following],
+        "is_false_end": visit.is_false_end,
+        "delay_s": visit.delay,
+    }
 
 
 def parquet_bytes(table: list[Row]) -> bytes:

@@ -39,6 +39,8 @@ MEASURES = (
     ("tissue_impulse_ns", "force × time", "N s", "force on the tissue, summed over the episode"),
     ("tears", "tears", "count", "how often soft tissue tore"),
     ("thread_mm", "thread drawn", "mm", "thread that came out of the exit behind the needle"),
+    ("false_ends", "false ends", "count", "subtasks ended before their success was measured"),
+    ("end_delay_s", "end delay", "s", "median time from a subtask's measured success to its end"),
 )
 """Columns of an episode's row that are no count: name, what, unit, explanation."""
 

@@ -188,6 +188,8 @@ def test_experts_in_their_order_sew_and_count_their_stages() -> None:
     assert made.config.task == "suture"
     row = evaluate(made.make_agent, made.config, [names.TEST_SEED], workers=1)[0].row
     assert row.success and row.stages == 5, row
+    # A grasp ends after five steps, the others after fifteen, the first of which is no delay.
+    assert (row.false_ends, row.end_delay_s) == (0, pytest.approx(0.28))
     assert summary([row])["reached"] == dict.fromkeys(names.SUBTASKS, 1)
 
 

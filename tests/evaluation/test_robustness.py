@@ -35,6 +35,8 @@ def seeing(image_size=48):
     def encode(frames):
         return frames.reshape(len(frames), -1).astype(np.float64)
 
+    encode.fingerprint = "pixels"
+
     def act(features, agent_pos):
         weights = np.random.default_rng(0).normal(size=(features.shape[1], 7)) / features.shape[1]
         return np.tanh(features @ weights / 30).astype(np.float32)
@@ -207,7 +209,7 @@ def test_a_wrapper_passes_on_every_member_of_the_agent():
     wrapped.restart(3)
     wrapped.share(table)
     assert agent.restarted == [3] and agent.shared is table
-    kept = ("name", "cameras", "image_size", "depth")
+    kept = ("name", "cameras", "image_size", "depth", "privileged")
     assert all(getattr(wrapped, member) == getattr(agent, member) for member in kept)
 
 

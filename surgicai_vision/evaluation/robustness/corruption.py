@@ -7,6 +7,7 @@ function of the image, the strength, the start seed, the step and the view alone
 looks the same in any batch and process. At strength 0 the image comes back as it was.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.cameras import camera_number
+from surgicai_vision.envs.lazy_frames import LazyFrames
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
@@ -151,9 +153,22 @@ class CorruptedAgent(Agent):
         return self._agent.act(slots, robots, seen)
 
     def _seen(self, slot: int, observation: Observation) -> Observation:
-        changed = {}
-        for view in self.cameras:
+        """Return an observation whose images are changed when they are looked at."""
+        if not self.cameras:
+            return observation
+        moments = {
+            view: Moment(self._seeds[slot], self._steps[slot], camera_number(view))
+            for view in self.cameras
+        }
+
+        def changed(view: str) -> Image:
             image = frame_of(observation, view).astype(np.uint8, copy=False)
-            moment = Moment(self._seeds[slot], self._steps[slot], camera_number(view))
-            changed[view] = self._change(image, self._strength, moment)
-        return {**observation, **changed} if isinstance(observation, dict) else observation
+            return self._change(image, self._strength, moments[view])
+
+        makers = {
+            key: functools.partial(changed, key)
+            if key in moments
+            else functools.partial(frame_of, observation, key)
+            for key in observation
+        }
+        return LazyFrames(makers, {})

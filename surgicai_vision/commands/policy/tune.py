@@ -1,0 +1,98 @@
+"""`policy tune`: choose how sure and how patient the ends of a hierarchical policy are."""
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+from cyclopts import App, Parameter
+
+from surgicai_vision.commands import folders
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.options import (
+    ACCEPT_LICENCE,
+    COUNT,
+    DIRECTORY,
+    FILE_ONLY,
+    NOT_NEGATIVE,
+    UNIQUE,
+    WEIGHTS,
+    default_text,
+)
+from surgicai_vision.core import names
+from surgicai_vision.core.config import JSON
+from surgicai_vision.features.encoders import WeightsSource
+
+if TYPE_CHECKING:
+    from surgicai_vision.evaluation.ends_sweep import Ends
+
+app = App(
+    name="tune",
+    help_epilogue="""\
+example:
+  surgicai-vision policy tune hierarchical.yaml --confidence 0.5,0.9 --patience 1,3""",
+)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `policy tune`.
+
+    Attributes:
+        policy: The YAML file of a hierarchical policy with learned ends.
+        confidence: Probabilities that another subtask must have.
+        patience: How often in a row it must be named.
+        episodes: Number of validation starts, the same for all pairs.
+        seed: Seed of the first start; each episode takes the next.
+        workers: Number of processes.
+        out: Folder to make or to continue; its hierarchical.yaml has the chosen values.
+    """
+
+    policy: Annotated[Path, Parameter(metavar="FILE")] = field(kw_only=False)
+    confidence: Annotated[tuple[float, ...], UNIQUE, Parameter(metavar="P[,P]")] = (0.5, 0.7, 0.9)
+    patience: Annotated[tuple[int, ...], UNIQUE, Parameter(metavar="N[,N]")] = (1, 2, 3)
+    episodes: Annotated[int, COUNT] = 20
+    seed: Annotated[int, NOT_NEGATIVE] = names.VALIDATION_SEED
+    workers: Annotated[
+        int | None, COUNT, default_text("one a core, at most one for four episodes")
+    ] = None
+    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
+    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    out: Annotated[
+        Path | None, DIRECTORY, default_text("outputs/ends/<file>-starts<seed>+<episodes>")
+    ] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+
+
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
+    """Evaluate every pair on validation starts, and write a file with the best."""
+    from surgicai_vision.evaluation.ends_sweep import CHOSEN, MARK, sweep_ends
+    from surgicai_vision.training.run_config import Starts
+
+    name = f"{options.policy.stem}-starts{options.seed}+{options.episodes}"
+    out = options.out or folders.OUTPUTS / "ends" / name
+    folders.check_folder(out, MARK)
+    rows = sweep_ends(
+        options.policy,
+        Starts(options.seed, options.episodes),
+        out,
+        console.stage,
+        options.confidence,
+        options.patience,
+        cast("dict[str, JSON] | None", options.env),
+        WeightsSource.parse(options.weights, options.accept_licence),
+        options.workers,
+    )
+    console.say("confidence  patience  sewn     false ends  delay [s]")
+    for row in rows:
+        console.say(_line(row))
+    console.say(f"best: {out / CHOSEN}")
+    return {"ends": [asdict(row) for row in rows], "out": str(out)}
+
+
+def _line(row: "Ends") -> str:
+    """Return one pair as a line of the table."""
+    sewn = f"{row.successes}/{row.episodes}"
+    delay = "–" if row.delay_s is None else f"{row.delay_s:.2f}"
+    return f"{row.confidence:<10g}  {row.patience:<8}  {sewn:<7}  {row.false_ends:<10.2f}  {delay}"

@@ -1,0 +1,136 @@
+"""Ends sweep: how sure and how patient the ends of a hierarchical policy should be.
+
+`sweep_ends` evaluates a hierarchical policy with learned ends at every `confidence` and `patience`
+on validation starts, one evaluation folder each, and writes the best of them as
+`DIR/hierarchical.yaml`, which `evaluate` takes. What is there already is kept, so running again
+continues.
+
+Best is what sews most; of those what ends the fewest subtasks falsely, and then what ends them
+soonest. Test starts are refused: what is chosen on them cannot be measured on them.
+"""
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from surgicai_vision.core import files, names
+from surgicai_vision.core.config import JSON, to_mapping
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.progress import Stage
+from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
+from surgicai_vision.evaluation.policy_spec import open_policy, read_hierarchical
+from surgicai_vision.evaluation.run import evaluate_once
+from surgicai_vision.evaluation.storage import Row
+from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
+from surgicai_vision.training.run_config import Starts
+
+CHOSEN, MARK = "hierarchical.yaml", "ends.json"
+CONFIDENCES = (0.5, 0.7, 0.9)
+PATIENCES = (1, 2, 3)
+
+
+@dataclass(frozen=True)
+class Ends:
+    """What one pair of settings came to.
+
+    Attributes:
+        confidence: of `HierarchicalConfig`.
+        patience: of `HierarchicalConfig`.
+        successes: whole procedures that were sewn.
+        episodes: validation starts.
+        false_ends: subtasks ended before their measured success, a procedure.
+        delay_s: mean over procedures of the median time from measured success to end [s]; None
+            where nothing was ended after it.
+    """
+
+    confidence: float
+    patience: int
+    successes: int
+    episodes: int
+    false_ends: float
+    delay_s: float | None
+
+    def rank(self) -> tuple[float, float, float]:
+        """Return what is the least for the best."""
+        late = float("inf") if self.delay_s is None else self.delay_s
+        return -self.successes, self.false_ends, late
+
+
+def sweep_ends(
+    path: Path,
+    starts: Starts,
+    out: Path,
+    stage: Stage,
+    confidences: Sequence[float] = CONFIDENCES,
+    patiences: Sequence[int] = PATIENCES,
+    env: Mapping[str, JSON] | None = None,
+    weights: WeightsSource = ANYWHERE,
+    workers: int | None = None,
+) -> list[Ends]:
+    """Evaluate every pair and write the best into `out`; return them, the best first.
+
+    Args:
+        path: the YAML file of a hierarchical policy.
+        starts: validation starts, the same for all.
+        out: folder to make or to continue.
+        stage: shows progress.
+        confidences: values of `HierarchicalConfig.confidence`.
+        patiences: values of `HierarchicalConfig.patience`.
+        env: fields of the env that differ, as `open_policy` takes them.
+        weights: where pretrained weights come from.
+        workers: processes.
+
+    Raises:
+        InputError: privileged ends, test starts, or values that are not allowed.
+        OutputExists: `out` holds another policy or other starts.
+    """
+    given = read_hierarchical(path)
+    if given.termination != "learned":
+        raise InputError(
+            f"{path} has termination: {given.termination}; only learned ends have a confidence."
+        )
+    if starts.seeds[-1] >= names.TEST_SEED:
+        raise InputError(
+            f"Starts {starts.seeds[0]} to {starts.seeds[-1]} reach into the test starts, from "
+            f"{names.TEST_SEED} on; choose on validation starts, from {names.VALIDATION_SEED} on."
+        )
+    configs = [
+        dataclasses.replace(given, confidence=confidence, patience=patience)
+        for confidence, patience in itertools.product(confidences, patiences)
+    ]
+    owner = {**to_mapping(given), "confidence": None, "patience": None}
+    mine = {"hierarchical": owner, "env": dict(env or {}), "starts": to_mapping(starts)}
+    files.claim(out / MARK, mine, "the ends")
+    tried = {}
+    for config in configs:
+        name = f"confidence-{config.confidence:g}-patience-{config.patience}"
+        file = _write(out / f"{name}.yaml", config)
+        opened = functools.partial(open_policy, file, env=env, weights=weights)
+        row = evaluate_once(out / name, opened, starts.seeds, stage, workers)
+        tried[config] = _ends(config, row)
+    best = min(configs, key=lambda config: tried[config].rank())
+    _write(out / CHOSEN, best)
+    return sorted(tried.values(), key=Ends.rank)
+
+
+def _write(path: Path, config: HierarchicalConfig) -> Path:
+    """Write the YAML file of a hierarchical policy and return its path."""
+    files.write_bytes(path, yaml.safe_dump(to_mapping(config), sort_keys=False).encode())
+    return path
+
+
+def _ends(config: HierarchicalConfig, summary: Row) -> Ends:
+    """Return what an evaluation's summary says of the ends."""
+    return Ends(
+        config.confidence,
+        config.patience,
+        summary["successes"],
+        summary["episodes"],
+        summary["false_ends"]["mean"],
+        summary["end_delay_s"]["mean"],
+    )
