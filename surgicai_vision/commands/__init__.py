@@ -64,7 +64,7 @@ COMMANDS = MappingProxyType(
         "evaluate": "Run a policy from held-out starts and count successes.",
         "watch": "Look at a policy while it acts, in the browser or in a window.",
         "robustness": "Run a policy while light, cameras, images or the arm shift.",
-        "robot": "Speak CRTK: serve the simulation as a da Vinci Research Kit.",
+        "robot": "Speak CRTK: serve the simulation as a dVRK, or drive one by a policy.",
         "sweep": "Encode, train and evaluate every run of a grid.",
         "release": "Build the policies that come with the product, from nothing.",
         "report": "Write the report of stored results.",

@@ -29,7 +29,10 @@ POLL_S = 0.005
 CONNECT_S = 20.0
 """Time in which a robot must be found [s]."""
 ASK_AGAIN_S = 0.5
-_DUE = ("measured_js", "setpoint_js", "measured_cp", "setpoint_cp", "image_raw", "compressed")
+_DUE = (
+    *("measured_js", "setpoint_js", "measured_cp", "setpoint_cp", "image_raw", "compressed"),
+    "judgement",
+)
 """Last part of the topics on which something comes all the time."""
 
 
@@ -80,8 +83,8 @@ class Client:
         for arm in config.arms:
             heard += topics.psm_topics(arm, heard=False).values()
             said += topics.psm_topics(arm, heard=True).values()
-        image_of = topics.compressed_topic if config.is_compressed else topics.image_topic
-        heard += [image_of(view) for view in config.views]
+        self._image_of = topics.compressed_topic if config.is_compressed else topics.image_topic
+        heard += [self._image_of(view) for view in config.views]
         if config.is_simulated:
             heard += [topics.STEPPED, topics.JUDGEMENT]
             said += [topics.STEP, topics.RESET, topics.ENTER]
@@ -123,10 +126,16 @@ class Client:
             self._transport.wait(POLL_S)
 
     def update(self) -> None:
-        """Take what has come."""
+        """Take what has come; of a topic's messages the one with the latest stamp counts."""
         for name, inbox in self._inboxes.items():
             for received in inbox():
-                self._newest[name] = Heard(received.message, time.monotonic())
+                before = self._newest.get(name)
+                if before is None or not _is_older(received.message, before.message):
+                    self._newest[name] = Heard(received.message, time.monotonic())
+
+    def image_topic(self, view: str) -> str:
+        """Return the topic on which a view's images come."""
+        return self._image_of(view).name
 
     def newest(self, topic: str) -> Heard | None:
         """Return the newest message of a topic, None before the first."""
@@ -175,6 +184,10 @@ class Client:
         """Tell a served simulation's judge which subtask is on; as `step`."""
         return self._ask(topics.ENTER, subtask, self.stamp())
 
+    def tell_subtask(self, subtask: str) -> None:
+        """Tell a served simulation's judge which subtask is on, and do not wait."""
+        self.send(topics.ENTER.name, StringStamped(Header(self.stamp()), subtask))
+
     def _ask(self, topic: Topic, text: str, stamp: int) -> int:
         self.send(topic.name, StringStamped(Header(stamp), text))
         ends = time.monotonic() + STEP_S
@@ -215,6 +228,13 @@ class Client:
     def _is_due(name: str) -> bool:
         """Return True if something comes on a topic all the time."""
         return name.rpartition("/")[2] in _DUE
+
+
+def _is_older(message: Message, than: Message) -> bool:
+    """Return True if a message was overtaken by another, as their stamps say."""
+    if isinstance(message, String) or isinstance(than, String):
+        return False
+    return 0 < message.header.stamp < than.header.stamp
 
 
 def _renamed(topic: Topic, table: Mapping[str, str]) -> Topic:

@@ -30,14 +30,18 @@ if TYPE_CHECKING:
     uint32 = int
     Texts = Sequence[str]
     Floats = Sequence[float]
+    Singles = Sequence[float]
+    Integers = Sequence[int]
     Nine = Sequence[float]
     Twelve = Sequence[float]
     Bytes = bytes
 else:
-    from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
+    from cyclonedds.idl.types import array, float32, float64, int32, sequence, uint8, uint32
 
     Texts = sequence[str]
     Floats = sequence[float64]
+    Singles = sequence[float32]
+    Integers = sequence[int32]
     Nine = array[float64, 9]
     Twelve = array[float64, 12]
     Bytes = sequence[uint8]
@@ -155,6 +159,15 @@ class StringStamped(IdlStruct, typename="crtk_msgs::msg::dds_::StringStamped_"):
 
     header: Header
     string: str
+
+
+@dataclass
+class Joy(IdlStruct, typename="sensor_msgs::msg::dds_::Joy_"):
+    """sensor_msgs/Joy."""
+
+    header: Header
+    axes: Singles
+    buttons: Integers
 
 
 @dataclass
@@ -461,6 +474,15 @@ CODECS = MappingProxyType(
             ),
         ),
         m.CameraInfo: _codec(CameraInfo, _to_info, _from_info),
+        m.Joy: _codec(
+            Joy,
+            lambda message: Joy(
+                _to_header(message.header), list(message.axes), list(message.buttons)
+            ),
+            lambda sample: m.Joy(
+                _from_header(sample.header), tuple(sample.axes), tuple(sample.buttons)
+            ),
+        ),
     }
 )
 """Message → its codec."""

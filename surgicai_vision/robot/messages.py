@@ -108,6 +108,15 @@ class CameraInfo:
     intrinsics: Numbers
 
 
+@dataclass(frozen=True)
+class Joy:
+    """sensor_msgs/Joy: a pedal's or a gamepad's axes in [-1, 1] and buttons, 1 where pressed."""
+
+    header: Header
+    axes: Numbers
+    buttons: tuple[int, ...]
+
+
 Message = (
     JointState
     | PoseStamped
@@ -118,4 +127,5 @@ Message = (
     | Image
     | CompressedImage
     | CameraInfo
+    | Joy
 )

@@ -142,7 +142,6 @@ class Server:
         self._stamps: dict[str, int] = {}
         self._requests: list[_Request] = []
         self._shown: dict[str, tuple[str, bool, bool]] = {}
-        self._judged = ""
         self._last_stamp = 0
         self._next_image = 0.0
         self._cameras: Cameras | None = None
@@ -368,20 +367,20 @@ class Server:
         self._publishers[f"/{name}/{level}"](StringStamped(header, text))
 
     def _publish_judgement(self, stamp: int) -> None:
-        """Publish how the episode stands, where that has changed."""
+        """Publish how the episode stands."""
         info = self.robot.info
+        env = self.robot.env
         judged = {
             "seed": self.robot.seed,
-            "subtask": self.robot.env.subtask.name,
+            "steps": self.robot.steps,
+            "subtask": env.subtask.name,
+            "advance": env.config.advance,
             "is_success": bool(info["is_success"]),
             "progress": int(info.get("progress", 0) or info["is_success"]),
             "physics_error": bool(info["physics_error"]),
         }
-        text = json.dumps(judged)
-        if text != self._judged:
-            self._judged = text
-            told = json.dumps({**judged, "steps": self.robot.steps})
-            self._publishers[topics.JUDGEMENT.name](StringStamped(Header(stamp), told))
+        message = StringStamped(Header(stamp), json.dumps(judged))
+        self._publishers[topics.JUDGEMENT.name](message)
 
     def _offer_image(self, stamp: int) -> None:
         """Give the image thread the present state where an image is due and it has time."""

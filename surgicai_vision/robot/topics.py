@@ -95,8 +95,9 @@ The text names the topics, between blanks, whose message with the same stamp mus
 STEPPED = Topic("/simulation/stepped", m.StringStamped, EVENT)
 """Answers `RESET`, `ENTER` and `STEP`: the text is the stamp that was asked with, its own stamp is
 that of the states published with it."""
-JUDGEMENT = Topic("/simulation/judgement", m.StringStamped, EVENT)
-"""Ground truth: the judged episode as JSON: seed, steps, subtask, progress, success, errors."""
+JUDGEMENT = Topic("/simulation/judgement", m.StringStamped)
+"""Ground truth: the judged episode as JSON: seed, steps, subtask, who advances it, progress,
+success, errors."""
 
 
 def psm_topics(name: str, *, heard: bool) -> dict[str, Topic]:

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 
+from surgicai_vision.robot.topics import EVENT, LATCHED
 from surgicai_vision.robot.transport import Received
 
 
@@ -10,6 +11,7 @@ class Medium:
 
     def __init__(self):
         self.inboxes = defaultdict(list)
+        self.kept = {}  # what those who come later hear too
         self.count = 0
 
 
@@ -33,13 +35,16 @@ class MemoryTransport:
             if topic.name in self.dropped:
                 return
             self.medium.count += 1
+            received = Received(message, self.source, self.medium.count)
+            if topic.quality in (EVENT, LATCHED):
+                self.medium.kept[topic.name] = received
             for waiting in self.medium.inboxes[topic.name]:
-                waiting.append(Received(message, self.source, self.medium.count))
+                waiting.append(received)
 
         return publish
 
     def inbox(self, topic):
-        waiting = []
+        waiting = [self.medium.kept[topic.name]] if topic.name in self.medium.kept else []
         self.medium.inboxes[topic.name].append(waiting)
 
         def take():

@@ -1,5 +1,6 @@
 """CRTK over DDS: what is sent arrives, between two processes, and nowhere but on the loopback."""
 
+import io
 import json
 import os
 import socket
@@ -13,9 +14,12 @@ from served import DOMAIN, serving
 from surgicai_vision import envs
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.evaluation.agents import RandomAgent
 from surgicai_vision.robot import frames, topics
 from surgicai_vision.robot import messages as m
 from surgicai_vision.robot.client import Client, ClientConfig
+from surgicai_vision.robot.driver import DriveConfig, DrivenRobot, Driver
+from surgicai_vision.robot.guards import GuardConfig
 from surgicai_vision.robot.topics import Topic
 from surgicai_vision.robot.transport import open_transport
 
@@ -33,6 +37,7 @@ EXAMPLES = [
     m.String("400006"),
     m.Image(HEADER, 2, 3, bytes(range(18))),
     m.CompressedImage(HEADER, "jpeg", b"\xff\xd8 and so on"),
+    m.Joy(HEADER, (0.5, -1.0), (1, 0)),
     m.CameraInfo(HEADER, 2, 3, tuple(float(value) for value in range(9))),
 ]
 SEED = 900_001
@@ -61,6 +66,7 @@ def test_a_message_is_the_same_after_its_way(transport, message):
 def test_a_type_has_the_name_that_ros_gives_it(message):
     package = {
         "JointState": "sensor_msgs",
+        "Joy": "sensor_msgs",
         "Image": "sensor_msgs",
         "CompressedImage": "sensor_msgs",
         "CameraInfo": "sensor_msgs",
@@ -123,6 +129,61 @@ def test_a_served_simulation_is_driven_from_another_process(transport):
         goal = frames.read_pose(client.newest("/PSM2/local/setpoint_cp").message)
         assert np.allclose(goal, own.simulation.commands["psm2"].pose, atol=1e-9)
     own.close()
+
+
+def test_a_policy_drives_the_served_simulation_as_in_process(tmp_path):
+    """`serve` and `drive`, a process each: the same poses at every step as in this process."""
+    own = envs.make(TaskConfig("grasp", max_steps=25))
+    own.reset(seed=SEED)
+    agent = RandomAgent()
+    agent.reset(0, own, SEED)
+    poses = []
+    for _ in range(25):
+        poses.append(own.both_arms())
+        own.step(agent.act([0], [own], [own.observe()])[0])
+    own.close()
+    domain = DOMAIN % 200 + 2
+    drive = [
+        *(sys.executable, "-m", "surgicai_vision", "robot", "drive", "random", "--task", "grasp"),
+        *("--simulated", "--clock", "stepped", "--send", "--seed", str(SEED), "--seconds", "0.5"),
+        *("--domain", str(domain), "--out", str(tmp_path / "log"), "--json"),
+    ]
+    with serving("--task", "grasp", "--clock", "stepped", domain=domain):
+        driven = subprocess.run(drive, capture_output=True, text=True, timeout=300)
+    assert driven.returncode == 0, driven.stderr
+    said = json.loads(driven.stdout.splitlines()[-1])
+    assert said["sent"]
+    assert [row["steps"] for row in said["episodes"]] == [25]
+    lines = [json.loads(row) for row in (tmp_path / "log" / "drive.jsonl").open()]
+    assert lines[0]["policy"] == "random"
+    assert np.allclose([line["both_arms"] for line in lines[1:]], poses, atol=1e-6)
+
+
+def test_a_robot_that_falls_silent_is_told_nothing_more(transport):
+    """In real time: when the publisher is killed, the guards hold everything back and say why."""
+    log = io.StringIO()
+    with serving("--task", "grasp") as process:
+        client = Client(transport, ClientConfig(is_simulated=True))
+        client.connect()
+        config = DriveConfig(GuardConfig(), sends=True, is_simulated=True)
+        killed = []
+
+        def dead_man():
+            if log.getvalue().count('"sent": true') > 10 and not killed:
+                process.kill()
+                process.wait()
+                killed.append(len(log.getvalue().splitlines()))
+            return 0.0
+
+        robot = DrivenRobot(client, (), "grasp", 224)
+        task = TaskConfig("grasp")
+        driver = Driver(RandomAgent(), robot, task, config, dead_man, log, lambda text: None)
+        driver.episode(SEED, 400)
+    lines = [json.loads(line) for line in log.getvalue().splitlines()]
+    assert killed
+    late = int(2 * config.guards.max_age * 50) + killed[0]
+    assert not any(line["sent"] for line in lines[late:])
+    assert "s old" in lines[-1]["held"]
 
 
 RCLPY = """

@@ -1,5 +1,6 @@
 """`robot serve`: the simulation as a dVRK that speaks CRTK."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -17,6 +18,7 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.commands.robot.network import INTERFACE, TRANSPORT, Domain, ros_domain
 from surgicai_vision.core import names
+from surgicai_vision.core.config import ADVANCES
 from surgicai_vision.core.processes import Terminated
 
 app = App(
@@ -42,6 +44,8 @@ class Options:
         size: Height and width of images [px].
         image_rate: Images of each view a second at most, in real time [Hz].
         compressed: Publish JPEG files besides the raw images.
+        advance: How the judge of the whole procedure goes on: by the present subtask's success, or
+            told on /simulation/enter, as a hierarchical policy with learned ends needs it.
         truth: Publish the needle's pose and the subtask under way, which no robot knows.
         transport: What carries the messages.
         interface: See above.
@@ -58,6 +62,7 @@ class Options:
         float, Parameter(validator=validators.Number(gt=0, lte=100), metavar="HZ")
     ] = 25.0
     compressed: bool = False
+    advance: Annotated[str, Parameter(choices=ADVANCES)] = ADVANCES[0]
     truth: bool = False
     transport: Annotated[str, TRANSPORT] = "cyclonedds"
     interface: Annotated[str, INTERFACE] = "lo"
@@ -88,7 +93,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         options.truth,
     )
     with open_transport(options.transport, options.interface, domain) as transport:
-        env = envs.make(task_config(options.task, options.env))
+        task = dataclasses.replace(task_config(options.task, options.env), advance=options.advance)
+        env = envs.make(task)
         robot = SimulatedRobot(env)
         robot.reset(options.seed)
         limit = None if options.seconds is None else round(options.seconds * names.FPS)

@@ -1,0 +1,227 @@
+"""`robot drive`: a policy drives a dVRK, simulated or real, over CRTK."""
+
+import json
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter, validators
+
+from surgicai_vision.commands import folders
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.evaluate import open_given
+from surgicai_vision.commands.options import (
+    ACCEPT_LICENCE,
+    COUNT,
+    DIRECTORY,
+    FILE_ONLY,
+    NOT_NEGATIVE,
+    TASK,
+    WEIGHTS,
+    default_text,
+)
+from surgicai_vision.commands.robot.network import INTERFACE, TRANSPORT, Domain, ros_domain
+from surgicai_vision.core import names
+from surgicai_vision.core.config import from_mapping
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.processes import Terminated
+from surgicai_vision.features.encoders import WeightsSource
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from surgicai_vision.robot.transport import Transport
+
+app = App(
+    name="drive",
+    help_epilogue="""\
+example:
+  surgicai-vision robot serve --clock stepped --advance told --view front,back &
+  surgicai-vision robot drive hierarchical.yaml --simulated --clock stepped --send
+
+Without --send nothing is sent: it prints what would be. docs/robot.md says what the guards ask.""",
+)
+LOG = "drive.jsonl"
+KEY = "key"
+NONE = "none"
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `robot drive`.
+
+    Attributes:
+        policy: A checkpoint folder, a hierarchical.yaml, released:NAME (see `policies`) or
+            module:factory.
+        task: The task.
+        send: Send what the policy says; otherwise print what would be sent.
+        simulated: The robot is `robot serve`, which begins episodes and judges them.
+        clock: real, or stepped where the simulation is served with --clock stepped.
+        dead_man: What a person holds: key (the space bar), the topic of a sensor_msgs/Joy, or, at
+            a served simulation alone, none.
+        episodes: Episodes at a served simulation.
+        seed: Seed of the first start.
+        seconds: Longest time of an episode [s].
+        compressed: Read the compressed images, not the raw ones.
+        transport: What carries the messages.
+        interface: See above.
+        domain: See above.
+        out: Folder of the log, which grows.
+    """
+
+    policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
+    task: Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")] = None
+    send: bool = False
+    simulated: bool = False
+    clock: Annotated[str, Parameter(choices=("real", "stepped"))] = "real"
+    dead_man: Annotated[
+        str | None,
+        Parameter(metavar="key|TOPIC|none"),
+        default_text("key, at a served simulation none"),
+    ] = None
+    episodes: Annotated[int, COUNT] = 1
+    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    seconds: Annotated[
+        float | None, Parameter(validator=validators.Number(gt=0)), default_text("the task's own")
+    ] = None
+    compressed: bool = False
+    transport: Annotated[str, TRANSPORT] = "cyclonedds"
+    interface: Annotated[str, INTERFACE] = "lo"
+    domain: Domain = None
+    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
+    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    out: Annotated[Path | None, DIRECTORY, default_text("outputs/drive/<task>-<policy>")] = None
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    guards: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    topics: Annotated[dict[str, object] | None, FILE_ONLY] = None
+
+
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
+    """Drive, and print what was sent, what was held back, and how late it came."""
+    import numpy as np
+
+    from surgicai_vision.core.files import code_version
+    from surgicai_vision.robot.client import Client, ClientConfig
+    from surgicai_vision.robot.driver import DriveConfig, DrivenRobot, Driver, check_drivable
+    from surgicai_vision.robot.guards import GuardConfig
+    from surgicai_vision.robot.transport import open_transport
+
+    spec = open_given(
+        options.policy,
+        options.task,
+        options.env,
+        None,
+        WeightsSource.parse(options.weights, options.accept_licence),
+    )
+    config = DriveConfig(
+        from_mapping(GuardConfig, options.guards or {}, "guards"),
+        options.send,
+        options.simulated,
+        options.clock == "stepped",
+    )
+    renamed = {name: str(topic) for name, topic in (options.topics or {}).items()}
+    out = options.out or folders.OUTPUTS / "drive" / f"{spec.config.task}-{spec.name}"
+    folders.check_folder(out, LOG)
+    agent = spec.make_agent()
+    check_drivable(agent, spec.config)
+    views = tuple(agent.cameras)
+    limit = spec.config.max_steps
+    if options.seconds is not None:
+        limit = max(1, round(options.seconds * names.FPS))
+    episodes = []
+    with ExitStack() as stack:
+        transport = stack.enter_context(
+            open_transport(options.transport, options.interface, ros_domain(options.domain))
+        )
+        dead_man = _dead_man(options, transport, stack)
+        client = Client(
+            transport,
+            ClientConfig(
+                views=views,
+                is_compressed=options.compressed,
+                is_simulated=options.simulated,
+                renamed=renamed,
+            ),
+        )
+        client.connect()
+        out.mkdir(parents=True, exist_ok=True)
+        log = stack.enter_context((out / LOG).open("a", buffering=1, encoding="utf-8"))
+        about = {
+            "policy": options.policy,
+            "task": spec.config.task,
+            "guards": asdict(config.guards),
+            "sends": options.send,
+            "code_version": code_version(),
+        }
+        log.write(json.dumps(about) + "\n")
+        robot = DrivenRobot(client, views, spec.config.task, agent.image_size)
+        driver = Driver(agent, robot, spec.config, config, dead_man, log, console.note)
+        if not options.send:
+            console.note("dry run: nothing is sent; --send sends it")
+        try:
+            for number in range(options.episodes if options.simulated else 1):
+                episode = driver.episode(options.seed + number, limit)
+                episodes.append(episode)
+                console.say(
+                    f"{_about(episode.seed, options)}: {episode.ended}; {episode.steps} control "
+                    f"steps, {episode.held} held back"
+                )
+        except KeyboardInterrupt as interrupt:
+            if isinstance(interrupt, Terminated):
+                raise
+            console.note("interrupted: nothing more is sent")
+    late = 1e3 * np.array([value for episode in episodes for value in episode.latencies] or [0.0])
+    median, high = float(np.median(late)), float(np.percentile(late, 99))
+    console.say(f"from the newest pose to sending: {median:.1f} ms in the median, p99 {high:.1f}.")
+    successes = sum(bool(episode.success) for episode in episodes)
+    if options.simulated:
+        console.say(f"{successes} of {len(episodes)} episodes succeeded.")
+    console.say(f"log: {out / LOG}")
+    return {
+        "policy": spec.name,
+        "task": spec.config.task,
+        "sent": options.send,
+        "log": str(out / LOG),
+        "latency_ms_median": median,
+        "latency_ms_p99": high,
+        "successes": successes if options.simulated else None,
+        "episodes": [
+            {
+                "seed": episode.seed,
+                "success": episode.success,
+                "progress": episode.progress,
+                "steps": episode.steps,
+                "held": episode.held,
+                "ended": episode.ended,
+            }
+            for episode in episodes
+        ],
+    }
+
+
+def _dead_man(options: Options, transport: "Transport", stack: ExitStack) -> "Callable[[], float]":
+    """Return what says for how long the dead-man's switch was not held [s].
+
+    Raises:
+        InputError: none at a robot, or something that is no switch.
+    """
+    from surgicai_vision.robot.dead_man import HeldKey, HeldPedal
+
+    given = options.dead_man or (NONE if options.simulated else KEY)
+    if given == NONE:
+        if not options.simulated:
+            raise InputError("--dead-man none is for a served simulation; a person holds a robot.")
+        return lambda: 0.0
+    if given == KEY:
+        return stack.enter_context(HeldKey()).age
+    if not given.startswith("/"):
+        raise InputError(f"--dead-man is '{given}'; allowed: {KEY}, {NONE} or a topic, /NAME.")
+    return HeldPedal(transport, given).age
+
+
+def _about(seed: int, options: Options) -> str:
+    """Return what an episode is called."""
+    return f"start {seed}" if options.simulated else "the run"

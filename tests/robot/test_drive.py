@@ -1,0 +1,351 @@
+"""A policy at a served simulation, over a transport within this process, and its guards."""
+
+import dataclasses
+import functools
+import io
+import json
+import math
+
+import numpy as np
+import pytest
+from memory_transport import MemoryTransport
+
+from surgicai_vision import envs
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.demos.expert import Expert
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.control import StepSize
+from surgicai_vision.evaluation.agent import Agent
+from surgicai_vision.evaluation.agents import ExpertAgent, RandomAgent
+from surgicai_vision.robot import topics
+from surgicai_vision.robot.client import Client, ClientConfig
+from surgicai_vision.robot.driver import DriveConfig, DrivenRobot, Driver
+from surgicai_vision.robot.guards import (
+    GuardConfig,
+    Input,
+    Planned,
+    TargetGuard,
+    problem_of_inputs,
+)
+from surgicai_vision.robot.messages import Header, StringStamped
+from surgicai_vision.robot.server import ServeConfig, Server
+from surgicai_vision.robot.simulated import SimulatedRobot
+from surgicai_vision.scene import kinematics
+
+SEED = 900_003
+SIMULATED = DriveConfig(GuardConfig(), sends=True, is_simulated=True, is_stepped=True)
+STEP = StepSize.of("paper")
+
+
+@functools.cache
+def env_of(task):
+    return envs.make(TaskConfig(task))
+
+
+class Served(MemoryTransport):
+    """A transport at whose other end a stepped server is asked whenever the client waits."""
+
+    def __init__(self, task, views=()):
+        super().__init__()
+        self.robot = SimulatedRobot(env_of(task))
+        self.robot.reset(SEED)
+        config = ServeConfig("stepped", views=views, size=(64, 64))
+        self.server = Server(self.robot, self, config)
+        self.server.__enter__()
+
+    def wait(self, seconds):
+        self.server.poll()
+
+
+class Script(Agent):
+    """Plays (phase, action) pairs, then holds still."""
+
+    name = "script"
+
+    def __init__(self, rows, cameras=(), image_size=64):
+        self.rows = rows
+        self.cameras = cameras
+        self.image_size = image_size
+        self.seen = []
+
+    def reset(self, slot, robot, seed):
+        self.place = 0
+
+    def act(self, slots, robots, observations):
+        self.seen.append(observations[0])
+        if self.place >= len(self.rows):
+            return np.zeros((1, 7), np.float32)
+        phase, action = self.rows[self.place]
+        self.place += 1
+        if phase >= 0:
+            robots[0].enter(phase)
+        return np.asarray([action], np.float32)
+
+
+def drive(agent, task, steps, config=SIMULATED, dead_man=lambda: 0.0, transport=None, views=()):
+    """Drive one episode; returns it, the lines of its log, what was told, and the transport."""
+    served = transport or Served(task, views)
+    client = Client(served, ClientConfig(views=views, is_simulated=config.is_simulated))
+    client.connect()
+    log = io.StringIO()
+    told = []
+    robot = DrivenRobot(client, views, task, 64)
+    driver = Driver(agent, robot, TaskConfig(task), config, dead_man, log, told.append)
+    episode = driver.episode(SEED, steps)
+    return episode, [json.loads(line) for line in log.getvalue().splitlines()], told, served
+
+
+def test_a_driven_policy_moves_as_in_process():
+    own = envs.make(TaskConfig("grasp"))
+    own.reset(seed=SEED)
+    agent = RandomAgent()
+    agent.reset(0, own, SEED)
+    for _ in range(50):
+        own.step(agent.act([0], [own], [own.observe()])[0])
+    episode, lines, _, served = drive(RandomAgent(), "grasp", 50)
+    assert episode.steps == 50
+    assert episode.held == 0
+    assert np.allclose(served.robot.env.data.qpos, own.data.qpos, atol=1e-8)
+    assert all(line["sent"] for line in lines)
+
+
+def test_an_agent_reads_the_same_poses_as_in_process():
+    served = Served("suture")
+    client = Client(served, ClientConfig(is_simulated=True))
+    client.connect()
+    client.reset(SEED)
+    robot = DrivenRobot(client, (), "suture", 64)
+    env = served.robot.env
+    assert np.allclose(robot.agent_pos(), env.agent_pos(), atol=1e-6)
+    assert np.allclose(robot.both_arms(), env.both_arms(), atol=1e-6)
+    robot.enter(3)
+    env.enter(3)
+    assert robot.active == "PSM1"
+    assert np.allclose(robot.agent_pos(), env.agent_pos(), atol=1e-6)
+    with pytest.raises(InputError, match="no subtask 5"):
+        robot.enter(5)
+
+
+def test_a_whole_procedure_succeeds_as_in_process():
+    """Both arms, all five subtasks and PSM2's letting go, through topics alone."""
+    env = env_of("suture")
+    env.reset(seed=SEED)
+    expert = Expert(env)
+    rows = []
+    ended = False
+    while not ended:
+        rows.append((env.phase, expert.action()))
+        _, _, ended, truncated, info = env.step(rows[-1][1])
+        ended = ended or truncated
+    assert info["is_success"]
+    final = env.data.qpos.copy()
+    episode, lines, _, served = drive(Script(rows), "suture", len(rows) + 100)
+    assert episode.success
+    assert episode.ended == "the judge sees success"
+    assert episode.steps == len(rows)
+    assert np.allclose(served.robot.env.data.qpos, final, atol=1e-3)
+    let_go = [line for line in lines if set(line["commands"]) == {"PSM1", "PSM2"}]
+    assert {line["phase"] for line in let_go} == {4}
+
+
+def test_images_reach_the_agent_as_they_were_rendered():
+    script = Script([(-1, np.zeros(7))] * 2, cameras=("front",))
+    drive(script, "grasp", 2, views=("front",))
+    assert script.seen[0]["front"].shape == (64, 64, 3)
+    assert script.seen[0]["front"].std() > 5
+    assert np.array_equal(script.seen[0]["agent_pos"].shape, (7,))
+
+
+def test_a_dry_run_tells_and_moves_nothing():
+    dry = dataclasses.replace(SIMULATED, sends=False)
+    served = Served("grasp")
+    before = served.robot.state("PSM2").setpoint
+    script = Script([(-1, [1, 0, 0, 0, 0, 0, 1])] * 5)
+    _, lines, told, _ = drive(script, "grasp", 5, dry, transport=served)
+    assert served.robot.state("PSM2").setpoint == before
+    assert not any(line["sent"] for line in lines)
+    assert lines[0]["commands"]["PSM2"]["jaw"] > 0
+    assert any("would be told" in line for line in told)
+
+
+def test_nothing_is_sent_while_the_switch_is_not_held():
+    ages = iter([0.0, 0.1, 9.9, 9.9, 0.0])
+    script = Script([(-1, [1, 0, 0, 0, 0, 0, 0])] * 5)
+    episode, lines, told, _ = drive(script, "grasp", 5, dead_man=lambda: next(ages))
+    assert [line["sent"] for line in lines] == [True, True, False, False, True]
+    assert episode.held == 2
+    assert "held: the dead-man's switch is not held" in told
+
+
+@pytest.mark.parametrize(("command", "ends"), [("pause", False), ("disable", True)])
+def test_an_emergency_stop_is_obeyed_at_once(command, ends):
+    served = Served("grasp")
+    moved = [(-1, [1, 0, 0, 0, 0, 0, 0])] * 12
+
+    class Stopped(Script):
+        def act(self, slots, robots, observations):
+            if self.place == 3:
+                stop = topics.psm_topics("PSM2", heard=True)["state_command"]
+                served.publisher(stop)(StringStamped(Header(), command))
+            return super().act(slots, robots, observations)
+
+    episode, lines, told, _ = drive(Stopped(moved), "grasp", 12, transport=served)
+    assert [line["sent"] for line in lines][:4] == [True] * 4
+    assert not any(line["sent"] for line in lines[4:])
+    place = served.robot.state("PSM2").joints
+    assert np.allclose(served.robot.state("PSM2").setpoint, place, atol=2e-3)
+    assert ("stopped" in episode.ended) == ends
+    if not ends:
+        assert any("PSM2 is PAUSED" in line for line in told)
+
+
+def test_an_action_that_is_not_finite_ends_the_episode():
+    script = Script([(-1, [0] * 7), (-1, [math.nan] * 7)])
+    episode, lines, _, _ = drive(script, "grasp", 9)
+    assert "not finite" in episode.ended
+    assert [line["sent"] for line in lines] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"position": (math.nan, 0.0, 0.0)}, "finite"),
+        ({"quaternion": (0.0, 0.0, 0.0, 0.0)}, "unit quaternion"),
+    ],
+)
+def test_a_pose_that_cannot_be_used_holds_the_arm_and_the_log_says_why(changes, problem):
+    served = Served("grasp")
+    topic = topics.psm_topics("PSM2", heard=False)["local/measured_cp"]
+    calls = iter(range(100))
+
+    class Spoilt(Client):
+        def update(self):
+            super().update()
+            heard = self.newest(topic.name)
+            if heard is not None and next(calls) > 40:
+                spoilt = dataclasses.replace(heard.message, **changes)
+                self._newest[topic.name] = dataclasses.replace(heard, message=spoilt)
+
+    client = Spoilt.__new__(Spoilt)
+    Client.__init__(client, served, ClientConfig(is_simulated=True))
+    client.connect()
+    log = io.StringIO()
+    robot = DrivenRobot(client, (), "grasp", 64)
+    driver = Driver(
+        Script([(-1, [1] * 7)] * 30), robot, TaskConfig("grasp"), SIMULATED, float, log, print
+    )
+    episode = driver.episode(SEED, 30)
+    lines = [json.loads(line) for line in log.getvalue().splitlines()]
+    assert lines[0]["sent"]
+    assert not lines[-1]["sent"]
+    assert problem in lines[-1]["held"]
+    assert episode.held >= 1
+
+
+def test_messages_out_of_order_are_left():
+    served = Served("grasp")
+    client = Client(served, ClientConfig(is_simulated=True))
+    client.connect()
+    topic = topics.psm_topics("PSM2", heard=False)["measured_cp"]
+    newest = client.newest(topic.name).message
+    old = dataclasses.replace(newest, header=Header(newest.header.stamp - 5, "ECM_view"))
+    served.publisher(topic)(old)
+    client.update()
+    assert client.newest(topic.name).message is newest
+
+
+def test_an_oracle_is_refused():
+    with pytest.raises(InputError, match="reads the state of a simulation"):
+        drive(ExpertAgent(), "grasp", 1)
+
+
+# -- guards ----------------------------------------------------------------------------------------
+
+POSE = poses.flat(kinematics.start_in_base(names.PSM2))
+WORLD_BASE = poses.flat(kinematics.base_in_world(names.PSM2))
+ENABLED = {"PSM2": ("ENABLED", True)}
+
+
+def planned(shift=0.0, lead=0.0):
+    told = (POSE[0] + lead, *POSE[1:])
+    return Planned("PSM2", told, POSE, (told[0] + shift, *told[1:]), WORLD_BASE)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "states", "dead_man", "problem"),
+    [
+        ([Input("/a", 0.05, 0.1)], ENABLED, 0.0, ""),
+        ([Input("/a", 0.2, 0.1)], ENABLED, 0.0, "/a is 0.20 s old"),
+        ([Input("/a", math.inf, 0.1)], ENABLED, 0.0, "/a has never come"),
+        ([], {"PSM2": ("", False)}, 0.0, "silent"),
+        ([], {"PSM2": ("PAUSED", True)}, 0.0, "PSM2 is PAUSED"),
+        ([], {"PSM2": ("ENABLED", False)}, 0.0, "not homed"),
+        ([], ENABLED, 0.6, "dead-man"),
+    ],
+)
+def test_what_holds_a_policy_back(inputs, states, dead_man, problem):
+    said = problem_of_inputs(inputs, states, dead_man)
+    assert problem in said
+    assert bool(said) == bool(problem)
+
+
+def test_a_set_point_may_not_jump_lead_or_race():
+    guard = TargetGuard(GuardConfig(max_speed=0.03), STEP)
+    assert guard.problem_of_target(planned(0.0005), 0.0) == ""
+    assert "a step of" in guard.problem_of_target(planned(0.002), 0.0)
+    assert "does not follow" in guard.problem_of_target(planned(0.0005, lead=0.03), 0.0)
+    assert "not finite" in guard.problem_of_target(planned(math.nan), 0.0)
+    for step in range(60):
+        plan = planned(0.0008, lead=0.0008 * (step % 2))
+        problem = guard.problem_of_target(plan, 0.02 * step)
+        if problem:
+            break
+        guard.remember(plan, 0.02 * step)
+    assert "would be told to move" in problem
+
+
+def test_a_largest_action_of_the_policys_own_step_size_is_allowed():
+    guard = TargetGuard(GuardConfig(), STEP)
+    for shift in (0.0, 1e-4, STEP.translation):
+        assert guard.problem_of_target(planned(shift), 0.0) == ""
+
+
+def test_the_tip_is_kept_in_the_workspace_and_the_jaw_still_moves():
+    guard = TargetGuard(GuardConfig(), STEP)
+    assert not guard.is_outside(planned())
+    assert guard.is_outside(planned(0.5))
+    low = GuardConfig().low
+    narrow = GuardConfig(low=low, high=(low[0] + 0.001, low[1] + 0.001, low[2] + 0.001))
+    config = dataclasses.replace(SIMULATED, guards=narrow)
+    served = Served("grasp")
+    script = Script([(-1, [1, 1, 1, 0, 0, 0, -1])] * 4)
+    episode, lines, _, _ = drive(script, "grasp", 4, config, transport=served)
+    assert episode.held == 0
+    places = [line["commands"]["PSM2"]["pose"][:3] for line in lines]
+    assert np.allclose(places, places[0], atol=1e-9)
+    jaws = [line["commands"]["PSM2"]["jaw"] for line in lines]
+    assert (np.diff(jaws) < 0).all()
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"max_age": 9.0},
+        {"max_speed": 0.0},
+        {"max_lead": math.nan},
+        {"low": (0.0, 0.0, 0.0), "high": (0.0, 0.1, 0.1)},
+        {"frame": "map"},
+        {"high": (9.0, 9.0, 9.0)},
+    ],
+)
+def test_guards_have_no_switch(limits):
+    with pytest.raises(InputError):
+        GuardConfig(**limits)
+
+
+def test_a_robot_must_be_given_its_own_workspace():
+    with pytest.raises(InputError, match="where this robot's tips may be"):
+        DriveConfig(GuardConfig())
+    DriveConfig(GuardConfig("ECM_view", (-0.05, -0.05, 0.05), (0.05, 0.05, 0.2)))
