@@ -11,13 +11,14 @@ process:
 * `asked`: as `all`, but it is asked every five steps;
 * `looked_at`: as `asked`, and an image is rendered when it is looked at (the default).
 
-The last two must give the same row for every seed, and the same states. Figures are medians over
-the turns, ratios medians of the turns' ratios by CPU time: on a machine that others use too only
-that means something.
+The last two must give the same row for every seed, and the same states. What is
+loaded once a process is loaded before. Figures are medians over the turns, ratios medians
+of the turns' ratios by CPU time: on a machine that others use too only that means something.
 """
 
 import argparse
 import contextlib
+import dataclasses
 import functools
 import os
 import time
@@ -95,6 +96,8 @@ def measure(chosen: argparse.Namespace) -> dict[str, object]:
     cpu: dict[str, list[float]] = {way: [] for way in WAYS}
     found: dict[str, list[Episode]] = {}
     equal = chosen.episodes
+    first = dataclasses.replace(config, max_steps=1)
+    evaluate(functools.partial(make_agent, chosen.encoder, chosen.size, 1), first, seeds, workers=1)
     for turn in range(chosen.repeats):
         for way in list(WAYS)[:: -1 if turn % 2 else 1]:
             decide_every, rendering = WAYS[way]

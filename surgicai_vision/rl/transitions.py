@@ -222,7 +222,9 @@ def _replay(env: SuturingEnv, demo: Demo) -> _Episode:
 
 def _joined(parts: Sequence[Sequence[Observation]]) -> dict[str, NDArray[np.float32]]:
     """Return observations, episode by episode, as one array a key."""
-    rows = [row if isinstance(row, dict) else {OBSERVATION: row} for part in parts for row in part]
+    rows = [
+        row if isinstance(row, Mapping) else {OBSERVATION: row} for part in parts for row in part
+    ]
     return {key: np.stack([row[key] for row in rows]).astype(np.float32) for key in rows[0]}
 
 
