@@ -21,8 +21,10 @@ from surgicai_vision.commands.options import (
     VIDEO,
     VIEWS,
     default_text,
+    within,
 )
 from surgicai_vision.core import names
+from surgicai_vision.core.config import RANDOMISATION_CHOICES
 from surgicai_vision.core.errors import InputError
 
 app = App(
@@ -48,6 +50,9 @@ class Options:
         depth: Render depth beside RGB.
         segmentation: Render the parts beside RGB.
         frame_stride: Render every N-th frame alone: many episodes at the cost of few.
+        appearance: Looks to draw, whatever was recorded: train, heldout or a family's name.
+        distractors: Most things that lie about, drawn with the look.
+        variants: Looks in which each demonstration is rendered.
         workers: Number of processes.
         out: Dataset to make.
     """
@@ -65,6 +70,13 @@ class Options:
     depth: bool = False
     segmentation: bool = False
     frame_stride: Annotated[int, COUNT] = 1
+    appearance: Annotated[
+        str | None,
+        Parameter(choices=RANDOMISATION_CHOICES["appearance"][1:]),
+        default_text("as recorded"),
+    ] = None
+    distractors: Annotated[int | None, within(0, 5), default_text("as recorded")] = None
+    variants: Annotated[int, COUNT] = 1
     video: Annotated[str | None, VIDEO, default_text("lossless images")] = None
     workers: Annotated[int, COUNT] = folders.CORES
     executor: Annotated[str, EXECUTOR] = "local"
@@ -77,6 +89,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Record demonstrations if none are given, render them and print where the dataset is."""
     from surgicai_vision.core.executor import LOCAL, RunContext, open_engine
     from surgicai_vision.dataset import render_demos
+    from surgicai_vision.dataset.variants import Variants
     from surgicai_vision.scene.opengl import check_opengl
 
     # Everything that can be wrong is found before any work.
@@ -85,6 +98,9 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         raise InputError(
             "--task, --episodes and env say what to record; with --demos DIR nothing is recorded."
         )
+    variants = None
+    if options.appearance or options.distractors or options.variants > 1:
+        variants = Variants(options.appearance or "", options.distractors or 0, options.variants)
     task = folders.demos_task(options.demos[0]) if options.demos else options.task or "grasp"
     out = options.out or folders.dataset_folder(task)
     folders.check_folder(out, names.META_FILE)
@@ -99,6 +115,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         depth=options.depth,
         segmentation=options.segmentation,
         frame_stride=options.frame_stride,
+        variants=variants,
         video=options.video,
         context=context,
     )

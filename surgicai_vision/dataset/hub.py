@@ -45,6 +45,11 @@ def dataset_card(dataset: RenderedDataset, repo: str, licence: str = LICENCE) ->
     )
     stored = f"as {dataset.video} video.{lost}" if dataset.video else "lossless."
     rows = "\n".join(f"| `{key}` | {text} |" for key, text in COLUMN_TEXTS.items())
+    looks = ""
+    if dataset.variants > 1:
+        looks = (
+            f" Every {dataset.variants} episodes in a row show one demonstration, each in its look."
+        )
     shown = "\n".join(f"| `{key}` | {size} |" for key in images)
     return f"""---
 license: {licence}
@@ -65,7 +70,7 @@ configs:
 {task_text(dataset.task)}
 
 {meta["episodes"]} simulated demonstrations of the task `{dataset.task}` in robotic suturing:
-{dataset.length} frames at {dataset.fps} per second, by {", ".join(meta["demonstrators"])}.
+{dataset.length} frames at {dataset.fps} per second, by {", ".join(meta["demonstrators"])}.{looks}
 LeRobot {CODEBASE_VERSION} format, by surgicai-vision ({meta["code_version"]}).
 Images of {size} pixels, {stored}
 

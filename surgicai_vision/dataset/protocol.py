@@ -57,6 +57,10 @@ class Dataset(Protocol):
     def episode_index(self) -> NDArray[np.int64]:
         """Episode of every frame, (N,) int64, rising."""
 
+    @property
+    def demonstration_index(self) -> NDArray[np.int64]:
+        """Demonstration of every frame, (N,) int64, rising; several episodes may show one."""
+
     def bounds(self) -> list[tuple[int, int]]:
         """Return (first frame, frame after the last) of every episode."""
 

@@ -66,6 +66,7 @@ class RenderedDataset:
         image_size: side of the images [px].
         length: number of frames N.
         fps: frames per second of simulated time; `names.FPS` divided by the frame stride.
+        variants: episodes that show one demonstration, one behind the other in different looks.
         video: codec of the RGB views, None where they are lossless images.
     """
 
@@ -80,6 +81,7 @@ class RenderedDataset:
             self.image_size = int(self.meta["image_size"])
             self.length = int(self.meta["frames"])
             self.fps = int(self.meta["fps"])
+            self.variants = int(self.meta.get("variants", 1))
             self.video: str | None = self.meta.get("video")
             self.has_depth = bool(self.meta["depth"])
             self.has_segmentation = bool(self.meta["segmentation"])
@@ -112,6 +114,11 @@ class RenderedDataset:
     def episode_index(self) -> NDArray[np.int64]:
         """Episode of every frame, (N,) int64."""
         return self._column("episode_index").astype(np.int64, copy=False)
+
+    @functools.cached_property
+    def demonstration_index(self) -> NDArray[np.int64]:
+        """Demonstration of every frame, (N,) int64, rising."""
+        return self.episode_index // self.variants
 
     @property
     def policy_views(self) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.convert import DatasetSummary, check_video, finished, write_converted
 from surgicai_vision.dataset.reader import open_dataset
 from surgicai_vision.dataset.schema import Table
+from surgicai_vision.dataset.variants import Variants
 from surgicai_vision.dataset.writer import SUMMARY_FILE, assemble
 from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo, read_marker
 
@@ -47,6 +48,7 @@ def render_demos(
     depth: bool = False,
     segmentation: bool = False,
     frame_stride: int = 1,
+    variants: Variants | None = None,
     video: str | None = None,
     context: RunContext = RunContext(),
 ) -> DatasetSummary:
@@ -63,6 +65,8 @@ def render_demos(
         frame_stride: render every n-th frame of each episode alone, from its first; a divisor of
             `names.FPS`, so that the dataset has `names.FPS / frame_stride` frames per second of
             simulated time. Actions stay those of one step.
+        variants: looks in which each demonstration is rendered; None renders each once, as it was
+            recorded.
         video: codec of the RGB views, a key of `video.CODECS`; lossless images by default.
         context: workers, engine and display.
 
@@ -84,6 +88,7 @@ def render_demos(
         "depth": depth,
         "segmentation": segmentation,
         **({"frame_stride": frame_stride} if frame_stride > 1 else {}),
+        **({"variants": variants.request} if variants else {}),
     }
     request = {**options, "demos": demos_digest(paths), **({"video": video} if video else {})}
     if (out / names.META_FILE).exists():
@@ -91,7 +96,13 @@ def render_demos(
     origins = [_Origin.of(read_demo(path)) for path in paths]
     config = _same_config(origins, paths)
     counts = [len(range(0, origin.length, frame_stride)) for origin in origins]
-    jobs = [_job(path, options, count) for path, count in zip(paths, counts, strict=True)]
+    if variants:
+        config = variants.shown(config)
+    jobs = [
+        _job(path, options | ({"variant": variant} if variants else {}), count)
+        for path, count in zip(paths, counts, strict=True)
+        for variant in range(variants.count if variants else 1)
+    ]
     title = f"dataset: {', '.join(views)} at {size} px"
     with building(out) as (store, result), context.stage(title, "frames") as progress:
         shards = run(jobs, store, context, progress=progress, unit="frames")
@@ -185,6 +196,7 @@ def _meta(
         "cameras": summaries[0]["cameras"],
         "units": {"length": "m", "angle": "rad", "depth": "m", "time": "s"},
         "parts": list(names.PARTS),
+        **({"variants": request["variants"]["count"]} if "variants" in request else {}),
         "fps": names.FPS // request.get("frame_stride", 1),
         "renderers": sorted({summary["renderer"] for summary in summaries}),
         "scene_hash": origins[0].scene_hash,

@@ -9,6 +9,7 @@ import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pyarrow as pa
@@ -19,15 +20,19 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile
-from surgicai_vision.core.files import write_json
+from surgicai_vision.core.files import sha256_file, write_json
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
+from surgicai_vision.dataset.variants import Variants
 from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, column_array, compression
 from surgicai_vision.demos.store import Demo, read_demo
+from surgicai_vision.envs.looks import draw as draw_look
 from surgicai_vision.scene.cameras import crop_of
 from surgicai_vision.scene.rendering import renderer_string
 
+LOOK_STREAM = 0x100C5
+"""Sets the random numbers of variants' looks apart from all others."""
 MEASURED: Mapping[str, Callable[[envs.SuturingEnv], NDArray[np.float32]]] = {
     names.STATE: lambda env: env.agent_pos(),
     names.NEEDLE_POSE: lambda env: env.needle_pose(),
@@ -71,10 +76,17 @@ def render_episode(
     depth: bool,
     segmentation: bool,
     frame_stride: int = 1,
+    variants: Mapping[str, str | int] = MappingProxyType({}),
+    variant: int = 0,
 ) -> None:
-    """Write one episode's columns and images into `folder`; the job "render-episode"."""
+    """Write one episode's columns and images into `folder`; the job "render-episode".
+
+    `variants` are the fields of `variants.Variants`, `variant` is the number of one of them.
+    """
     episode = read_demo(Path(demo))
-    env = _env(json.dumps(to_mapping(episode.config)), tuple(views), size, depth, segmentation)
+    looks = from_mapping(Variants, variants) if variants else None
+    config = looks.shown(episode.config) if looks else episode.config
+    env = _env(json.dumps(to_mapping(config)), tuple(views), size, depth, segmentation)
     if env.scene.hash != episode.scene_hash:
         raise BadFile(
             f"{demo} was recorded in another scene (hash {episode.scene_hash[:12]}, now "
@@ -88,8 +100,9 @@ def render_episode(
     measured: dict[str, list[NDArray[np.float32]]] = {
         key: [] for key in (*MEASURED, *schema.calibration_keys(views))
     }
+    look = _look(looks, Path(demo), variant) if looks else {}
     for state in episode.state[:-1:frame_stride]:
-        env.set_state_vector(state)
+        env.set_state_vector(env.simulation.redrawn(state, look) if look else state)
         observation = env.observe()
         assert isinstance(observation, dict)  # the env shows images
         for key, view, modality in keys:
@@ -120,6 +133,12 @@ def render_episode(
         "cameras": {view: _camera(view) for view in views},
     }
     write_json(folder / SUMMARY_FILE, summary)
+
+
+def _look(looks: Variants, demo: Path, variant: int) -> Mapping[str, Sequence[float]]:
+    """Return the numbers of a variant's look, drawn from the demonstration's file and `variant`."""
+    rng = np.random.default_rng([LOOK_STREAM, int(sha256_file(demo), 16), variant])
+    return draw_look(looks.shown(TaskConfig()).randomisation, rng)
 
 
 def _columns(

@@ -32,12 +32,12 @@ from surgicai_vision.dataset.protocol import Dataset, episode_bounds
 
 
 def first_episodes(dataset: Dataset, count: int) -> "DatasetSubset":
-    """Return the first `count` episodes of a dataset.
+    """Return the episodes of the first `count` demonstrations of a dataset.
 
     Raises:
         InputError: fewer than one, or more than there are.
     """
-    bounds = dataset.bounds()
+    bounds = episode_bounds(dataset.demonstration_index)
     if not 1 <= count <= len(bounds):
         raise InputError(f"{count} demonstrations were asked; {dataset.path} holds {len(bounds)}.")
     return DatasetSubset(dataset, np.arange(bounds[count - 1][1]), {"episodes": count})
@@ -172,6 +172,11 @@ class DatasetSubset:
     def episode_index(self) -> NDArray[np.int64]:
         """Episode of every frame, (N,) int64."""
         return np.asarray(self._whole.episode_index)[self.rows]
+
+    @functools.cached_property
+    def demonstration_index(self) -> NDArray[np.int64]:
+        """Demonstration of every frame, (N,) int64."""
+        return np.asarray(self._whole.demonstration_index)[self.rows]
 
     def bounds(self) -> list[tuple[int, int]]:
         """Return (first frame, frame after the last) of every episode."""

@@ -5,6 +5,7 @@ follows (`scene.visual.appearance`, `scene.visual.distractors`).
 """
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -15,6 +16,15 @@ from surgicai_vision.scene.visual.distractors import MOST, Litter
 
 FAMILIES = {names.TRAIN: names.TRAIN_APPEARANCES, names.HELDOUT: names.HELDOUT_APPEARANCES}
 """Set of looks → its families."""
+
+
+def draw(config: RandomisationConfig, rng: np.random.Generator) -> Mapping[str, tuple[float, ...]]:
+    """Draw a look alone: axis → its numbers, of the axes that `config` has on."""
+    drawn = {
+        "appearance": draw_appearance(config, rng).numbers[:2],
+        "distractors": draw_litter(config, rng).numbers,
+    }
+    return {axis: numbers for axis, numbers in drawn.items() if axis in config.on}
 
 
 def draw_appearance(config: RandomisationConfig, rng: np.random.Generator) -> Appearance:

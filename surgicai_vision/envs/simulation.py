@@ -15,7 +15,7 @@ clock shows it.
 import copy
 import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 
 import mujoco
@@ -508,6 +508,22 @@ class Simulation:
         state = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, self.data, state, STATE)
         return state
+
+    def redrawn(
+        self, state: NDArray[np.float64], given: Mapping[str, Sequence[float]]
+    ) -> NDArray[np.float64]:
+        """Return a vector of `get_state` with the numbers of some axes of randomisation replaced.
+
+        Args:
+            state: of this scene.
+            given: axis → its numbers, as `randomisation.report` has them.
+        """
+        mujoco.mj_setState(self.model, self.data, state, STATE)
+        draws = tuple(self.data.userdata[_DRAWS:_WELDS].tolist())
+        self.data.userdata[_DRAWS:_WELDS] = randomisation.with_numbers(draws, given)
+        redrawn = np.empty_like(state)
+        mujoco.mj_getState(self.model, self.data, redrawn, STATE)
+        return redrawn
 
     def set_state(self, state: NDArray[np.float64]) -> None:
         """Restore a vector of `get_state`.

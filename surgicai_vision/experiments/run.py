@@ -70,7 +70,7 @@ def train_run(
         dataset = fed
         features = [entry.part(fed.rows, fed.fingerprint) for entry in features]
     subsets: list[Callable[[Dataset], DatasetSubset]] = []
-    if run.demonstrations not in (None, len(np.unique(dataset.episode_index))):
+    if run.demonstrations not in (None, len(np.unique(dataset.demonstration_index))):
         subsets.append(functools.partial(first_episodes, count=run.demonstrations))
     if subtask is not None:
         subsets.append(functools.partial(of_subtask, subtask=subtask))

@@ -47,28 +47,44 @@ COMPUTED: Mapping[str, Callable[[Columns, NDArray[np.int64]], NDArray[np.generic
 
 
 def split(
-    episode_index: NDArray[np.int64], recipe: "Recipe", seed: int
+    episode_index: NDArray[np.int64],
+    recipe: "Recipe",
+    seed: int,
+    demonstration_index: NDArray[np.int64] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], tuple[int, ...]]:
-    """Split the frames into training and validation.
+    """Split the frames into training and validation; variants of a frame stay together.
 
     Args:
         episode_index: (N,) episode of every frame.
         recipe: its `split` ("episode" or "transition") and `validation` (share held out) count.
         seed: of the draw.
+        demonstration_index: (N,) demonstration of every frame, where several episodes show one;
+            each episode is one by default.
 
     Returns:
         Training rows, validation rows (both sorted int64), and the episodes held out (whole ones
         only). At least one episode is held out when the share is above 0 and there are two or more.
     """
     generator = np.random.default_rng(seed)
-    units = np.unique(episode_index) if recipe.split == "episode" else np.arange(len(episode_index))
+    shown = episode_index if demonstration_index is None else demonstration_index
+    unit = shown if recipe.split == "episode" else _first_variants(episode_index, shown)
+    units = np.unique(unit)
     count = round(recipe.validation * len(units))
     if recipe.validation > 0 and len(units) > 1:
         count = min(max(count, 1), len(units) - 1)
     held = np.sort(generator.permutation(units)[:count])
-    belongs = np.isin(episode_index, held) if recipe.split == "episode" else np.isin(units, held)
-    episodes = tuple(int(index) for index in held) if recipe.split == "episode" else ()
-    return np.flatnonzero(~belongs), np.flatnonzero(belongs), episodes
+    belongs = np.isin(unit, held)
+    episodes = np.unique(episode_index[belongs]) if recipe.split == "episode" else ()
+    return np.flatnonzero(~belongs), np.flatnonzero(belongs), tuple(map(int, episodes))
+
+
+def _first_variants(
+    episode_index: NDArray[np.int64], demonstration_index: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return of every frame the row of the same one in its demonstration's first variant, (N,)."""
+    position = np.arange(len(episode_index)) - np.searchsorted(episode_index, episode_index)
+    first: NDArray[np.int64] = np.searchsorted(demonstration_index, demonstration_index) + position
+    return first
 
 
 def cuts(count: int, size: int) -> list[int]:

@@ -170,7 +170,7 @@ class _Task:
             views=tuple(entry.view for entry in self.features),
             pool=first["pool"] if first else "global",
             privileged=self.recipe.privileged,
-            demonstrations=len(np.unique(self.dataset.episode_index)),
+            demonstrations=len(np.unique(self.dataset.demonstration_index)),
             seed=self.seed,
         )
 
@@ -231,7 +231,9 @@ class _Training:
         self.task = task
         self.device = device
         index = np.asarray(task.dataset.episode_index)
-        self.rows, self.held_rows, self.held_episodes = split(index, task.recipe, task.seed)
+        self.rows, self.held_rows, self.held_episodes = split(
+            index, task.recipe, task.seed, np.asarray(task.dataset.demonstration_index)
+        )
         if len(self.rows) < 2:
             raise InputError(
                 f"There are {len(self.rows)} frames to train on; at least 2 are needed."

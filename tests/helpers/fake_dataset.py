@@ -25,6 +25,10 @@ class FakeData:
     def policy_views(self) -> tuple[str, ...]:
         return self.views
 
+    @property
+    def demonstration_index(self) -> np.ndarray:
+        return self.episode_index
+
     def bounds(self) -> list[tuple[int, int]]:
         return episode_bounds(self.episode_index)
 

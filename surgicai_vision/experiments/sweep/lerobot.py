@@ -100,7 +100,7 @@ def _arguments(run: RunConfig, dataset: Dataset, root: Path, out: Path) -> list[
         f"--output_dir={out}",
         *OPTIONS.get(run.policy, ()),
     ]
-    if run.demonstrations not in (None, len(np.unique(dataset.episode_index))):
+    if run.demonstrations not in (None, len(np.unique(dataset.demonstration_index))):
         arguments.append(f"--dataset.episodes={list(range(run.demonstrations or 0))}")
     if run.encoder == OWN:
         side = dataset.image_size

@@ -1,0 +1,146 @@
+"""Variants: one demonstration in several looks; what was recorded stays, splits go by it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from policies.base import Recipe
+from surgicai_vision import envs
+from surgicai_vision.commands import render_demos as command
+from surgicai_vision.commands.console import Console
+from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig
+from surgicai_vision.core.errors import InputError, OutputExists
+from surgicai_vision.core.executor import RunContext
+from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, schema
+from surgicai_vision.dataset.hub import dataset_card
+from surgicai_vision.dataset.subset import first_episodes, with_frame_stride
+from surgicai_vision.dataset.variants import Variants
+from surgicai_vision.demos.rollout import EpisodeRecorder
+from surgicai_vision.demos.store import list_demos, read_demo, write_demo, write_marker
+from surgicai_vision.training.data import split
+
+STEPS = 2
+THREE = Variants("train", distractors=5, count=3)
+
+
+def record(folder, config):
+    """Write two short episodes of an arm that moves."""
+    env = envs.make(config)
+    folder.mkdir()
+    for index, seed in enumerate((3, 4)):
+        env.reset(seed=seed)
+        recorder = EpisodeRecorder(env, seed, "expert")
+        for _ in range(STEPS):
+            recorder.step(np.array([0.5, 0.5, 0.5, 0, 0, 0, -1], np.float32))
+        write_demo(folder, index, recorder.demo())
+    write_marker(folder, "grasp", "expert")
+    return folder
+
+
+def render(demos, out, **more):
+    return render_demos(demos, out, views=("front",), size=64, context=RunContext(0), **more)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    return record(tmp_path_factory.mktemp("variants") / "demos", TaskConfig("grasp"))
+
+
+@pytest.fixture(scope="module")
+def dataset(demos):
+    render(demos, demos.parent / "varied", variants=THREE)
+    return open_dataset(demos.parent / "varied")
+
+
+def test_what_was_recorded_is_the_same_in_every_variant_and_what_is_seen_is_not(demos, dataset):
+    render(demos, demos.parent / "plain")
+    plain = open_dataset(demos.parent / "plain")
+    assert plain.variants == 1 and "variants" not in plain.meta
+    columns = dataset.columns()
+    for key in schema.columns(dataset.views):
+        shape = (2, 3, STEPS, -1)
+        varied = columns[key].reshape(shape)
+        once = plain.columns()[key].reshape(2, 1, STEPS, -1)
+        np.testing.assert_array_equal(varied, np.broadcast_to(once, varied.shape), err_msg=key)
+    images = dataset.frames("front").reshape(2, 3, STEPS, -1).astype(int)
+    own = plain.frames("front").reshape(2, 1, STEPS, -1).astype(int)
+    assert (np.abs(images - own).mean(axis=-1) > 5).all()
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        assert (np.abs(images[:, one] - images[:, other]).mean(axis=-1) > 5).all()
+    assert dataset.config.randomisation == RandomisationConfig(appearance="train", distractors=5)
+    assert check_dataset(dataset.path).ok
+
+
+def test_splits_and_counts_go_by_the_demonstration(dataset):
+    np.testing.assert_array_equal(dataset.demonstration_index, np.repeat([0, 1], 3 * STEPS))
+    assert len(dataset.bounds()) == 6
+    for kind in ("episode", "transition"):
+        recipe = Recipe(split=kind, validation=0.5)
+        rows, held, episodes = split(dataset.episode_index, recipe, 0, dataset.demonstration_index)
+        assert sorted([*rows, *held]) == list(range(dataset.length))
+        seen = {(dataset.demonstration_index[row], row % STEPS) for row in rows}
+        hidden = {(dataset.demonstration_index[row], row % STEPS) for row in held}
+        assert not seen & hidden and len(seen) == len(hidden) == 2
+        assert len(episodes) == (3 if kind == "episode" else 0)
+    first = first_episodes(dataset, 1)
+    assert (first.length, len(first.bounds())) == (3 * STEPS, 3)
+    with pytest.raises(InputError, match="3 demonstrations were asked"):
+        first_episodes(dataset, 3)
+    strided = with_frame_stride(dataset, 2)
+    np.testing.assert_array_equal(strided.demonstration_index, np.repeat([0, 1], 3))
+    assert "Every 3 episodes in a row show one demonstration" in dataset_card(dataset, "a/b")
+
+
+def test_a_killed_rendering_goes_on_and_a_finished_one_does_nothing(demos, dataset, tmp_path):
+    """The variants of one folder lie in jobs of their own; the digest says that they are equal."""
+    fewer = render(demos, tmp_path / "set", variants=dataclasses.replace(THREE, count=1))
+    assert fewer.episodes == 2
+    with pytest.raises(OutputExists):
+        render(demos, tmp_path / "set", variants=THREE)
+    again = render(demos, dataset.path, variants=THREE)
+    assert again.digest == dataset.meta["digest"]
+    np.testing.assert_array_equal(
+        open_dataset(tmp_path / "set").frames("front")[:STEPS], dataset.frames("front")[:STEPS]
+    )
+
+
+def test_looks_that_were_recorded_are_drawn_anew_and_the_rest_is_kept(tmp_path):
+    axes = RandomisationConfig(appearance="fat", phantom_shift=5.0, needle_size=0.1)
+    demos = record(tmp_path / "demos", TaskConfig("grasp", randomisation=axes))
+    render(demos, tmp_path / "set", variants=Variants("heldout", count=2))
+    dataset = open_dataset(tmp_path / "set")
+    assert dataset.config.randomisation == dataclasses.replace(axes, appearance="heldout")
+    assert dataset.config.randomisation.shows_heldout, "train refuses it"
+    env = envs.make(TaskConfig("grasp", randomisation=axes))
+    env.set_state_vector(read_demo(list_demos(demos)[0]).state[0])
+    seen = dataset.columns()[names.NEEDLE_POSE]
+    np.testing.assert_array_equal(seen[0], env.needle_pose())
+    np.testing.assert_array_equal(seen[STEPS], env.needle_pose())
+
+
+def test_refuses_variants_without_a_look():
+    with pytest.raises(InputError, match="without a look to draw"):
+        Variants(count=2)
+    with pytest.raises(InputError, match="at least 1"):
+        Variants("train", count=0)
+    with pytest.raises(InputError, match="appearance"):
+        Variants("mud")
+
+
+def test_the_command_renders_variants(demos, tmp_path):
+    options = command.Options(
+        demos=(demos,),
+        view=("front",),
+        size=32,
+        appearance="train",
+        variants=2,
+        workers=1,
+        out=tmp_path / "set",
+    )
+    assert command.run(options, console=Console())["episodes"] == 4
+    assert open_dataset(tmp_path / "set").meta["request"]["variants"] == {
+        "appearance": "train",
+        "count": 2,
+    }
