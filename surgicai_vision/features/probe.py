@@ -112,7 +112,7 @@ def probe(
             raise InputError(
                 f"The features of view '{entry.view}' are of another dataset; encode this one."
             )
-    index = np.asarray(dataset.episode_index)
+    index = np.asarray(dataset.demonstration_index)  # its variants are held out together
     rows = spread(index, FRAMES)
     tables: list[NDArray[np.float64]] = [
         np.asarray(entry.rows[rows], np.float64).reshape(len(rows), -1) for entry in features
@@ -172,7 +172,7 @@ def _pose(dataset: Dataset) -> Array:
     if names.NEEDLE_POSE not in columns:
         raise UnknownName("column", names.NEEDLE_POSE, columns)
     pose = np.asarray(columns[names.NEEDLE_POSE], np.float64)
-    episodes = len(np.unique(dataset.episode_index))
+    episodes = len(np.unique(dataset.demonstration_index))
     if episodes < FEWEST:
         raise InputError(f"The dataset has {episodes} episodes; a probe needs at least {FEWEST}.")
     if not np.isfinite(pose).all():
