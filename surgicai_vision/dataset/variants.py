@@ -50,7 +50,10 @@ class Variants:
     @property
     def axes(self) -> Mapping[str, str | int]:
         """Return axis of randomisation → what it is drawn from, of those that are drawn."""
-        asked = {"appearance": self.appearance, "distractors": self.distractors}
+        asked: dict[str, str | int] = {
+            "appearance": self.appearance,
+            "distractors": self.distractors,
+        }
         return {axis: value for axis, value in asked.items() if value}
 
     def shown(self, config: TaskConfig) -> TaskConfig:
