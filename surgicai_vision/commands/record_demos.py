@@ -87,8 +87,8 @@ class Options:
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Record demonstrations and print where they are."""
     from surgicai_vision.core.executor import RunContext, open_engine
+    from surgicai_vision.demos.disturbance import Disturbance
     from surgicai_vision.demos.record import record
-    from surgicai_vision.demos.rollout import Disturbance
     from surgicai_vision.demos.store import MARKER, read_marker
     from surgicai_vision.evaluation.statistics import clopper_pearson
 

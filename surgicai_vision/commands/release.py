@@ -57,12 +57,11 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Build the policies, and print how often each succeeds."""
     from surgicai_vision.core.config import to_mapping
     from surgicai_vision.core.executor import RunContext
+    from surgicai_vision.experiments.plan_config import read_plan
     from surgicai_vision.experiments.release import run_release
-    from surgicai_vision.experiments.release_config import read_plan, smaller
     from surgicai_vision.training.released import PREFIX, released_folder
 
-    plan = smaller(
-        read_plan(options.plan),
+    plan = read_plan(options.plan).smaller(
         demonstrations=options.demonstrations,
         epochs=options.epochs,
         episodes=options.episodes,

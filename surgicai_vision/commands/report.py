@@ -65,13 +65,13 @@ def _planned(folder: Path, console: Console) -> "Sequence[PlannedRun]":
         BadFile: another version wrote the sweep.
     """
     from surgicai_vision.evaluation.storage import GRID_FILE
-    from surgicai_vision.experiments.sweep.plan import plan, read_grid_of
+    from surgicai_vision.experiments.sweep.plan import plan, read_experiment_of
 
     if not (folder / GRID_FILE).exists():
         return ()
-    grid = read_grid_of(folder)
+    experiment = read_experiment_of(folder)
     try:
-        return plan(grid, folder)
+        return plan(experiment, folder)
     except SurgicaiError as error:
         console.note(
             "The sweep cannot be planned here, so only runs with a result or a record are "

@@ -1,4 +1,4 @@
-"""`sweep`: encode, train and evaluate every cell of a grid."""
+"""`sweep`: encode, train and evaluate every cell of a grid, or rebuild a plan from nothing."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,22 +12,29 @@ from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
     EXECUTOR,
+    IMAGE_SIZE,
     default_text,
     read_yaml,
 )
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, UnknownName
 from surgicai_vision.core.files import configs_folder
+from surgicai_vision.experiments.plan_config import plan_of
 from surgicai_vision.experiments.sweep.grid import AXES, Grid
 
 if TYPE_CHECKING:
+    from surgicai_vision.experiments.sweep.experiment import Experiment
     from surgicai_vision.experiments.sweep.selection import Choice
 
 app = App(
     name="sweep",
     help_epilogue="""\
-example:
-  surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/smoke --json""",
+examples:
+  surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/smoke --json
+a headline from nothing, for its first training seed; without --only for all of them:
+  surgicai-vision sweep procedure --only seed=0
+to try a file in minutes:
+  surgicai-vision sweep procedure --demonstrations 5 --epochs 1 --episodes 2 --size 64""",
 )
 
 
@@ -37,20 +44,28 @@ class Options:
     """Options of `sweep`.
 
     Attributes:
-        grid: The grid; shipped ones also by their name (smoke).
+        grid: The grid, or the plan; shipped ones also by their name (smoke).
         out: Folder to make or to continue.
-        only: Work on these runs alone, by an axis of the grid; repeat it for another axis; views
-            are joined by +.
+        only: Work on these runs alone, by an axis of the grid, or by condition; repeat it for
+            another axis; views are joined by +.
+        demonstrations: Demonstrations of each dataset, in place of the file's.
+        epochs: Passes over the frames, in place of the recipes'.
+        episodes: Starts of each evaluation, in place of the file's.
+        size: Height and width of images [px], in place of the file's.
         dry_run: List the runs, what is there already and about how long the rest takes; no work.
         workers: Runs at a time; the results do not depend on it.
         attempts: How often a run is started whose process is killed.
     """
 
     grid: Annotated[str, Parameter(metavar="GRID.yaml")] = field(kw_only=False)
-    out: Annotated[Path | None, DIRECTORY, default_text("outputs/sweeps/<name of the grid>")] = None
+    out: Annotated[Path | None, DIRECTORY, default_text("outputs/sweeps/<name of the file>")] = None
     only: Annotated[
         tuple[str, ...], Parameter(metavar="AXIS=VALUE[,VALUE]"), default_text("all")
     ] = ()
+    demonstrations: Annotated[int | None, COUNT, default_text("the file's")] = None
+    epochs: Annotated[int | None, COUNT, default_text("the recipes'")] = None
+    episodes: Annotated[int | None, COUNT, default_text("the file's")] = None
+    size: Annotated[int | None, IMAGE_SIZE, default_text("the file's")] = None
     dry_run: bool = False
     workers: Annotated[int, COUNT] = folders.CORES
     attempts: Annotated[int, COUNT] = 3
@@ -65,9 +80,16 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     from surgicai_vision.experiments.sweep.selection import read_choice
 
     path = grid_file(options.grid)
-    grid = read_grid(path)
+    whole = read_experiment(path)
+    grid = whole.smaller(
+        demonstrations=options.demonstrations,
+        epochs=options.epochs,
+        episodes=options.episodes,
+        size=options.size,
+    )
     choice = read_choice(options.only, grid.runs)
-    out = options.out or folders.OUTPUTS / "sweeps" / path.stem
+    name = path.stem if grid == whole else f"{path.stem}-tried"
+    out = options.out or folders.OUTPUTS / "sweeps" / name
     context = RunContext(options.workers, open_engine(options.executor), console.stage)
     if options.dry_run:
         return _list(grid, out, choice, options.workers, console)
@@ -80,7 +102,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 
 
 def _list(
-    grid: Grid, out: Path, choice: "Choice", workers: int, console: Console
+    grid: "Experiment", out: Path, choice: "Choice", workers: int, console: Console
 ) -> dict[str, object]:
     """Print what each run is, and how long the rest takes where a finished run tells it."""
     from surgicai_vision.experiments.sweep.estimate import estimate
@@ -127,6 +149,12 @@ def grid_file(given: str) -> Path:
     if path.suffix or path.parent != Path():
         raise BadFile(f"There is no grid {path}; shipped ones: {', '.join(sorted(shipped))}.")
     raise UnknownName("grid", given, shipped)
+
+
+def read_experiment(path: Path) -> "Experiment":
+    """Read a grid, or a plan, which lists its policies."""
+    table = read_yaml(path)
+    return plan_of(table, str(path)) if "policies" in table else read_grid(path)
 
 
 def read_grid(path: Path) -> Grid:

@@ -37,7 +37,8 @@ from surgicai_vision.demos.demonstrator import (
     BehaviourPolicy,
     make_demonstrator,
 )
-from surgicai_vision.demos.rollout import UNDISTURBED, Disturbance, rollout
+from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance
+from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import (
     MARKER,
     list_demos,

@@ -144,7 +144,7 @@ def open_policy(
             f"{text} was trained for '{spec.config.task}', not for '{task}'; "
             "leave the task out, or give a policy of that task."
         )
-    return _in_env(spec, env)
+    return in_env(spec, env)
 
 
 def _task_of_baseline(name: str, task: str | None) -> str:
@@ -164,8 +164,14 @@ def _names_code(text: str) -> bool:
     return ":" in text and not released.is_released(text) and not Path(text).exists()
 
 
-def _in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
-    """Put what is evaluated into the env of the table `env`, where there is one."""
+def in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
+    """Put what is evaluated into the env of the table `env`, where there is one.
+
+    Args:
+        spec: what is evaluated.
+        env: fields of `TaskConfig` that differ from the default's; None or an empty table keeps the
+            env that the policy was trained in.
+    """
     if not env:
         return spec
     if "task" in env:

@@ -20,7 +20,7 @@ from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.progress import timed
 from surgicai_vision.dataset import open_dataset
-from surgicai_vision.demos.rollout import Disturbance
+from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.run import evaluate_once

@@ -1,7 +1,7 @@
 """Release: build the policies that come with the product, from nothing to their cards.
 
 Record, render, encode, train, evaluate on held-out starts, write the card. One folder holds the
-work, below the hash of the scene it is done in:
+work, below the hash of the scene it is done in, for the first training seed of the plan:
 
     <out>/<scene hash>/<demonstrations>/demos, dataset
     <out>/<scene hash>/policies/<name>, evaluations/<name>
@@ -21,25 +21,19 @@ import yaml
 
 from surgicai_vision import __version__
 from surgicai_vision.core import files, names
-from surgicai_vision.core.config import digest, from_mapping, to_mapping
+from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, check_name
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.subset import of_subtask
-from surgicai_vision.demos.rollout import Disturbance
-from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.provenance import command_line
 from surgicai_vision.evaluation.run import evaluate_once
 from surgicai_vision.evaluation.storage import read_rows
-from surgicai_vision.experiments.prepare import prepare_dataset
-from surgicai_vision.experiments.release_config import (
-    HLP,
-    Demonstrations,
-    ReleasedPolicy,
-    ReleasePlan,
-)
+from surgicai_vision.experiments.dataset_config import Demonstrations
+from surgicai_vision.experiments.plan_config import HLP, Plan, PlannedPolicy, plan_of
+from surgicai_vision.experiments.prepare import check_dataset, make_dataset
 from surgicai_vision.experiments.run import train_run
 from surgicai_vision.features import encoders
 from surgicai_vision.scene import build_scene
@@ -63,7 +57,7 @@ SHOWN = 5
 
 
 def run_release(
-    plan: ReleasePlan, out: Path, context: RunContext, only: Sequence[str] = ()
+    plan: Plan, out: Path, context: RunContext, only: Sequence[str] = ()
 ) -> list[ReleaseCard]:
     """Build what is not built yet and write it to `released_folder()`.
 
@@ -86,9 +80,13 @@ def run_release(
     for name in only:
         check_name("policy of the plan", name, plan.names)
     chosen = [name for name in plan.names if name in only or not only]
-    encoders.find_weights(plan.encoder)
     for policy in plan.policies:
-        policies.check_progress_from(policies.recipe_of(plan.run(policy)), None)
+        run = plan.training(policy, plan.seed[0])
+        policies.check_progress_from(policies.recipe_of(run), None)
+        if run.encoder:
+            encoders.find_weights(run.encoder)
+    for recorded in plan.demonstrations:
+        check_dataset(plan.dataset(recorded, plan.seed[0]))
     _check_writable(released_folder())
     check_opengl()
     scene = build_scene(plan.task_config(names.SUTURE).scene).hash
@@ -109,7 +107,7 @@ class _Build:
         context: processes and progress.
     """
 
-    plan: ReleasePlan
+    plan: Plan
     out: Path
     scene_hash: str
     context: RunContext
@@ -119,14 +117,16 @@ class _Build:
         files.check_output(self.out, may_resume=PLAN_FILE)
         path = self.out / PLAN_FILE
         wanted = to_mapping(self.plan)
-        if path.exists() and files.read_json(path) != wanted:
-            raise OutputExists(
-                f"{self.out} holds the work of another plan (see {path}); give another --out."
-            )
+        if path.exists():
+            if to_mapping(plan_of(files.read_json(path), str(path))) != wanted:
+                raise OutputExists(
+                    f"{self.out} holds the work of another plan (see {path}); give another --out."
+                )
+            return
         self.out.mkdir(parents=True, exist_ok=True)
         files.write_json(path, wanted)
 
-    def subtask(self, policy: ReleasedPolicy) -> ReleaseCard:
+    def subtask(self, policy: PlannedPolicy) -> ReleaseCard:
         """Train, count and release one policy."""
         recorded = self.plan.recorded(policy)
         folder = self.out / "policies" / policy.name
@@ -134,7 +134,8 @@ class _Build:
             dataset: Dataset = open_dataset(self._dataset(recorded))
             if policy.subtask:  # before the encoding: no other frame is encoded
                 dataset = of_subtask(dataset, policy.subtask)
-            train_run(self.plan.run(policy), dataset, folder, self.context.stage)
+            run = self.plan.training(policy, self.plan.seed[0])
+            train_run(run, dataset, folder, self.context.stage)
         checkpoint = read_checkpoint(folder)
         whose = f"the {policy.subtask} of " if policy.subtask else ""
         card = ReleaseCard(
@@ -157,7 +158,7 @@ class _Build:
         """Count the whole procedure by the released parts, and release it."""
         parts = {name: f"{PREFIX}{name}" for name in (*names.SUBTASKS, HLP)}
         hashes = {name: read_card(name).files[WEIGHTS] for name in parts}
-        config = from_mapping(HierarchicalConfig, {**self.plan.procedure, **parts}, "procedure")
+        config = self.plan.hierarchical(None, parts)
         content = yaml.safe_dump(to_mapping(config), sort_keys=False).encode()
         policy = f"{PREFIX}{names.SUTURE}"
         card = ReleaseCard(
@@ -178,19 +179,8 @@ class _Build:
 
     def _dataset(self, recorded: Demonstrations) -> Path:
         """Record and render; return the dataset's folder."""
-        return prepare_dataset(
-            self.plan.task_config(recorded.task),
-            self.out / recorded.name,
-            self.context,
-            demonstrations=recorded.episodes,
-            views=recorded.view,
-            size=self.plan.size,
-            depth=False,
-            frame_stride=recorded.frame_stride,
-            demonstrator=recorded.demonstrator,
-            disturbance=Disturbance(recorded.noise),
-            post_success_steps=recorded.post_success_steps,
-        )
+        dataset = self.plan.dataset(recorded, self.plan.seed[0])
+        return make_dataset(dataset, self.out / recorded.name, self.context)
 
     def _counted(self, card: ReleaseCard, given: str | Path, folder: str) -> ReleaseCard:
         """Evaluate a policy on the held-out starts; return its card with the count."""

@@ -27,6 +27,7 @@ class Condition:
         strength: how much.
         expert_swap: subtask of a hierarchical policy in which the expert acts, or "".
         upset: whether one thing went wrong in every episode.
+        name: name of the condition of a plan, or "".
         trained: whether a policy was trained.
         place: where it stands, if another evaluation of the same condition and training seed stands
             elsewhere.
@@ -45,6 +46,7 @@ class Condition:
     strength: float = 0.0
     expert_swap: str = ""
     upset: bool = False
+    name: str = ""
     trained: bool = True
     place: str = ""
 
@@ -57,6 +59,7 @@ class Condition:
             hierarchical,
             *(part for part, common in usual if part != common),
             " + ".join(self.changes),
+            self.name,
             self.place,
         ]
         return " · ".join(part for part in parts if part)
@@ -112,6 +115,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         strength=run.shift.strength if run.shift else 0.0,
         expert_swap=run.expert_swap or "",
         upset=run.upset,
+        name=run.condition,
         trained=run.is_trained,
         place=place,
     )

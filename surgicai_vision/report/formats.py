@@ -20,8 +20,8 @@ HEAD = (
 )
 CAPTION = (
     "Intervals: exact (Clopper-Pearson), 95 %, episodes of all training seeds together; across"
-    " training seeds: mean, standard deviation and hierarchical bootstrap interval. Length and"
-    " steps: mean and standard deviation over successful episodes."
+    " training seeds: mean, standard deviation, hierarchical bootstrap interval and each seed's"
+    " successes. Length and steps: mean and standard deviation over successful episodes."
 )
 _LATEX = {
     "\\": r"\textbackslash{}",

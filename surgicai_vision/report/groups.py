@@ -134,12 +134,15 @@ class Group:
         return statistics.mean_and_std([float(row[column]) for row in self.rows if row["success"]])
 
     def across_text(self) -> str:
-        """Return "31.0 ± 4.2 % (22–40 %)", or a dash for one training seed."""
+        """Return "31.0 ± 4.2 % (22–40 %); by seed 28, 34", or a dash for one training seed."""
         if self.across is None:
             return text.ABSENT
         mean = 100 * self.across.mean
         std = 100 * self.across.std
-        return f"{mean:.1f} ± {std:.1f} % ({text.interval(self.across.interval)})"
+        counts = [sum(bool(row["success"]) for row in result.rows) for result in self.results]
+        by_seed = ", ".join(map(str, counts))
+        bounds = text.interval(self.across.interval)
+        return f"{mean:.1f} ± {std:.1f} % ({bounds}); by seed {by_seed}"
 
 
 def measured(row: Mapping[str, Any], column: str) -> float | None:

@@ -1,9 +1,10 @@
 """Pairs: exact McNemar on the same starts, Holm's correction within a task.
 
 Compared are trained conditions of a task that differ in one thing (`FACTORS`); recipes as wholes,
-with the encoder, views and demonstrations of each; and each with images against proprioception
-alone. Episodes are paired by training seed and start. The test speaks of the policies that were
-trained, not of all that the same recipe might give.
+with the encoder, views and demonstrations of each; conditions of a plan, with how subtasks end in
+each; and each with images against proprioception alone. Episodes are paired by training seed and
+start. The test speaks of the policies that were trained, not of all that the same recipe might
+give.
 """
 
 import itertools
@@ -26,6 +27,7 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "recipe": "recipe",
         "changes": "change",
         "demonstrations": "demonstrations",
+        "name": "condition",
         "place": "place",
     }
 )
@@ -59,7 +61,9 @@ def compare(groups: Sequence[Group]) -> list[Pair]:
     pairs: list[Pair] = []
     for task in task_names():
         trained = [
-            item for item in of_task(groups, task) if item.condition.trained and item.episodes
+            item
+            for item in of_task(groups, task, plain=False)
+            if _is_compared(item.condition) and item.episodes
         ]
         candidates = [_pair(*two) for two in itertools.combinations(trained, 2)]
         found = [pair for pair in candidates if pair is not None]
@@ -80,9 +84,16 @@ def factor(first: Condition, second: Condition) -> str:
     if "recipe" in differ and bool(first.views) == bool(second.views):
         whole = ("encoder", "views", "pool", "recipe", "changes", "demonstrations")
         differ = [name for name in differ if name == "recipe" or name not in whole]
+    if "name" in differ:
+        differ = [name for name in differ if name != "hierarchical"]
     if blind:
         differ = ["images" if name == "encoder" else name for name in differ if name != "views"]
     return FACTORS.get(differ[0], differ[0]) if len(differ) == 1 else ""
+
+
+def _is_compared(condition: Condition) -> bool:
+    """Return True for what is trained and evaluated as trained, or in a condition of a plan."""
+    return condition.trained and (condition.plain or bool(condition.name))
 
 
 def _pair(first: Group, second: Group) -> Pair | None:

@@ -122,7 +122,8 @@ def evaluate_command(result: Result) -> str | None:
     about = result.about
     seeds = [row["seed"] for row in result.rows]
     whole = seeds == list(range(seeds[0], seeds[0] + len(seeds)))
-    if not whole or not result.condition.plain or result.run.is_hierarchical:
+    condition = result.condition
+    if not whole or not condition.plain or condition.name or result.run.is_hierarchical:
         return None
     ending = f"--task {result.summary['task']} --episodes {len(seeds)} --seed {seeds[0]} --json"
     name = result.summary["policy"]
@@ -150,6 +151,7 @@ def _identity(condition: Condition) -> dict[str, object]:
         "strength": condition.strength,
         "expert_in": condition.expert_swap,
         "upset": condition.upset,
+        "condition": condition.name,
         "trained": condition.trained,
     }
 

@@ -7,8 +7,10 @@ Light to import, for the command line.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import check_view
@@ -23,6 +25,11 @@ LEROBOT_POLICIES = ("act", "diffusion")
 """Policies that a sweep trains by `lerobot-train`."""
 TERMINATIONS = ("privileged", "learned")
 """How a subtask ends under a hierarchical policy."""
+
+BANKS: Mapping[str, int] = MappingProxyType(
+    {"test": names.TEST_SEED, "validation": names.VALIDATION_SEED}
+)
+"""Bank of start states → its first seed; choices are made on validation, and reported on test."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +96,8 @@ class RunConfig:
         starts: start states of the evaluation; None before it.
         shift: what is shifted in an evaluation of robustness.
         upset: one thing goes wrong in every episode of the evaluation (`envs.upset`).
+        condition: name of the condition of a plan (`experiments.plan_config`) that it is evaluated
+            in; empty elsewhere.
     """
 
     env: TaskConfig = field(default_factory=TaskConfig)
@@ -115,6 +124,7 @@ class RunConfig:
     starts: Starts | None = None
     shift: Shift | None = None
     upset: bool = False
+    condition: str = ""
 
     def __post_init__(self) -> None:
         for view in self.views:
@@ -207,4 +217,6 @@ def with_epochs(changes: tuple[str, ...], epochs: int | None) -> tuple[str, ...]
 
 def of_training(run: RunConfig) -> RunConfig:
     """Return a run without what belongs to one evaluation of it."""
-    return dataclasses.replace(run, starts=None, shift=None, expert_swap=None, upset=False)
+    return dataclasses.replace(
+        run, starts=None, shift=None, expert_swap=None, upset=False, condition=""
+    )

@@ -14,8 +14,9 @@ from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.files import write_json
 from surgicai_vision.demos import record as recording
 from surgicai_vision.demos import store
+from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.demos.record import record
-from surgicai_vision.demos.rollout import Disturbance, rollout
+from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import (
     Demo,
     list_demos,

@@ -13,10 +13,11 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos import rollout as rollout_module
 from surgicai_vision.demos.demonstrator import make_demonstrator
+from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.recovery_expert import RecoveryExpert
-from surgicai_vision.demos.rollout import Disturbance, Rollout, rollout
+from surgicai_vision.demos.rollout import Rollout, rollout
 from surgicai_vision.demos.store import read_demo, read_marker
 from surgicai_vision.envs.upset import UpsetPlan
 

@@ -13,11 +13,11 @@ from surgicai_vision.core.config import RandomisationConfig, read_changes
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.experiments.sweep.driver import run_sweep
-from surgicai_vision.experiments.sweep.grid import BANKS, Ablation, Grid
+from surgicai_vision.experiments.sweep.grid import Ablation, Grid
 from surgicai_vision.experiments.sweep.plan import Jobs, plan, run_key
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import read_checkpoint
-from surgicai_vision.training.run_config import RunConfig, with_epochs
+from surgicai_vision.training.run_config import BANKS, RunConfig, with_epochs
 
 BASE = """
 task: grasp

@@ -12,7 +12,7 @@ from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.core.files import PACKAGE, sha256_file
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.rollout import evaluate
-from surgicai_vision.experiments.release_config import read_plan, smaller
+from surgicai_vision.experiments.plan_config import read_plan
 from surgicai_vision.training import released
 from surgicai_vision.training.checkpoint import WEIGHTS
 from surgicai_vision.training.policies import load_policy
@@ -91,6 +91,10 @@ def test_one_command_builds_all_and_continues_where_it_was(capsys):
     assert [card["name"] for card in built["policies"]] == [*names.SUBTASKS, "hlp", "suture"]
     work = sorted(path for path in Path("outputs/release").rglob("*") if path.is_file())
     times = [path.stat().st_mtime_ns for path in work if path.name != "plan.json"]
+    (stored,) = Path("outputs/release").glob("*/plan.json")
+    whole = json.loads(stored.read_text())
+    earlier = {key: whole[key] for key in whole if key in (*PLAN, "env")}
+    stored.write_text(json.dumps({**earlier, "seed": 0}))  # before there were conditions
     code, again = run(capsys, *command)
     assert again == built
     assert [path.stat().st_mtime_ns for path in work if path.name != "plan.json"] == times
@@ -183,9 +187,9 @@ def test_wrong_input_is_refused_before_any_work(capsys, monkeypatch):
 def test_the_plan_that_is_released_is_whole():
     plan = read_plan()
     assert plan.names == (*names.SUBTASKS, "hlp", "suture")
-    assert {each.episodes for each in smaller(plan, demonstrations=3).demonstrations} == {3}
+    assert {each.episodes for each in plan.smaller(demonstrations=3).demonstrations} == {3}
     with pytest.raises(InputError, match="epochs is 0"):
-        smaller(plan, epochs=0)
+        plan.smaller(epochs=0)
 
 
 SHIPPED = sorted(path.parent.name for path in (PACKAGE / "released").glob(f"*/{released.CARD}"))

@@ -30,7 +30,7 @@ from surgicai_vision.experiments.sweep.driver import run_sweep
 from surgicai_vision.experiments.sweep.estimate import estimate
 from surgicai_vision.experiments.sweep.grid import Grid, parts_of
 from surgicai_vision.experiments.sweep.lerobot import _arguments
-from surgicai_vision.experiments.sweep.plan import Jobs, plan, read_grid_of, run_key
+from surgicai_vision.experiments.sweep.plan import Jobs, plan, read_experiment_of, run_key
 from surgicai_vision.experiments.sweep.selection import read_choice
 from surgicai_vision.report.experiment_key import condition_of
 from surgicai_vision.training.checkpoint import read_checkpoint
@@ -332,7 +332,7 @@ def test_a_run_is_stored_whole_wherever_its_results_are(quiet):
         assert evaluated == state.run and evaluated.starts == Starts(names.TEST_SEED, 1)
         assert condition_of(trained) == condition_of(evaluated), "one policy forms one condition"
         assert trained.seed == evaluated.seed
-    assert read_grid_of(out) == BLIND
+    assert read_experiment_of(out) == BLIND
 
 
 def test_a_sweep_of_another_version_is_refused(tmp_path):

@@ -1,9 +1,9 @@
-"""Sweep: a grid of runs, done once each by jobs of the executor.
+"""Sweep: the runs of a grid or of a plan, done once each by jobs of the executor.
 
-A run is encode (cached) → train → evaluate.
+A run is encode (cached) → train → evaluate, or the evaluation of policies that runs share.
 
-`out` holds `sweep.json` (the grid), `data/<task>/` (demonstrations and dataset), `runs/<key>/`
-with `policy/`, `evaluation/` and `result.json`, `policies/<key>/` (what hierarchical policies
+`out` holds `sweep.json` (the grid, or the plan), `data/<name>/` (demonstrations and dataset),
+`runs/<key>/` with `policy/`, `evaluation/` and `result.json`, `policies/<key>/` (policies that runs
 share), `references/` (expert, replay), `episodes.parquet` (one row an episode), `probes.parquet`
 (where asked for) and `run.json` for the report. The key is the digest of the `RunConfig`;
 `result.json` names the job, which counts code and versions too. So running again does only what is

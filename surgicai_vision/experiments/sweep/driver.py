@@ -16,6 +16,7 @@ from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
 from surgicai_vision.core.executor import Job, RunContext, claim
 from surgicai_vision.core.executor import run as run_jobs
+from surgicai_vision.envs.upset import check_upset_task
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.storage import (
     FAILED_FILE,
@@ -26,10 +27,9 @@ from surgicai_vision.evaluation.storage import (
     Row,
     parquet_bytes,
     read_rows,
-    read_versioned,
 )
-from surgicai_vision.experiments.prepare import prepare_dataset
-from surgicai_vision.experiments.sweep.grid import Grid, parts_of
+from surgicai_vision.experiments.prepare import check_dataset, make_dataset
+from surgicai_vision.experiments.sweep.experiment import Experiment
 from surgicai_vision.experiments.sweep.plan import (
     CACHED,
     LEFT,
@@ -40,6 +40,7 @@ from surgicai_vision.experiments.sweep.plan import (
     Jobs,
     RunState,
     plan,
+    read_experiment_of,
     run_folder,
     run_key,
 )
@@ -53,7 +54,7 @@ ATTEMPTS = 3
 
 
 def run_sweep(
-    grid: Grid,
+    experiment: Experiment,
     out: Path,
     context: RunContext,
     attempts: int = ATTEMPTS,
@@ -62,7 +63,7 @@ def run_sweep(
     """Do every run that is not done and can be done.
 
     Args:
-        grid: the runs.
+        experiment: the runs, a grid or a plan.
         out: folder to make or to continue.
         context: processes, engine and progress; the result does not depend on them.
         attempts: how often a run is started whose worker dies.
@@ -77,13 +78,17 @@ def run_sweep(
         OutputExists: `out` holds something else.
         UnknownName: a recipe that does not exist; before any work.
     """
-    plan(grid, out, choice)  # refuses what cannot be done before anything is written
-    _open(grid, out)
+    plan(experiment, out, choice)  # refuses what cannot be done before anything is written
+    for dataset in experiment.datasets.values():
+        check_dataset(dataset)
+    for run in experiment.runs:
+        if run.upset:
+            check_upset_task(run.task)
+    _open(experiment, out)
     with claim(out / WORK):
-        states = plan(grid, out, choice)
-        asked = [state for state in states if state.state != LEFT]
-        tasks = [task for task in grid.task if any(s.run.task == task for s in asked)]
-        sweep = _Sweep(grid, out, context, attempts, tuple(tasks))
+        states = plan(experiment, out, choice)
+        asked = [state.run for state in states if state.state != LEFT]
+        sweep = _Sweep(experiment, out, context, attempts, experiment.references(asked))
         to_do = [state for state in states if state.state == TO_DO]
         sweep.prepare(to_do)
         sweep.do(to_do)
@@ -102,9 +107,9 @@ def run_sweep(
         for state in to_do
         if state.key in sweep.errors
     ]
-    table = _collect(grid, out)
+    table = _collect(experiment, out)
     _collect_probes(out)
-    _store_run(grid, out, sweep.problems, skipped)
+    _store_run(experiment, out, sweep.problems, skipped)
     counts = {
         "runs": len(states),
         "done": len(to_do) - len(sweep.errors),
@@ -117,22 +122,26 @@ def run_sweep(
     return {**counts, "digest": digest(table), "problems": lines, "out": str(out)}
 
 
-def _open(grid: Grid, out: Path) -> None:
-    """Make the folder, or accept the one of the same grid."""
+def _open(experiment: Experiment, out: Path) -> None:
+    """Make the folder, or accept the one of the same experiment."""
     files.check_output(out, may_resume=GRID_FILE)
+    table = experiment.table()
     if (out / GRID_FILE).exists():
-        if read_versioned(out / GRID_FILE)["grid"] != to_mapping(grid):
+        stored = read_experiment_of(out)
+        if stored.kind != experiment.kind or not experiment.extends(stored.table()):
             raise OutputExists(
-                f"--out {out} holds another sweep (see {out / GRID_FILE}); give another folder."
+                f"--out {out} holds another sweep (see {out / GRID_FILE}); give another folder. "
+                "To a plan, training seeds and conditions may be added; the rest must stay."
             )
-        return
+        if stored.table() == table:
+            return
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
             f"--out {out} cannot be written: {error.strerror}; choose another folder."
         ) from None
-    files.write_json(out / GRID_FILE, {"format": FORMAT, "grid": to_mapping(grid)})
+    files.write_json(out / GRID_FILE, {"format": FORMAT, experiment.kind: table})
 
 
 @final
@@ -162,17 +171,17 @@ class _Sweep:
     """One call of a sweep.
 
     Attributes:
-        grid, out, context, attempts: as `run_sweep`'s.
-        tasks: those whose references are wanted.
+        experiment, out, context, attempts: as `run_sweep`'s.
+        references: what is not trained and wanted beside the runs.
         errors: run's key → what went wrong, in one line.
         problems: what went wrong beside the runs.
     """
 
-    grid: Grid
+    experiment: Experiment
     out: Path
     context: RunContext
     attempts: int
-    tasks: tuple[str, ...]
+    references: tuple[RunConfig, ...]
     errors: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     jobs: Jobs = field(init=False)
@@ -185,45 +194,32 @@ class _Sweep:
         ours = {
             name: value for name, value in os.environ.items() if name.startswith("SURGICAI_VISION_")
         }
-        self.jobs = Jobs(self.grid, self.out, command_line(), ours)
+        self.jobs = Jobs(self.experiment, self.out, command_line(), ours)
 
     def prepare(self, to_do: Sequence[RunState]) -> None:
         """Make the datasets, features and policies that runs share.
 
-        A task whose dataset fails fails its runs.
+        A dataset that fails fails its runs.
         """
+        users = {state.key: self.jobs.datasets_of(state.run) for state in to_do}
         replayed = [
-            task
-            for task in self.tasks
-            if self.grid.replay and not self._is_filed_reference("replay", task)
+            self.experiment.dataset_of(run)
+            for run in self.references
+            if run.policy == "replay" and not self._is_filed_reference(run)
         ]
-        for task in dict.fromkeys([*(state.run.task for state in to_do), *replayed]):
+        used = [name for state in to_do for name in users[state.key]]
+        for name in dict.fromkeys([*used, *replayed]):
             try:
-                self._prepare_dataset(task)
+                dataset = self.experiment.datasets[name]
+                make_dataset(dataset, self.jobs.data_folder(name), self.context)
             except SurgicaiError as error:
                 for state in to_do:
-                    if task == state.run.task:
+                    if name in users[state.key] and state.key not in self.errors:
                         self._fail(state, error)
         self._renew()
         live = [state for state in to_do if state.key not in self.errors]
         self._share("features", [job for state in live for job in self.jobs.features(state.run)])
-        self._train_parts([state for state in live if state.run.is_hierarchical])
-
-    def _prepare_dataset(self, task: str) -> None:
-        """Record and render a task's demonstrations."""
-        prepare_dataset(
-            self.grid.config(task),
-            self.jobs.data_folder(task),
-            self.context,
-            demonstrations=self.grid.recorded,
-            views=self.grid.cameras or ("front",),
-            size=self.grid.size,
-            depth=self.grid.has_depth,
-            frame_stride=self.grid.frame_stride,
-            demonstrator=self.grid.demonstrator,
-            disturbance=self.grid.disturbance,
-            post_success_steps=self.grid.post_success_steps,
-        )
+        self._train_parts(live)
 
     def _run(
         self,
@@ -260,20 +256,29 @@ class _Sweep:
         return errors
 
     def _train_parts(self, states: Sequence[RunState]) -> None:
-        """Train the policies of hierarchical runs and file them; a run that lacks one fails."""
+        """Train the policies that runs share and file them; a run that lacks one fails."""
         parts = {
             self.jobs.policy(part).key(): part
             for state in states
-            for part in parts_of(state.run).values()
+            for part in self.experiment.parts(state.run).values()
         }
         places = {
             key: _Place(self.jobs.policy_folder(part), JOB_FILE) for key, part in parts.items()
         }
-        missing = [part for key, part in parts.items() if not places[key].holds(key)]
-        errors = self._share("policies", map(self.jobs.policy, missing))
         self._file_finished(places)
+        missing = [part for key, part in parts.items() if not places[key].holds(key)]
+
+        def ended(job: Job, folder: Path, error: SurgicaiError | None) -> None:
+            if error is None:
+                _file(folder, places[folder.name], folder.name)
+            else:
+                errors[job.key()] = error
+
+        errors: dict[str, SurgicaiError] = {}
+        if missing:
+            self._run("policies", [self.jobs.policy(part) for part in missing], ended)
         for state in states:
-            for part in parts_of(state.run).values():
+            for part in self.experiment.parts(state.run).values():
                 error = errors.get(self.jobs.policy(part).key())
                 if error and state.key not in self.errors:
                     self._fail(state, error)
@@ -287,10 +292,11 @@ class _Sweep:
                 job = self.jobs.run(state.run)
                 jobs.append(job)
                 places[job.key()] = _Place(run_folder(self.out, state.key), RESULT_FILE, state)
-        for name, task in self._references():
-            job = self.jobs.reference(name, task)
-            jobs.append(job)
-            places[job.key()] = _Place(self._reference_folder(name, task), REFERENCE_FILE)
+        for run in self.references:
+            if not self._is_filed_reference(run):
+                job = self.jobs.reference(run)
+                jobs.append(job)
+                places[job.key()] = _Place(self._reference_folder(run), REFERENCE_FILE)
         self._file_finished(places)
         left = [job for job in jobs if not places[job.key()].holds(job.key())]
 
@@ -308,7 +314,7 @@ class _Sweep:
 
     def probe(self, runs: Sequence[RunConfig]) -> None:
         """Probe what the runs see, where the grid asks for it."""
-        wanted = self.jobs.probes(runs) if self.grid.probe else {}
+        wanted = self.jobs.probes(runs) if self.experiment.probe else {}
         places = {
             job.key(): _Place(self.out / "probes" / name, PROBE_FILE)
             for name, job in wanted.items()
@@ -326,18 +332,13 @@ class _Sweep:
             if (self.out / WORK / key).is_dir():
                 _file(self.out / WORK / key, place, key)
 
-    def _references(self) -> list[tuple[str, str]]:
-        """Return (name, task) of the references that are not there."""
-        wanted = (("expert", self.grid.expert), ("replay", self.grid.replay))
-        pairs = [(name, task) for task in self.tasks for name, is_on in wanted if is_on]
-        return [(name, task) for name, task in pairs if not self._is_filed_reference(name, task)]
+    def _is_filed_reference(self, run: RunConfig) -> bool:
+        place = _Place(self._reference_folder(run), REFERENCE_FILE)
+        return place.holds(self.jobs.reference(run).key())
 
-    def _is_filed_reference(self, name: str, task: str) -> bool:
-        place = _Place(self._reference_folder(name, task), REFERENCE_FILE)
-        return place.holds(self.jobs.reference(name, task).key())
-
-    def _reference_folder(self, name: str, task: str) -> Path:
-        return self.out / "references" / f"{name}-{task}"
+    def _reference_folder(self, run: RunConfig) -> Path:
+        parts = [run.policy, run.task, *([run.condition] if run.condition else [])]
+        return self.out / "references" / "-".join(parts)
 
     def _fail(self, state: RunState, error: SurgicaiError) -> None:
         """Keep a run's error, and its traceback where it was none of ours."""
@@ -350,7 +351,7 @@ class _Sweep:
 
 
 JOB_FILE = "job.json"
-"""Names the job that made a policy which hierarchical policies share."""
+"""Names the job that made a policy which runs share."""
 
 
 def _file(folder: Path, place: _Place, key: str) -> None:
@@ -363,10 +364,10 @@ def _file(folder: Path, place: _Place, key: str) -> None:
     files.sync_folder(place.folder.parent)
 
 
-def _collect(grid: Grid, out: Path) -> list[Row]:
+def _collect(experiment: Experiment, out: Path) -> list[Row]:
     """Write `episodes.parquet` of all runs that are done and return its rows."""
     table: list[Row] = []
-    for run in grid.runs:
+    for run in experiment.runs:
         folder = run_folder(out, run_key(run))
         if (folder / RESULT_FILE).exists():
             about = _about(run)
@@ -394,38 +395,20 @@ def _about(run: RunConfig) -> Row:
         "demonstrations": run.demonstrations,
         "hierarchical": run.termination,
         "expert_swap": run.expert_swap,
+        "condition": run.condition,
     }
 
 
-def _store_run(grid: Grid, out: Path, problems: list[str], skipped: Sequence[RunState]) -> None:
+def _store_run(
+    experiment: Experiment, out: Path, problems: list[str], skipped: Sequence[RunState]
+) -> None:
     """Write what the report says of the sweep; only when something changed."""
     old = files.read_json(out / RUN_FILE) if (out / RUN_FILE).exists() else {}
-    counts = ", ".join(map(str, grid.demonstrations))
-    parts = [f"{counts} demonstrations of each task by the scripted {grid.demonstrator}"]
-    parts += [f"executed with noise {grid.noise:g}"] if grid.noise else []
-    parts += (
-        [f"going on for {grid.post_success_steps} steps after their success"]
-        if grid.post_success_steps
-        else []
-    )
-    randomised = {axis: size for axis, size in vars(grid.randomisation).items() if size}
-    parts += [f"{axis} up to {size:g}" for axis, size in randomised.items()]
-    parts += [f"a frame every {grid.frame_stride} steps"] if grid.frame_stride > 1 else []
-    seen = f"{', '.join(grid.views)} at {grid.size} × {grid.size}" if grid.views else "no images"
-    taught = f"{', '.join(grid.policy)}, recipe {', '.join(grid.recipe)}"
-    data = "; ".join(
-        [
-            ", ".join(parts),
-            seen,
-            taught,
-            f"{grid.episodes} {grid.starts} starts from {grid.bank.first_seed}",
-        ]
-    )
     made = {
         "format": FORMAT,
         "title": "sweep",
         "command": old.get("command") or command_line(),
-        "data": data,
+        "data": experiment.text,
         "problems": problems,
         "skipped": [
             {"key": state.key, "run": to_mapping(state.run), "reason": state.reason}

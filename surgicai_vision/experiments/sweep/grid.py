@@ -2,23 +2,28 @@
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names, view_names
 from surgicai_vision.core.config import (
+    JSON,
     RandomisationConfig,
     TaskConfig,
     check_frame_stride,
+    to_mapping,
 )
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.demos.demonstrator import SCRIPTED_DEMONSTRATORS
-from surgicai_vision.demos.rollout import Disturbance
+from surgicai_vision.demos.disturbance import Disturbance
+from surgicai_vision.experiments.dataset_config import DatasetConfig, Demonstrations
+from surgicai_vision.experiments.sweep.experiment import Evaluated, Training
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
 from surgicai_vision.training.run_config import (
+    BANKS,
     LEROBOT_POLICIES,
     OWN,
     TERMINATIONS,
@@ -43,11 +48,6 @@ AXES: Mapping[str, Callable[[RunConfig], object]] = MappingProxyType(
 """Keys of a grid that hold lists, and a run's value on each; one value alone may be written without
 brackets.
 """
-
-BANKS: Mapping[str, int] = MappingProxyType(
-    {"test": names.TEST_SEED, "validation": names.VALIDATION_SEED}
-)
-"""Bank of start states → its first seed; choices are made on validation, and reported on test."""
 
 
 @dataclass(frozen=True)
@@ -285,11 +285,6 @@ class Grid:
         return self.depth or any(map(names.is_depth_view, self.views))
 
     @property
-    def disturbance(self) -> Disturbance:
-        """What disturbs the demonstrations."""
-        return Disturbance(self.noise)
-
-    @property
     def bank(self) -> Starts:
         """Start states of every evaluation."""
         return Starts(BANKS[self.starts], self.episodes)
@@ -305,6 +300,101 @@ class Grid:
         Runs with fewer train on the first of them.
         """
         return max(self.demonstrations)
+
+    @property
+    def kind(self) -> str:
+        """The key of `sweep.json` that it is stored under."""
+        return "grid"
+
+    @functools.cached_property
+    def datasets(self) -> Mapping[str, DatasetConfig]:
+        """Each task's dataset, by the task's name."""
+        return {task: self._dataset(task) for task in self.task}
+
+    def _dataset(self, task: str) -> DatasetConfig:
+        recorded = Demonstrations(
+            task,
+            task,
+            self.recorded,
+            self.cameras or ("front",),
+            self.demonstrator,
+            self.noise,
+            self.post_success_steps,
+            self.frame_stride,
+        )
+        return DatasetConfig(self.config(task), recorded, self.size, self.has_depth)
+
+    def dataset_of(self, run: RunConfig) -> str:
+        """Return the name of the dataset of a run: its task."""
+        return run.task
+
+    def parts(self, run: RunConfig) -> Mapping[str, Training]:
+        """Return the policies of a hierarchical run, trained on frames of whole procedures."""
+        if not run.is_hierarchical:
+            return {}
+        return {
+            name: Training(
+                replace(part, env=with_task(part.env, names.SUTURE)),
+                run.task,
+                None if part.task == names.SUTURE else part.task,
+            )
+            for name, part in parts_of(run).items()
+        }
+
+    def evaluated(self, run: RunConfig) -> Evaluated:
+        """Return how a run is evaluated: in the env it was trained in."""
+        return Evaluated({}, {"termination": run.termination} if run.is_hierarchical else {})
+
+    def references(self, runs: Sequence[RunConfig]) -> tuple[RunConfig, ...]:
+        """Return the expert and the replay on each task of the runs."""
+        tasks = [task for task in self.task if any(run.task == task for run in runs)]
+        wanted = (("expert", self.expert), ("replay", self.replay))
+        return tuple(
+            RunConfig(self.config(task), policy=name, starts=self.bank)
+            for name, is_on in wanted
+            if is_on
+            for task in tasks
+        )
+
+    def table(self) -> Mapping[str, JSON]:
+        """Return it as plain data."""
+        return to_mapping(self)
+
+    def extends(self, stored: Mapping[str, JSON]) -> bool:
+        """Return True if `stored` is the same grid."""
+        return self.table() == stored
+
+    def smaller(
+        self,
+        demonstrations: int | None = None,
+        epochs: int | None = None,
+        episodes: int | None = None,
+        size: int | None = None,
+    ) -> "Grid":
+        """Return the grid with other numbers, to try it in minutes; see `Experiment.smaller`."""
+        return replace(
+            self,
+            demonstrations=self.demonstrations if demonstrations is None else (demonstrations,),
+            epochs=self.epochs if epochs is None else epochs,
+            episodes=self.episodes if episodes is None else episodes,
+            size=self.size if size is None else size,
+        )
+
+    @property
+    def text(self) -> str:
+        """What is done, in words."""
+        counts = ", ".join(map(str, self.demonstrations))
+        manner = self._dataset(self.task[0]).demonstrations.manner
+        randomised = [
+            f"{axis} up to {size}" for axis, size in vars(self.randomisation).items() if size
+        ]
+        data = ", ".join([f"{counts} demonstrations of each task {manner}", *randomised])
+        seen = (
+            f"{', '.join(self.views)} at {self.size} × {self.size}" if self.views else "no images"
+        )
+        taught = f"{', '.join(self.policy)}, recipe {', '.join(self.recipe)}"
+        starts = f"{self.episodes} {self.starts} starts from {self.bank.first_seed}"
+        return "; ".join([data, seen, taught, starts])
 
 
 def parts_of(run: RunConfig) -> dict[str, RunConfig]:

@@ -1,7 +1,7 @@
 """Jobs of a sweep, as workers do them.
 
-Encode, train a policy that hierarchical policies share, do a run, evaluate a reference. Each writes
-into its own folder and reads datasets and cache by path. Nothing here depends on who does it.
+Encode, train a policy that runs share, do a run, evaluate a reference. Each writes into its own
+folder and reads datasets and cache by path. Nothing here depends on who does it.
 """
 
 import dataclasses
@@ -15,9 +15,15 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, from_mapping
 from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import Stage, silent_stage, timed
-from surgicai_vision.dataset import RenderedDataset, open_dataset
+from surgicai_vision.dataset import Dataset, RenderedDataset, open_dataset
+from surgicai_vision.dataset.subset import of_subtask
 from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
-from surgicai_vision.evaluation.policy_spec import PolicySpec, hierarchical_policy, open_policy
+from surgicai_vision.evaluation.policy_spec import (
+    PolicySpec,
+    hierarchical_policy,
+    in_env,
+    open_policy,
+)
 from surgicai_vision.evaluation.run import evaluate_into
 from surgicai_vision.evaluation.storage import RESULT_FILE
 from surgicai_vision.experiments.run import encode_run, train_run
@@ -49,15 +55,20 @@ def train_policy(
     folder: Path,
     run: Table,
     subtask: str | None,
+    encodes_all: bool,
     dataset: str,
     accept_licence: bool,
     command: str,
     environment: Mapping[str, str],
 ) -> None:
-    """Job "sweep-policy": train one policy of a hierarchical policy."""
+    """Job "sweep-policy": train a policy that runs share."""
     os.environ.update(environment)
     weights = WeightsSource(accept_licence=accept_licence)
-    train_run(_run(run), _dataset(dataset), folder, silent_stage, weights, subtask=subtask)
+    data: Dataset = _dataset(dataset)
+    if subtask and not encodes_all:
+        data = of_subtask(data, subtask)
+        subtask = None
+    train_run(_run(run), data, folder, silent_stage, weights, subtask=subtask)
 
 
 def train_and_evaluate(
@@ -65,22 +76,31 @@ def train_and_evaluate(
     run: Table,
     final: str,
     policies: Mapping[str, str],
+    env: Table,
+    procedure: Table,
     dataset: str,
     accept_licence: bool,
     command: str,
     environment: Mapping[str, str],
 ) -> None:
-    """Job "sweep-run": train a policy, or take a hierarchical one, and count its successes."""
+    """Job "sweep-run": train a policy, or take those made before, and count its successes."""
     os.environ.update(environment)
     what = _run(run)
     weights = WeightsSource(accept_licence=accept_licence)
     seconds: dict[str, float] = {}
     with timed(silent_stage, seconds) as measured:
+        about: dict[str, JSON] = {"command": command}
         if what.is_hierarchical:
-            spec = _hierarchical(what, policies, weights)
+            table = {**dict.fromkeys(names.SUBTASKS, "expert"), **policies, **procedure}
+            config = from_mapping(HierarchicalConfig, table, "procedure")
+            spec = hierarchical_policy(config, weights=weights)
+        elif policies:
+            spec = open_policy(*policies.values(), task=what.task, weights=weights)
         else:
             spec = _trained(what, _dataset(dataset), folder / "policy", measured, weights)
-        about = {**spec.about, "command": command, "folder": str(Path(final) / "policy")}
+            about["folder"] = str(Path(final) / "policy")
+        spec = in_env(spec, env)
+        about = {**spec.about, **about}
         with measured("evaluation", "steps"):
             summary = _evaluate(folder / "evaluation", spec, what, about)
     shutil.rmtree(folder / SCRATCH, ignore_errors=True)
@@ -135,18 +155,9 @@ def _trained(
     return open_policy(policy, task=run.task, weights=weights)
 
 
-def _hierarchical(
-    run: RunConfig, policies: Mapping[str, str], weights: WeightsSource
-) -> PolicySpec:
-    """Return the hierarchical policy of a run, of policies trained before."""
-    low = {subtask: policies.get(subtask, "expert") for subtask in names.SUBTASKS}
-    table = {"hlp": policies["hlp"], **low, "termination": run.termination}
-    return hierarchical_policy(from_mapping(HierarchicalConfig, table), weights=weights)
-
-
 def _evaluate(folder: Path, spec: PolicySpec, run: RunConfig, about: Table) -> dict[str, JSON]:
-    """Evaluate what is called and stored as `run`, in the env that the policy was trained in."""
-    assert run.starts is not None, "the grid says where a run is evaluated"
+    """Evaluate what is called and stored as `run`, in the env of `spec`."""
+    assert run.starts is not None, "the experiment says where a run is evaluated"
     stored = dataclasses.replace(run, env=spec.config)
     spec = dataclasses.replace(spec, run=stored, about=about)
     return evaluate_into(folder, spec, run.starts.seeds, workers=1)

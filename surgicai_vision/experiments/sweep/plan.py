@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -12,7 +12,9 @@ from surgicai_vision.core.errors import BadFile, MissingWeights
 from surgicai_vision.core.executor import Job, register_job
 from surgicai_vision.core.files import read_json
 from surgicai_vision.evaluation.storage import GRID_FILE, RESULT_FILE, read_versioned
-from surgicai_vision.experiments.sweep.grid import Grid, parts_of, with_task
+from surgicai_vision.experiments.plan_config import plan_of
+from surgicai_vision.experiments.sweep.experiment import Experiment, Training
+from surgicai_vision.experiments.sweep.grid import Grid
 from surgicai_vision.experiments.sweep.selection import EVERYTHING, Choice, is_chosen
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import WeightsSource
@@ -73,16 +75,28 @@ class RunState:
     def where(self) -> str:
         """The run in words."""
         run = self.run
-        return f"{run.task}, {run.name}, {run.demonstrations} demonstrations, seed {run.seed}"
+        parts = [run.task, run.name]
+        parts += [f"{run.demonstrations} demonstrations"] if run.demonstrations else []
+        parts += [run.condition] if run.condition else []
+        return ", ".join([*parts, f"seed {run.seed}"])
 
 
-def read_grid_of(folder: Path) -> Grid:
-    """Return the grid of the sweep in `folder`.
+def read_experiment_of(folder: Path) -> Experiment:
+    """Return the grid or the plan of the sweep in `folder`.
 
     Raises:
         BadFile: there is none, or another version wrote it.
     """
-    return from_mapping(Grid, read_versioned(folder / GRID_FILE)["grid"], str(folder / GRID_FILE))
+    path = folder / GRID_FILE
+    stored = read_versioned(path)
+    if "plan" in stored:
+        return plan_of(stored["plan"], str(path))
+    return from_mapping(Grid, stored["grid"], str(path))
+
+
+def training_key(training: Training) -> str:
+    """Return the digest of everything that decides what a shared policy is."""
+    return digest(training)[:16]
 
 
 def run_key(run: RunConfig) -> str:
@@ -95,20 +109,26 @@ def run_folder(out: Path, key: str) -> Path:
     return out / "runs" / key
 
 
-def plan(grid: Grid, out: Path, choice: Choice = EVERYTHING) -> list[RunState]:
-    """Return every run of `grid` with its state in the folder `out`; does no work.
+def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list[RunState]:
+    """Return every run of `experiment` with its state in the folder `out`; does no work.
 
     Raises:
         UnknownName: a recipe, or a change of one, that does not exist.
         InputError: a recipe that is fed progress, which no sweep says.
     """
-    for run in grid.runs:
-        if run.policy not in LEROBOT_POLICIES:
-            policies.check_progress_from(policies.recipe_of(run), None)
-    jobs = Jobs(grid, out)
-    weights = WeightsSource(accept_licence=grid.accept_licence)
+    for run in experiment.runs:
+        for trained in trained_by(experiment, run):
+            if trained.policy not in LEROBOT_POLICIES:
+                policies.check_progress_from(policies.recipe_of(trained), None)
+    jobs = Jobs(experiment, out)
+    weights = WeightsSource(accept_licence=experiment.accept_licence)
     missing = functools.lru_cache(functools.partial(_missing, weights=weights))
-    return [_state(run, jobs, missing, choice) for run in grid.runs]
+    return [_state(run, jobs, missing, choice) for run in experiment.runs]
+
+
+def trained_by(experiment: Experiment, run: RunConfig) -> list[RunConfig]:
+    """Return the policies that must be trained for a run: its parts, or its own."""
+    return [part.run for part in experiment.parts(run).values()] or [run]
 
 
 def _missing(encoder: str, weights: WeightsSource) -> str:
@@ -127,83 +147,108 @@ def _state(run: RunConfig, jobs: "Jobs", missing: Callable[[str], str], choice: 
     is_made = path.exists()
     if is_made and read_json(path).get("job") == jobs.key_of_run(run):
         return RunState(run, key, CACHED)
-    lack = missing(run.encoder) if run.encoder and run.encoder != OWN else ""
-    if lack:
-        return RunState(run, key, NOT_RUN, lack)
+    needed = {trained.encoder for trained in trained_by(jobs.experiment, run)} - {None, OWN}
+    lacks = [lack for encoder in sorted(map(str, needed)) if (lack := missing(encoder))]
+    if lacks:
+        return RunState(run, key, NOT_RUN, " ".join(lacks))
     if not is_chosen(run, choice):
         return RunState(run, key, LEFT)
     return RunState(run, key, TO_DO, "made by other code or other data" if is_made else "")
 
 
 class Jobs:
-    """The jobs of a grid in the folder `out`.
+    """The jobs of an experiment in the folder `out`.
 
     Args:
-        grid: the grid.
+        experiment: the grid or the plan.
         out: the sweep's folder.
         command: the command to be named beside each result.
         environment: variables for the workers, where an engine does not hand ours on.
     """
 
     def __init__(
-        self, grid: Grid, out: Path, command: str = "", environment: Mapping[str, str] | None = None
+        self,
+        experiment: Experiment,
+        out: Path,
+        command: str = "",
+        environment: Mapping[str, str] | None = None,
     ):
-        self.grid = grid
+        self.experiment = experiment
         self.out = out
         self._where: dict[str, JSON] = {"command": command, "environment": dict(environment or {})}
         self._digests: dict[str, str | None] = {}
 
-    def data_folder(self, task: str) -> Path:
-        """Return where a task's demonstrations and dataset are."""
-        return self.out / "data" / task
+    def data_folder(self, name: str) -> Path:
+        """Return where a dataset and its demonstrations are."""
+        return self.out / "data" / name
 
-    def policy_folder(self, part: RunConfig) -> Path:
-        """Return where a policy that hierarchical policies share is filed."""
-        return self.out / "policies" / run_key(part)
+    def policy_folder(self, training: Training) -> Path:
+        """Return where a policy that runs share is filed."""
+        return self.out / "policies" / training_key(training)
 
-    def dataset_digest(self, task: str) -> str | None:
-        """Return the digest of a task's dataset; None where it is not made yet."""
-        if task not in self._digests:
+    def dataset_digest(self, name: str) -> str | None:
+        """Return the digest of a dataset; None where it is not made yet."""
+        if name not in self._digests:
             try:
-                meta = read_json(self.data_folder(task) / "dataset" / names.META_FILE)
-                self._digests[task] = str(meta["digest"])
+                meta = read_json(self.data_folder(name) / "dataset" / names.META_FILE)
+                self._digests[name] = str(meta["digest"])
             except BadFile:
-                self._digests[task] = None
-        return self._digests[task]
+                self._digests[name] = None
+        return self._digests[name]
+
+    def datasets_of(self, run: RunConfig) -> tuple[str, ...]:
+        """Return the names of the datasets that a run's policies are trained on."""
+        parts = self.experiment.parts(run).values()
+        return tuple(dict.fromkeys(part.dataset for part in parts)) or (
+            self.experiment.dataset_of(run),
+        )
 
     def key_of_run(self, run: RunConfig) -> str | None:
         """Return the key of a run's job; None where it cannot be known yet."""
-        return self.run(run).key() if self.dataset_digest(run.task) else None
+        known = all(self.dataset_digest(name) for name in self.datasets_of(run))
+        return self.run(run).key() if known else None
 
     def run(self, run: RunConfig) -> Job:
         """Return the job of a run.
 
-        It trains and evaluates, or evaluates the hierarchical policy of policies made before.
+        It trains and evaluates, or evaluates policies made before.
         """
-        parts = parts_of(run) if run.is_hierarchical else {}
-        inputs = [self.policy(part).key() for part in parts.values()] or self._inputs(run)
+        parts = self.experiment.parts(run)
+        dataset = self.datasets_of(run)[0]
+        inputs = [self.policy(part).key() for part in parts.values()] or self._inputs(run, dataset)
+        evaluated = self.experiment.evaluated(run)
         arguments = {
             "run": to_mapping(run),
             "final": str(run_folder(self.out, run_key(run)).absolute()),
             "policies": {
                 name: str(self.policy_folder(part).absolute()) for name, part in parts.items()
             },
-            **self._common(run),
+            **to_mapping(evaluated),
+            **self._common(dataset),
         }
         return Job("sweep-run", arguments, tuple(inputs), label=(*LABELS, "final", "policies"))
 
-    def policy(self, part: RunConfig) -> Job:
-        """Return the job that trains one policy of a hierarchical policy.
-
-        It is trained on its subtask's frames of whole procedures.
-        """
-        whole = replace(part, env=with_task(part.env, names.SUTURE))
-        subtask = None if part.task == names.SUTURE else part.task
-        arguments = {"run": to_mapping(whole), "subtask": subtask, **self._common(whole)}
-        return Job("sweep-policy", arguments, tuple(self._inputs(whole)), label=LABELS)
+    def policy(self, training: Training) -> Job:
+        """Return the job that trains a policy that runs share."""
+        arguments = {
+            "run": to_mapping(training.run),
+            "subtask": training.subtask,
+            "encodes_all": training.encodes_all,
+            **self._common(training.dataset),
+        }
+        inputs = tuple(self._inputs(training.run, training.dataset))
+        return Job("sweep-policy", arguments, inputs, label=LABELS)
 
     def features(self, run: RunConfig) -> list[Job]:
         """Return the jobs that encode what a run sees, view by view, so that runs share them."""
+        parts = tuple(self.experiment.parts(run).values()) or (
+            Training(run, self.experiment.dataset_of(run)),
+        )
+        return [job for part in parts if part.encodes_all for job in self._features(part)]
+
+    def _features(self, training: Training) -> list[Job]:
+        """Return the jobs that encode what a policy sees."""
+        run = training.run
         if not run.encoder or run.encoder == OWN:
             return []
         changes: tuple[str, ...] = ()
@@ -213,8 +258,9 @@ class Jobs:
         jobs = []
         for view in run.views:
             seen = RunConfig(run.env, run.encoder, (view,), pool=run.pool, changes=changes)
-            arguments = {"run": to_mapping(seen), **self._common(seen)}
-            jobs.append(Job("sweep-features", arguments, tuple(self._inputs(seen)), label=LABELS))
+            arguments = {"run": to_mapping(seen), **self._common(training.dataset)}
+            inputs = tuple(self._inputs(seen, training.dataset))
+            jobs.append(Job("sweep-features", arguments, inputs, label=LABELS))
         return jobs
 
     def probes(self, runs: Iterable[RunConfig]) -> dict[str, Job]:
@@ -225,36 +271,37 @@ class Jobs:
         jobs = {}
         for run in runs:
             if run.encoder and run.encoder != OWN and not run.is_hierarchical:
+                dataset = self.experiment.dataset_of(run)
                 seen = RunConfig(run.env, run.encoder, run.views, pool=run.pool)
-                arguments = {"run": to_mapping(seen), **self._common(seen)}
-                inputs = tuple(self._inputs(seen))
+                arguments = {"run": to_mapping(seen), **self._common(dataset)}
+                inputs = tuple(self._inputs(seen, dataset))
                 jobs[run_key(seen)] = Job("sweep-probe", arguments, inputs, label=LABELS)
         return jobs
 
-    def reference(self, name: str, task: str) -> Job:
-        """Return the job that evaluates the expert, or the replay, on a task."""
-        run = RunConfig(self.grid.config(task), policy=name, starts=self.grid.bank)
+    def reference(self, run: RunConfig) -> Job:
+        """Return the job that evaluates what is not trained: the expert, or the replay."""
+        replayed = self.experiment.dataset_of(run) if run.policy == "replay" else None
         arguments: dict[str, JSON] = {
             "run": to_mapping(run),
-            "dataset": self._dataset(task),
+            "dataset": self._dataset(replayed) if replayed else "",
             **self._where,
         }
-        inputs = (self.dataset_digest(task) or "",) if name == "replay" else ()
+        inputs = (self.dataset_digest(replayed) or "",) if replayed else ()
         return Job("sweep-reference", arguments, inputs, label=LABELS)
 
-    def _dataset(self, task: str) -> str:
-        return str((self.data_folder(task) / "dataset").absolute())
+    def _dataset(self, name: str) -> str:
+        return str((self.data_folder(name) / "dataset").absolute())
 
-    def _common(self, run: RunConfig) -> dict[str, JSON]:
+    def _common(self, dataset: str) -> dict[str, JSON]:
         return {
-            "dataset": self._dataset(run.task),
-            "accept_licence": self.grid.accept_licence,
+            "dataset": self._dataset(dataset),
+            "accept_licence": self.experiment.accept_licence,
             **self._where,
         }
 
-    def _inputs(self, run: RunConfig) -> list[str]:
+    def _inputs(self, run: RunConfig, dataset: str) -> list[str]:
         """Return hashes of what a run reads: its dataset, its encoder, its recipe."""
-        inputs = [self.dataset_digest(run.task) or ""]
+        inputs = [self.dataset_digest(dataset) or ""]
         if run.encoder and run.encoder != OWN:
             inputs.append(_card_digest(run.encoder))
         if run.policy not in LEROBOT_POLICIES:

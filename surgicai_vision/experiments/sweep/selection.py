@@ -4,11 +4,17 @@ A choice maps an axis to values in words: those of `view` are joined by "+", wha
 is "none".
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.experiments.sweep.grid import AXES
 from surgicai_vision.training.run_config import RunConfig
+
+CHOICES: Mapping[str, Callable[[RunConfig], object]] = MappingProxyType(
+    {**AXES, "condition": lambda run: run.condition or None}
+)
+"""What runs are chosen by, and a run's value: the axes of a grid, and the condition of a plan."""
 
 Choice = Mapping[str, frozenset[str]]
 EVERYTHING: Choice = {}
@@ -28,9 +34,9 @@ def read_choice(texts: Iterable[str], runs: Sequence[RunConfig]) -> Choice:
     axis = ""
     for text in texts:
         before, sign, value = text.partition("=")
-        axis = check_name("axis", before, AXES) if sign else axis
+        axis = check_name("axis", before, CHOICES) if sign else axis
         if not axis:
-            raise InputError(f"--only {text}: give AXIS=VALUE,VALUE; axes: {', '.join(AXES)}.")
+            raise InputError(f"--only {text}: give AXIS=VALUE,VALUE; axes: {', '.join(CHOICES)}.")
         known = sorted({_value(run, axis) for run in runs})
         choice.setdefault(axis, set()).add(check_name(axis, value if sign else text, known))
     return {axis: frozenset(values) for axis, values in choice.items()}
@@ -43,7 +49,7 @@ def is_chosen(run: RunConfig, choice: Choice) -> bool:
 
 def _value(run: RunConfig, axis: str) -> str:
     """Return a run's place on an axis in words."""
-    value = AXES[axis](run)
+    value = CHOICES[axis](run)
     if isinstance(value, tuple):
         return "+".join(value) or NONE
     return NONE if value is None else str(value)

@@ -1,0 +1,82 @@
+"""Disturbance: what makes a demonstrator meet states off its own path; light to import.
+
+`surgicai_vision.demos.rollout` says what each kind is for, and runs an episode with it.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core.errors import InputError
+
+if TYPE_CHECKING:
+    from surgicai_vision.envs.base import SuturingEnv
+
+PERTURBATION_STEPS = (8, 25)
+"""Fewest and most control steps of a perturbation: 4 to 12 mm at the paper's step size."""
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What disturbs an episode.
+
+    Attributes:
+        noise: standard deviation of the Gaussian noise on the six motions of an executed action, in
+            units of its range; the jaw has none, since a random walk of it would drop the needle.
+        perturb_start_fraction: share of episodes that start with a motion in a random direction,
+            which is not recorded.
+        noise_from: lowest deviation; each episode draws its own between this and `noise`. None
+            takes `noise` throughout.
+        upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
+    """
+
+    noise: float = 0.0
+    perturb_start_fraction: float = 0.0
+    noise_from: float | None = None
+    upset_fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.noise_from is not None and not 0.0 <= self.noise_from <= self.noise:
+            raise InputError(
+                f"noise_from is {self.noise_from:g}; it must be within 0 and noise, {self.noise:g}."
+            )
+        if not 0.0 <= self.noise <= 1.0 or not 0.0 <= self.perturb_start_fraction <= 1.0:
+            raise InputError(
+                f"noise is {self.noise:g} and perturb_start_fraction "
+                f"{self.perturb_start_fraction:g}; each must be within 0 and 1."
+            )
+        if not 0.0 <= self.upset_fraction <= 1.0:
+            raise InputError(
+                f"upset_fraction is {self.upset_fraction:g}; it must be within 0 and 1."
+            )
+
+    def perturb_start(self, env: "SuturingEnv", rng: np.random.Generator) -> bool:
+        """Move the tool away with the given probability; return False if that ended the episode."""
+        if rng.random() >= self.perturb_start_fraction:
+            return True
+        direction = np.append(rng.uniform(-1.0, 1.0, 6), 0.0).astype(np.float32)
+        for _ in range(rng.integers(*PERTURBATION_STEPS, endpoint=True)):
+            _, _, terminated, truncated, _ = env.step(direction)
+            if terminated or truncated:
+                return False
+        return True
+
+    def draw_deviation(self, rng: np.random.Generator) -> float:
+        """Return the standard deviation of an episode's noise."""
+        if self.noise_from is None:
+            return self.noise
+        return float(rng.uniform(self.noise_from, self.noise))
+
+    @staticmethod
+    def disturb(
+        action: NDArray[np.float32], deviation: float, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """Return what is executed in the place of `action`, (7,)."""
+        noisy = action + np.append(rng.normal(0.0, deviation, 6), 0.0)
+        executed: NDArray[np.float32] = np.clip(noisy, -1.0, 1.0).astype(np.float32)
+        return executed
+
+
+UNDISTURBED = Disturbance()

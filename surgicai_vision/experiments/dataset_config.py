@@ -1,0 +1,112 @@
+"""What a dataset consists of, as data: demonstrations, and the images rendered of them.
+
+A training seed draws its own demonstrations: those of seed s are recorded at the start seeds
+`first_seed(s)`, `first_seed(s)` + 1, …, `SEEDS_EACH` at most. So training seeds share no start,
+and none meets the banks of validation and test. Training seed 0 begins at `names.TRAIN_SEED`.
+"""
+
+from dataclasses import dataclass
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, check_frame_stride
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.demos.demonstrator import SCRIPTED_DEMONSTRATORS
+from surgicai_vision.demos.disturbance import Disturbance
+
+SEEDS_EACH = 20_000
+"""Start seeds that belong to one training seed."""
+TRAINING_SEEDS = 20
+"""Training seeds that have start seeds of their own: the bank of training is below 400,000."""
+MOST_EPISODES = 4_000
+"""Most demonstrations of a dataset: at most four seeds each are tried (`demos.record`), so that all
+are the training seed's own.
+"""
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Demonstrations that policies are trained on, and the images rendered of them.
+
+    Attributes:
+        name: how the policies' `demonstrations` call them.
+        task: the task that is demonstrated.
+        episodes: how many.
+        view: rendered views.
+        demonstrator: who demonstrates.
+        noise: how much what the demonstrator executes is disturbed.
+        upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
+        post_success_steps: control steps an episode goes on after its success.
+        frame_stride: control steps from frame to frame.
+    """
+
+    name: str
+    task: str
+    episodes: int
+    view: tuple[str, ...]
+    demonstrator: str = "expert"
+    noise: float = 0.6
+    post_success_steps: int = 0
+    frame_stride: int = 5
+    upset_fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_name("demonstrator", self.demonstrator, SCRIPTED_DEMONSTRATORS)
+        Disturbance(self.noise, upset_fraction=self.upset_fraction)  # refuses wrong shares
+        check_frame_stride(self.frame_stride)
+        if self.episodes < 1:
+            raise InputError(
+                f"demonstrations {self.name}: episodes is {self.episodes}; it must be at least 1."
+            )
+        if self.post_success_steps < 0:
+            raise InputError(
+                f"post_success_steps is {self.post_success_steps}; it must be at least 0."
+            )
+
+    @property
+    def disturbance(self) -> Disturbance:
+        """What goes wrong in them."""
+        return Disturbance(self.noise, upset_fraction=self.upset_fraction)
+
+    @property
+    def manner(self) -> str:
+        """How is demonstrated, in words."""
+        after = self.post_success_steps
+        parts = [f"by the scripted {self.demonstrator}"]
+        parts += [f"executed with noise {self.noise:g}"] if self.noise else []
+        parts += [f"upset in {self.upset_fraction:.0%}"] if self.upset_fraction else []
+        parts += [f"going on for {after} steps after their success"] if after else []
+        parts += [f"a frame every {self.frame_stride} steps"] if self.frame_stride > 1 else []
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """Everything that decides a dataset.
+
+    Attributes:
+        env: the task and its scene.
+        demonstrations: what is recorded and rendered.
+        size: height and width of the images [px].
+        depth: render depth beside RGB.
+        first_seed: start seed of the first demonstration.
+    """
+
+    env: TaskConfig
+    demonstrations: Demonstrations
+    size: int = 224
+    depth: bool = False
+    first_seed: int = names.TRAIN_SEED
+
+
+def first_seed(training_seed: int) -> int:
+    """Return the first start seed of a training seed's demonstrations.
+
+    Raises:
+        InputError: a training seed that has none of its own.
+    """
+    if not 0 <= training_seed < TRAINING_SEEDS:
+        raise InputError(
+            f"seed is {training_seed}; allowed: 0 to {TRAINING_SEEDS - 1}, the training seeds that "
+            "have demonstrations of their own."
+        )
+    return names.TRAIN_SEED + SEEDS_EACH * training_seed

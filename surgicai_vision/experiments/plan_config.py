@@ -1,0 +1,498 @@
+"""Plan: a set of policies rebuilt from nothing, as data; light to import, for the command line.
+
+A plan is one YAML file that says what is recorded and rendered (`demonstrations`), what is trained
+on what (`policies`), and what is evaluated in which conditions (`conditions`):
+
+    size: 224
+    encoder: imagenet-lite-early         # of every policy that sees and names no other
+    pool: spatial
+    recipe: best                         # likewise
+    seed: [0, 1, 2]                      # training seeds; each draws demonstrations of its own
+    episodes: 100                        # held-out starts of each evaluation
+    demonstrations:
+      - {name: search, task: grasp, episodes: 350, demonstrator: search, view: [front_psm2]}
+      - {name: whole, task: suture, episodes: 160, view: [front_psm1, front_psm2]}
+    policies:
+      - {name: grasp, demonstrations: search, view: [front_psm2]}
+      - {name: place, demonstrations: whole, subtask: place, view: [front_psm2]}
+      - …                                # insert, handoff, pullout
+      - {name: hlp, demonstrations: whole, policy: hlp}
+    procedure: {grasp_hold: 5}           # fields of `HierarchicalConfig`
+    conditions:
+      - {name: standing}                 # every policy that acts, and the whole procedure
+      - {name: moved, policies: [suture], env: {randomisation: {phantom_shift: 10}}}
+      - {name: privileged, policies: [suture], procedure: {termination: privileged}}
+
+A policy takes part in the whole procedure by its name: the five subtasks and `hlp` make `suture`.
+Two commands take a plan:
+
+* `surgicai-vision sweep PLAN.yaml`: every training seed in every condition, in one folder
+  (`experiments.sweep`); a condition's starts are the same for every seed, and the same as those of
+  the other conditions. Seeds and conditions may be added later, in the same folder.
+* `surgicai-vision release --plan PLAN.yaml`: its first training seed alone, counted as trained, as
+  the policies that come with the product (`experiments.release`; `configs/release.yaml`).
+
+Everything a seed's policies are made of depends on that seed: `dataset_config.first_seed` gives
+each demonstrations that no other seed has, and none of them is a start of an evaluation.
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import yaml
+
+from surgicai_vision.core import names
+from surgicai_vision.core.cameras import view_names
+from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
+from surgicai_vision.core.errors import BadFile, InputError, check_name
+from surgicai_vision.core.files import configs_folder
+from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
+from surgicai_vision.experiments.dataset_config import (
+    MOST_EPISODES,
+    DatasetConfig,
+    Demonstrations,
+    first_seed,
+)
+from surgicai_vision.experiments.sweep.experiment import Evaluated, Training
+from surgicai_vision.features import encoders
+from surgicai_vision.training.run_config import BANKS, RunConfig, Starts, with_epochs
+
+HLP = "hlp"
+"""Name of the high-level policy, and of its kind."""
+AS_TRAINED = "as trained"
+"""Name of the only condition of a plan that lists none."""
+
+
+@dataclass(frozen=True)
+class PlannedPolicy:
+    """A policy of a plan.
+
+    Attributes:
+        name: its name.
+        demonstrations: name of what it is trained on.
+        subtask: take one subtask's frames of whole procedures.
+        view: what it sees; nothing for proprioception alone.
+        policy: its kind.
+        encoder: its encoder; None takes the plan's. Likewise `pool` and `recipe`.
+        change: what is changed in the recipe, "key=value" each.
+    """
+
+    name: str
+    demonstrations: str
+    subtask: str | None = None
+    view: tuple[str, ...] = ()
+    policy: str = "bc"
+    encoder: str | None = None
+    pool: str | None = None
+    recipe: str | None = None
+    change: tuple[str, ...] = ()
+
+    @property
+    def acts(self) -> bool:
+        """Whether it can be evaluated by itself; a high-level policy is judged in the whole."""
+        return self.policy != HLP
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What differs in an evaluation from the training.
+
+    Attributes:
+        name: how tables call it.
+        policies: the policies of the plan that are evaluated so, the whole procedure as `suture`;
+            none named are all that act.
+        env: fields of `TaskConfig` in the place of the plan's.
+        procedure: fields of `HierarchicalConfig` in the place of the plan's; `place: expert` puts
+            the expert in for a policy.
+        upset: let one thing go wrong in every episode (`envs.upset`).
+        seed: training seeds that are evaluated so; all by default.
+        episodes: starts; the plan's by default.
+    """
+
+    name: str
+    policies: tuple[str, ...] = ()
+    env: Mapping[str, JSON] = field(default_factory=dict)
+    procedure: Mapping[str, JSON] = field(default_factory=dict)
+    upset: bool = False
+    seed: tuple[int, ...] = ()
+    episodes: int | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is recorded, what is trained on what, and what is evaluated.
+
+    Attributes:
+        size: height and width of the images [px].
+        encoder: the frozen encoder of every policy that names no other.
+        pool: what is taken from it.
+        recipe: the recipe of every policy that names no other.
+        episodes: starts of each evaluation.
+        demonstrations: what is recorded and rendered.
+        policies: what is trained; the five subtasks and the high-level policy make `suture`.
+        seed: training seeds.
+        conditions: what is evaluated how.
+        procedure: when a subtask of the whole procedure ends, as `HierarchicalConfig` has it.
+        epochs: passes over the frames, of every policy; None takes the recipes'.
+        env: fields of `TaskConfig` that differ from the default's, in every task.
+        starts: the bank of the evaluations' starts, one of `BANKS`.
+        expert: evaluate the expert beside the policies, in every condition.
+        accept_licence: accept weights under a non-commercial licence.
+        licence: the policies' licence, where they are released.
+    """
+
+    size: int
+    encoder: str
+    pool: str
+    recipe: str
+    episodes: int
+    demonstrations: tuple[Demonstrations, ...]
+    policies: tuple[PlannedPolicy, ...]
+    seed: tuple[int, ...] = (0,)
+    conditions: tuple[Condition, ...] = (Condition(AS_TRAINED),)
+    procedure: Mapping[str, JSON] = field(default_factory=dict)
+    epochs: int | None = None
+    env: Mapping[str, JSON] = field(default_factory=dict)
+    starts: str = "test"
+    expert: bool = False
+    accept_licence: bool = False
+    licence: str = "MIT"
+
+    def __post_init__(self) -> None:
+        check_name("bank of starts", self.starts, BANKS)
+        _check_different("demonstrations", [recorded.name for recorded in self.demonstrations])
+        _check_different("policies", [policy.name for policy in self.policies])
+        _check_different("conditions", [condition.name for condition in self.conditions])
+        _check_different("seed", self.seed)
+        for seed in self.seed:
+            first_seed(seed)
+        for name, number in (("episodes", self.episodes), ("size", self.size)):
+            if number < 1:
+                raise InputError(f"{name} is {number}; it must be at least 1.")
+        for recorded in self.demonstrations:
+            self.task_config(recorded.task)
+            if recorded.episodes > MOST_EPISODES:
+                raise InputError(
+                    f"demonstrations {recorded.name}: episodes is {recorded.episodes}; "
+                    f"allowed: 1 to {MOST_EPISODES}."
+                )
+        for policy in self.policies:
+            self._check_policy(policy)
+        for condition in self.conditions:
+            self._check_condition(condition)
+        if len(set(self.runs)) != len(self.runs):
+            raise InputError(
+                f"The plan has {len(self.runs)} runs, {len(set(self.runs))} of them different; "
+                "leave out policies that differ in nothing but their names."
+            )
+
+    def _check_policy(self, policy: PlannedPolicy) -> None:
+        """Refuse a policy of what is not recorded, or not rendered."""
+        known = [recorded.name for recorded in self.demonstrations]
+        check_name("demonstrations", policy.demonstrations, known)
+        if policy.subtask is not None:
+            check_name("subtask", policy.subtask, names.SUBTASKS)
+        for view in policy.view:
+            check_name("rendered view", view, self.recorded(policy).view)
+        encoders.check_encoder_name(policy.encoder or self.encoder)
+
+    def _check_condition(self, condition: Condition) -> None:
+        """Refuse a condition of what is not trained, or that no env or procedure can have."""
+        evaluated = [policy.name for policy in self.policies if policy.acts]
+        if names.SUTURE in self.names:
+            evaluated.append(names.SUTURE)
+            self.hierarchical(condition, {})
+        for name in condition.policies:
+            check_name("policy that is evaluated", name, evaluated)
+        for seed in condition.seed:
+            check_name("training seed", str(seed), [str(seed) for seed in self.seed])
+        if condition.episodes is not None and condition.episodes < 1:
+            raise InputError(
+                f"condition {condition.name}: episodes is {condition.episodes}; "
+                "it must be at least 1."
+            )
+        for key in ("task", "advance"):
+            if key in {**self.env, **condition.env}:
+                raise InputError(
+                    f"condition {condition.name}: env has '{key}', which follows from what is "
+                    "evaluated; leave it out."
+                )
+        self.task_config(names.SUTURE, condition)
+
+    def task_config(self, task: str, condition: Condition | None = None) -> TaskConfig:
+        """Return the configuration of a task in the plan's env, or in that of a condition."""
+        other = condition.env if condition else {}
+        return from_mapping(TaskConfig, {**self.env, **other, "task": task}, "env")
+
+    def recorded(self, policy: PlannedPolicy) -> Demonstrations:
+        """Return what a policy is trained on."""
+        return next(each for each in self.demonstrations if each.name == policy.demonstrations)
+
+    def dataset(self, recorded: Demonstrations, seed: int) -> DatasetConfig:
+        """Return the dataset of demonstrations for a training seed."""
+        env = self.task_config(recorded.task)
+        return DatasetConfig(env, recorded, self.size, first_seed=first_seed(seed))
+
+    def training(self, policy: PlannedPolicy, seed: int) -> RunConfig:
+        """Return the training of a policy."""
+        recorded = self.recorded(policy)
+        changes = tuple(
+            change for change in policy.change if not (self.epochs and change.startswith("epochs="))
+        )
+        return RunConfig(
+            self.task_config(policy.subtask or recorded.task),
+            (policy.encoder or self.encoder) if policy.view else None,
+            policy.view,
+            policy=policy.policy,
+            pool=(policy.pool or self.pool) if policy.view else "global",
+            recipe=policy.recipe or self.recipe,
+            changes=with_epochs(changes, self.epochs),
+            demonstrations=recorded.episodes,
+            demonstrator=recorded.demonstrator,
+            noise=recorded.noise,
+            post_success_steps=recorded.post_success_steps,
+            frame_stride=recorded.frame_stride,
+            seed=seed,
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of everything that is built, the whole procedure last."""
+        parts = tuple(policy.name for policy in self.policies)
+        whole = {*names.SUBTASKS, HLP} <= set(parts)
+        return (*parts, names.SUTURE) if whole else parts
+
+    def hierarchical(
+        self, condition: Condition | None, parts: Mapping[str, str]
+    ) -> HierarchicalConfig:
+        """Return the whole procedure's policy in a condition.
+
+        Args:
+            condition: the condition; None takes the plan's own procedure.
+            parts: name of each part → its folder; one that is not given stands for itself.
+        """
+        everyone = {name: name for name in (*names.SUBTASKS, HLP)}
+        other = condition.procedure if condition else {}
+        table = {**everyone, **parts, **self.procedure, **other}
+        return from_mapping(HierarchicalConfig, table, "procedure")
+
+    @property
+    def kind(self) -> str:
+        """The key of `sweep.json` that it is stored under."""
+        return "plan"
+
+    @property
+    def probe(self) -> bool:
+        """Whether features are probed: never."""
+        return False
+
+    @property
+    def runs(self) -> tuple[RunConfig, ...]:
+        """Every policy in every condition, for one training seed after the other."""
+        return tuple(self._evaluated)
+
+    @functools.cached_property
+    def _evaluated(self) -> dict[RunConfig, tuple[str, Condition]]:
+        """Each run → the name of what is evaluated, and the condition."""
+        found: dict[RunConfig, tuple[str, Condition]] = {}
+        evaluated = [policy.name for policy in self.policies if policy.acts]
+        evaluated += [names.SUTURE] if names.SUTURE in self.names else []
+        for seed in self.seed:
+            for condition in self.conditions:
+                if condition.seed and seed not in condition.seed:
+                    continue
+                for name in condition.policies or evaluated:
+                    found[self._run(name, condition, seed)] = (name, condition)
+        return found
+
+    def _run(self, name: str, condition: Condition, seed: int) -> RunConfig:
+        """Return the evaluation of a policy, or of the whole procedure, in a condition."""
+        episodes = condition.episodes or self.episodes
+        starts = Starts(BANKS[self.starts], episodes)
+        if name == names.SUTURE:
+            seen = {view for policy in self._parts for view in policy.view}
+            return RunConfig(
+                self.task_config(name, condition),
+                views=tuple(view for view in view_names() if view in seen),
+                seed=seed,
+                termination=self.hierarchical(condition, {}).termination,
+                parts=self._digest,
+                starts=starts,
+                upset=condition.upset,
+                condition=condition.name,
+            )
+        training = self.training(self._policy(name), seed)
+        env = self.task_config(training.task, condition)
+        return replace(
+            training, env=env, starts=starts, upset=condition.upset, condition=condition.name
+        )
+
+    def _policy(self, name: str) -> PlannedPolicy:
+        return next(policy for policy in self.policies if policy.name == name)
+
+    @property
+    def _parts(self) -> tuple[PlannedPolicy, ...]:
+        """The policies of the whole procedure."""
+        return tuple(self._policy(name) for name in (*names.SUBTASKS, HLP))
+
+    @property
+    def _digest(self) -> str:
+        """Hash of what the whole procedure's policies are but for the training seed."""
+        table = to_mapping(self)
+        decide = ("size", "encoder", "pool", "recipe", "demonstrations", "policies", "procedure")
+        return digest({key: table[key] for key in (*decide, "epochs", "env")})
+
+    @functools.cached_property
+    def datasets(self) -> Mapping[str, DatasetConfig]:
+        """The datasets of every training seed, by their folders' names."""
+        return {
+            _dataset_name(recorded, seed): self.dataset(recorded, seed)
+            for seed in self.seed
+            for recorded in self.demonstrations
+        }
+
+    def dataset_of(self, run: RunConfig) -> str:
+        """Return the name of the dataset of a run's policy."""
+        name, _ = self._evaluated[run]
+        return _dataset_name(self.recorded(self._policy(name)), run.seed)
+
+    def parts(self, run: RunConfig) -> Mapping[str, Training]:
+        """Return the policies that a run evaluates, by their names."""
+        name, condition = self._evaluated[run]
+        if name != names.SUTURE:
+            return {name: self._training(self._policy(name), run.seed)}
+        replaced = {**self.procedure, **condition.procedure}
+        return {
+            policy.name: self._training(policy, run.seed)
+            for policy in self._parts
+            if policy.name not in replaced
+        }
+
+    def _training(self, policy: PlannedPolicy, seed: int) -> Training:
+        dataset = _dataset_name(self.recorded(policy), seed)
+        return Training(self.training(policy, seed), dataset, policy.subtask, encodes_all=False)
+
+    def evaluated(self, run: RunConfig) -> Evaluated:
+        """Return how a run is evaluated."""
+        condition = next(each for each in self.conditions if each.name == run.condition)
+        return Evaluated({**self.env, **condition.env}, {**self.procedure, **condition.procedure})
+
+    def references(self, runs: Sequence[RunConfig]) -> tuple[RunConfig, ...]:
+        """Return the expert on each task and condition of the runs, where it is asked for."""
+        found = {
+            RunConfig(
+                run.env,
+                policy="expert",
+                starts=run.starts,
+                upset=run.upset,
+                condition=run.condition,
+            ): None
+            for run in runs
+            if self.expert
+        }
+        return tuple(found)
+
+    def table(self) -> Mapping[str, JSON]:
+        """Return it as plain data."""
+        return to_mapping(self)
+
+    def extends(self, stored: Mapping[str, JSON]) -> bool:
+        """Return True if `stored` is this plan, but for training seeds and conditions it lacks."""
+        other = plan_of(stored, "the stored plan")
+        return (
+            to_mapping(replace(self, seed=other.seed, conditions=other.conditions)) == stored
+            and set(other.seed) <= set(self.seed)
+            and all(condition in self.conditions for condition in other.conditions)
+        )
+
+    def smaller(
+        self,
+        demonstrations: int | None = None,
+        epochs: int | None = None,
+        episodes: int | None = None,
+        size: int | None = None,
+    ) -> "Plan":
+        """Return the plan with other numbers, to try it in minutes; see `Experiment.smaller`.
+
+        Raises:
+            InputError: a number below 1.
+        """
+        given = {
+            "demonstrations": demonstrations,
+            "epochs": epochs,
+            "episodes": episodes,
+            "size": size,
+        }
+        for name, number in given.items():
+            if number is not None and number < 1:
+                raise InputError(f"{name} is {number}; it must be at least 1.")
+        return replace(
+            self,
+            demonstrations=tuple(
+                replace(each, episodes=demonstrations or each.episodes)
+                for each in self.demonstrations
+            ),
+            conditions=tuple(
+                replace(each, episodes=episodes or each.episodes) for each in self.conditions
+            ),
+            epochs=epochs or self.epochs,
+            episodes=episodes or self.episodes,
+            size=size or self.size,
+        )
+
+    @property
+    def text(self) -> str:
+        """What is done, in words."""
+        recorded = "; ".join(
+            f"{each.episodes} demonstrations of {each.task} {each.manner}"
+            for each in self.demonstrations
+        )
+        seen = {view for policy in self.policies for view in policy.view}
+        views = ", ".join(view for view in view_names() if view in seen) or "no images"
+        seeds = ", ".join(map(str, self.seed))
+        return (
+            f"for each training seed ({seeds}) of its own: {recorded}; {views} at {self.size} × "
+            f"{self.size}; recipe {self.recipe}; {self.episodes} {self.starts} starts from "
+            f"{BANKS[self.starts]}"
+        )
+
+
+def _dataset_name(recorded: Demonstrations, seed: int) -> str:
+    return f"seed{seed}/{recorded.name}"
+
+
+def _check_different(what: str, values: Sequence[object]) -> None:
+    """Refuse an empty list, and a value that is given twice."""
+    if not values or len(set(values)) != len(values):
+        raise InputError(
+            f"{what}: {', '.join(map(str, values)) or 'nothing'} is given; "
+            "give at least one, each once."
+        )
+
+
+def plan_of(table: Mapping[str, object], where: str) -> Plan:
+    """Build a plan from plain data; one training seed may stand without brackets.
+
+    Raises:
+        InputError: a key or a value that is not allowed.
+    """
+    seed = table.get("seed")
+    single = {"seed": [seed]} if isinstance(seed, int) else {}
+    return from_mapping(Plan, {**table, **single}, where)
+
+
+def read_plan(path: Path | None = None) -> Plan:
+    """Read a plan, by default `configs/release.yaml`.
+
+    Raises:
+        BadFile: it cannot be read.
+        InputError: a key or a value that is not allowed.
+    """
+    path = path or configs_folder() / "release.yaml"
+    try:
+        table = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BadFile(f"Cannot read {path}: {' '.join(str(error).split())}.") from None
+    return plan_of(table or {}, str(path))
