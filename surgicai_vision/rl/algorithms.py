@@ -39,6 +39,7 @@ class Algorithm:
         defaults: settings that differ from those of `Settings`.
         needs_demos: it learns from demonstrations.
         is_online: it takes steps in the env.
+        policy: the registered policy that its actor becomes.
     """
 
     library: str
@@ -48,6 +49,7 @@ class Algorithm:
     defaults: Mapping[str, JSON] = field(default_factory=dict)
     needs_demos: bool = False
     is_online: bool = True
+    policy: str = "actor"
 
     @property
     def has_hindsight(self) -> bool:
@@ -60,8 +62,9 @@ class Algorithm:
         return "bc_weight" in self.settings
 
 
-def _offline(kind: str, paper: str, *settings: str, **defaults: JSON) -> Algorithm:
-    return Algorithm(D3RLPY, kind, paper, (*OFFLINE, *settings), defaults, True, False)
+def _offline(kind: str, paper: str, policy: str = "actor") -> Algorithm:
+    """Return an algorithm of d3rlpy."""
+    return Algorithm(D3RLPY, kind, paper, OFFLINE, needs_demos=True, is_online=False, policy=policy)
 
 
 HER = "Andrychowicz et al., Hindsight experience replay, NeurIPS 2017, arXiv:1707.01495"
@@ -109,9 +112,16 @@ ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType(
         "ddpg-her": Algorithm(SB3, "DDPG", HER, (*DETERMINISTIC, *HINDSIGHT), {"critics": 1}),
         "sac-her": Algorithm(SB3, "SAC", HER, (*OFF_POLICY, *HINDSIGHT)),
         "td3-her": Algorithm(SB3, "TD3", HER, (*TWIN_DELAYED, *HINDSIGHT)),
-        "td3-bc": Algorithm(SB3, "TD3", NAIR, (*TWIN_DELAYED, *CLONING), needs_demos=True),
+        "td3-bc": Algorithm(
+            SB3, "TD3", NAIR, (*TWIN_DELAYED, *CLONING), {"tau": 0.01}, needs_demos=True
+        ),
         "td3-her-bc": Algorithm(
-            SB3, "TD3", NAIR, (*TWIN_DELAYED, *HINDSIGHT, *CLONING), needs_demos=True
+            SB3,
+            "TD3",
+            NAIR,
+            (*TWIN_DELAYED, *HINDSIGHT, *CLONING),
+            {"tau": 0.01},
+            needs_demos=True,
         ),
         "rlpd": Algorithm(
             SB3,
@@ -132,6 +142,7 @@ ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType(
             "BCQ",
             "Fujimoto et al., Off-policy deep reinforcement learning without exploration, "
             "ICML 2019, arXiv:1812.02900",
+            "bcq",
         ),
         "iql": _offline(
             "IQL",

@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from policies.base import Policy
+
 State = dict[str, Any]
 """Names → tensors, numbers, texts, or tables of them."""
 
@@ -45,8 +47,8 @@ class Learner(abc.ABC):
         """Go on until `done` is `target` or a little more; return the last losses by name."""
 
     @abc.abstractmethod
-    def layers(self) -> list[nn.Linear]:
-        """Return the linear layers of the actor, in order."""
+    def fill(self, policy: Policy) -> None:
+        """Give a policy of ours (`Algorithm.policy`) the weights of the library's actor."""
 
     @abc.abstractmethod
     def get_state(self) -> State:
@@ -59,6 +61,11 @@ class Learner(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Free envs and processes."""
+
+
+def linear(module: nn.Module) -> list[nn.Linear]:
+    """Return the linear layers of a network, in order."""
+    return [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
 
 
 def random_state() -> State:

@@ -13,7 +13,15 @@ from d3rlpy.models.encoders import VectorEncoderFactory
 from numpy.typing import NDArray
 from torch import nn
 
-from surgicai_vision.rl.learner import Learner, State, random_state, set_random_state
+from policies.actor import FLEXIBILITY, Actor, BatchConstrained
+from policies.base import Policy
+from surgicai_vision.rl.learner import (
+    Learner,
+    State,
+    linear,
+    random_state,
+    set_random_state,
+)
 from surgicai_vision.rl.settings import Request, Settings
 from surgicai_vision.rl.transitions import Transitions
 
@@ -52,6 +60,7 @@ def _bcq(settings: Settings) -> Any:
         imitator_encoder_factory=encoder,
         n_critics=settings.critics,
         n_action_samples=settings.samples,
+        action_flexibility=FLEXIBILITY,
         **_actor_critic(settings),
     )
 
@@ -126,21 +135,20 @@ class OfflineLearner(Learner):
                 losses.setdefault(name, []).append(float(value))
         return {name: float(np.mean(values)) for name, values in losses.items()}
 
-    def layers(self) -> list[nn.Linear]:
-        """Return the linear layers of the actor, in order."""
-        policy = self.policy
-        head = policy._mu if hasattr(policy, "_mu") else policy._fc
-        return [m for m in policy._encoder.modules() if isinstance(m, nn.Linear)] + [head]
+    def fill(self, policy: Policy) -> None:
+        """Give a policy of ours the weights of the library's actor."""
+        impl = self._algo.impl
+        if isinstance(policy, BatchConstrained):
+            parts = (impl.modules.vae_decoder, impl.modules.policy, impl.modules.q_funcs[0])
+            policy.take([_layers(part) for part in parts], self.mean, self.std)
+            return
+        assert isinstance(policy, Actor)
+        policy.take(_layers(impl.policy), self.mean, self.std)
 
-    @property
-    def policy(self) -> Any:
-        """The library's actor."""
-        return self._algo.impl.policy
-
-    @property
-    def modules(self) -> Any:
-        """All networks and optimisers of the algorithm, as the library names them."""
-        return self._algo.impl.modules
+    def greedy(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the library's own greedy actions for standardised inputs (B, n)."""
+        actions: NDArray[np.float32] = self._algo.predict(rows)
+        return actions
 
     def get_state(self) -> State:
         """Return networks, optimisers, counter and random state."""
@@ -164,3 +172,9 @@ class OfflineLearner(Learner):
 
     def close(self) -> None:
         """Nothing to free."""
+
+
+def _layers(module: Any) -> list[nn.Linear]:
+    """Return the linear layers of a network of the library's, from its input to its answer."""
+    head = module._mu if hasattr(module, "_mu") else module._fc
+    return [*linear(module._encoder), head]

@@ -19,9 +19,18 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
 from torch import nn
 
+from policies.actor import Actor
+from policies.base import Policy
 from surgicai_vision.rl.buffers import HindsightBuffer, MixedBuffer, demonstrations_of
 from surgicai_vision.rl.extractor import RelativeExtractor, StandardExtractor
-from surgicai_vision.rl.learner import Arrays, Learner, State, random_state, set_random_state
+from surgicai_vision.rl.learner import (
+    Arrays,
+    Learner,
+    State,
+    linear,
+    random_state,
+    set_random_state,
+)
 from surgicai_vision.rl.nair import DemonstrationTD3
 from surgicai_vision.rl.rlpd import LayerNormPolicy
 from surgicai_vision.rl.settings import Request
@@ -177,17 +186,17 @@ class OnlineLearner(Learner):
         successes = self.model.ep_success_buffer
         return {"training success": float(np.mean(successes))} if successes else {}
 
-    def layers(self) -> list[nn.Linear]:
-        """Return the linear layers of the actor, in order."""
-        policy: Any = self.model.policy
+    def fill(self, policy: Policy) -> None:
+        """Give an actor of ours the weights of the model's."""
+        model: Any = self.model.policy
         if isinstance(self.model, PPO):
-            parts = [policy.mlp_extractor.policy_net, policy.action_net]
+            parts = [model.mlp_extractor.policy_net, model.action_net]
         elif isinstance(self.model, TD3):  # DDPG too
-            parts = [policy.actor.mu]
+            parts = [model.actor.mu]
         else:
-            parts = [policy.actor.latent_pi, policy.actor.mu]
-        modules = [module for part in parts for module in part.modules()]
-        return [module for module in modules if isinstance(module, nn.Linear)]
+            parts = [model.actor.latent_pi, model.actor.mu]
+        assert isinstance(policy, Actor)
+        policy.take([layer for part in parts for layer in linear(part)], self.mean, self.std)
 
     # -- the whole state ---------------------------------------------------------------------------
 

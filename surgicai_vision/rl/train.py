@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from policies.actor import VECTORS, Actor, ActorRecipe
+from policies.actor import VECTORS, ActorRecipe
+from policies.base import Policy
 from surgicai_vision import __version__, envs
 from surgicai_vision.core import names, processes
 from surgicai_vision.core.config import to_mapping
@@ -38,6 +39,7 @@ from surgicai_vision.training.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
+from surgicai_vision.training.policies import policy_plugin
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
 
@@ -321,10 +323,10 @@ def actor_recipe(request: Request, squash: str) -> ActorRecipe:
     )
 
 
-def actor_of(request: Request, learner: Learner) -> Actor:
+def actor_of(request: Request, learner: Learner) -> Policy:
     """Return the learner's actor as a policy of ours."""
-    actor = Actor(actor_recipe(request, learner.squash), ())
-    actor.take(learner.layers(), learner.mean, learner.std)
+    actor = policy_plugin(request.algorithm.policy).make(actor_recipe(request, learner.squash), ())
+    learner.fill(actor)
     actor.eval().requires_grad_(False)
     return actor
 
@@ -360,7 +362,7 @@ def run_of(request: Request) -> RunConfig:
     """Return the run that a request is."""
     return RunConfig(
         env=request.env,
-        policy="actor",
+        policy=request.algorithm.policy,
         privileged=request.observation == "state",
         recipe="rl",
         changes=request.changes,

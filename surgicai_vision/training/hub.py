@@ -141,6 +141,12 @@ def _facts(checkpoint: Checkpoint) -> dict[str, str]:
         "scene, sha256": f"`{build_scene(checkpoint.task.scene).hash}`",
         "policy, sha256": f"`{checkpoint.policy_sha256}`",
     }
+    run = checkpoint.run
+    if run.algo:
+        learned = f"{run.env_steps} control steps" if run.env_steps else f"{run.updates} updates"
+        facts["policy"] = f"`{checkpoint.policy}`, algorithm `{run.algo}`, {learned}"
+        facts["data"] = f"{run.demonstrations or 'no'} demonstrations"
+        facts["sees"] = f"the state with the goal ({run.inputs}), in simulation alone"
     if encoder is not None:
         facts["encoder"] = (
             f"`{encoder.name}`, pool {encoder.pool}, frozen and not part of this repository; "

@@ -33,7 +33,12 @@ if TYPE_CHECKING:
 POLICIES: Final = Registry["Plugin"](
     "policy",
     POLICIES_GROUP,
-    {"bc": "policies.bc:BC", "hlp": "policies.hlp:HLP", "actor": "policies.actor:ACTOR"},
+    {
+        "bc": "policies.bc:BC",
+        "hlp": "policies.hlp:HLP",
+        "actor": "policies.actor:ACTOR",
+        "bcq": "policies.actor:BCQ",
+    },
 )
 """Policy name → its `policies.base.Plugin`."""
 

@@ -1,0 +1,222 @@
+"""Training: every algorithm leaves a checkpoint that every verb takes; a kill costs no result."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from policies.actor import VECTORS
+from surgicai_vision import envs
+from surgicai_vision.commands.main import main
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
+from surgicai_vision.demos.store import demos_digest, list_demos
+from surgicai_vision.evaluation.policy_spec import open_policy
+from surgicai_vision.rl import train as training
+from surgicai_vision.rl.algorithms import ALGORITHMS
+from surgicai_vision.rl.settings import Request, Settings, settings_of
+from surgicai_vision.rl.train import train
+from surgicai_vision.training.policies import load_policy
+
+SMALL = {"hidden": [16, 16], "batch_size": 16}
+LIMIT = 8
+
+
+def request_of(algo, demos, task="grasp", **changes):
+    algorithm = ALGORITHMS[algo]
+    paths = list_demos(demos[task]) if algorithm.needs_demos else []
+    small = SMALL | ({"rollout": 24} if algo == "ppo" else {})
+    if "learning_starts" in algorithm.settings:
+        small["learning_starts"] = LIMIT + 2
+    # Demonstrations are longer than an episode of this env; they are replayed in their own limit.
+    env = TaskConfig(task) if algorithm.needs_demos else TaskConfig(task, max_steps=LIMIT)
+    request = Request(
+        algo=algo,
+        env=env,
+        settings=settings_of(algo, small),
+        env_steps=48 if algorithm.is_online else 0,
+        updates=0 if algorithm.is_online else 12,
+        demonstrations=len(paths),
+        demos=demos_digest(paths) if paths else "",
+        validation=0,
+        save_every=24 if algorithm.is_online else 6,
+    )
+    if algorithm.is_online and algorithm.needs_demos and algorithm.has_hindsight:
+        # an episode must end before hindsight looks back at it
+        settings = replace(request.settings, learning_starts=205)
+        request = replace(request, settings=settings, env_steps=212, save_every=206)
+    return replace(request, **changes), paths
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_algorithm_leaves_a_policy_that_acts_as_the_librarys(algo, demos, tmp_path):
+    request, paths = request_of(algo, demos)
+    kept = []
+    original = training._write
+
+    def write(asked, learner, out):
+        kept.append(library_actions(learner, seen))
+        return original(asked, learner, out)
+
+    env = envs.make(request.env, "goal")
+    shown = envs.make(request.env, "relative")
+    env.reset(seed=3)
+    shown.reset(seed=3)
+    moves = np.random.default_rng(0).uniform(-1, 1, (5, 7)).astype(np.float32)
+    seen = [(env.step(move)[0], shown.step(move)[0]) for move in moves]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "_write", write)
+        checkpoint = train(request, paths, tmp_path / "out", tensorboard=False)
+    policy = load_policy(tmp_path / "out")
+    assert policy.inputs.vector == VECTORS["relative"]
+    ours = policy.act(None, np.stack([relative for _, relative in seen]))
+    assert np.abs(ours).max() <= 1
+    assert np.allclose(ours, kept[0], atol=2e-5)
+    assert checkpoint.run.algo == algo and checkpoint.run.name == f"{algo}-relative"
+    assert set(checkpoint.recipe["settings"]) == set(ALGORITHMS[algo].settings)
+    spec = open_policy(tmp_path / "out")
+    assert spec.run == checkpoint.run and spec.config == request.env
+    assert not (tmp_path / "out" / training.STATE).exists()
+
+
+def library_actions(learner, seen):
+    """What the library's own model does, greedily."""
+    relative = np.stack([row for _, row in seen])
+    if hasattr(learner, "model"):
+        has_goal = learner.request.algorithm.has_hindsight
+        goals = {key: np.stack([row[key] for row, _ in seen]) for key in seen[0][0]}
+        return learner.model.predict(goals if has_goal else relative, deterministic=True)[0]
+    standard = ((relative - learner.mean.numpy()) / learner.std.numpy()).astype(np.float32)
+    if learner.request.algo != "bcq":
+        return learner.greedy(standard)
+    # The library draws anew each time: its own networks, with the draws that are stored.
+    modules = learner._algo.impl.modules
+    draws = training.actor_of(learner.request, learner).draws
+    chosen = []
+    with torch.no_grad():
+        for row in torch.from_numpy(standard):
+            rows = row.expand(len(draws), -1)
+            actions = modules.policy(rows, modules.vae_decoder(rows, draws)).squashed_mu
+            chosen.append(actions[modules.q_funcs[0](rows, actions).q_value.argmax()])
+    return torch.stack(chosen).numpy()
+
+
+class Killed(BaseException):
+    """What ends a training in the middle."""
+
+
+@pytest.mark.parametrize("algo", ["td3-her-bc", "rlpd", "ppo", "td3-her", "iql", "tqc"])
+def test_a_killed_training_ends_as_if_it_had_not_been_killed(algo, demos, tmp_path):
+    request, paths = request_of(algo, demos)
+    if algo == "td3-her-bc":
+        request = replace(request, env_steps=224, save_every=216)  # in the middle of an episode
+    whole = train(request, paths, tmp_path / "whole", tensorboard=False)
+
+    def kill(done, total, unit=""):
+        if 0 < done < total:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(request, paths, tmp_path / "killed", progress=kill, tensorboard=False)
+    assert (tmp_path / "killed" / training.STATE).exists()
+    started = []
+    resumed = train(
+        request,
+        paths,
+        tmp_path / "killed",
+        progress=lambda done, *_: started.append(done),
+        tensorboard=False,
+    )
+    assert 0 < started[0] < request.total  # it went on
+    assert resumed.policy_sha256 == whole.policy_sha256
+
+
+def test_workers_change_no_result(demos, tmp_path):
+    request, _ = request_of("td3", demos)
+    settings = replace(request.settings, envs=2)
+    request = replace(request, settings=settings)
+    hashes = {
+        train(
+            request, [], tmp_path / str(workers), workers=workers, tensorboard=False
+        ).policy_sha256
+        for workers in (0, 1, 2)
+    }
+    assert len(hashes) == 1
+    other = train(replace(request, seed=1), [], tmp_path / "other", tensorboard=False)
+    assert other.policy_sha256 not in hashes
+
+
+def test_the_verb_trains_seeds_side_by_side_and_evaluate_takes_them(
+    demos, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    given = ["train", "--algo", "bc", "--demos", str(demos["grasp"]), "--updates", "4"]
+    given += ["--change", "hidden=[8],batch_size=8", "--validation", "1", "--save-every", "2"]
+    assert main([*given, "--seeds", "2", "--workers", "2", "--json"]) == 0
+    outs = json.loads(capsys.readouterr().out.splitlines()[-1])["checkpoints"]
+    assert len(outs) == 2
+    for out in outs:
+        curve = json.loads((tmp_path / out / training.CURVE).read_text())
+        assert [point["updates"] for point in curve] == [2, 4]
+        assert all(point["episodes"] == 1 for point in curve)
+    assert main(["evaluate", outs[1], "--episodes", "1", "--workers", "1"]) == 0
+    assert "on grasp: 0/1" in capsys.readouterr().out
+    assert list(tmp_path.glob("outputs/train/*-tensorboard/events*"))
+
+
+def test_what_cannot_be_trained_is_refused_before_any_work(demos, tmp_path, capsys):
+    def refused(*options):
+        assert main(["train", "--algo", *options, "--out", str(tmp_path / "no")]) == 2
+        assert not (tmp_path / "no").exists()
+        return capsys.readouterr().err
+
+    assert "bc_weight" in refused("sac", "--change", "bc_weight=0.2")
+    assert "no demonstrations" in refused("sac", "--demos", str(demos["grasp"]))
+    assert "give observation relative" in refused("td3-her", "--observation", "state")
+    assert "imitation" in refused("sac", "--view", "front")
+    assert "several" in refused("td3-her", "--task", "suture")
+    with pytest.raises(UnknownName, match="td3"):
+        settings_of("td4", {})
+    with pytest.raises(InputError, match="gamma is 1"):
+        Settings(gamma=1.0)
+    request, _ = request_of("bc", demos)
+    train(request, list_demos(demos["grasp"]), tmp_path / "a", tensorboard=False)
+    with pytest.raises(OutputExists, match="another training"):
+        train(replace(request, seed=1), list_demos(demos["grasp"]), tmp_path / "a")
+
+
+def test_a_missing_extra_is_one_clear_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: None)
+    assert main(["train", "--algo", "sac", "--out", str(tmp_path / "no")]) == 2
+    error = capsys.readouterr().err
+    assert "--algo sac needs the extra 'rl'" in error and len(error.strip().splitlines()) == 1
+
+
+def test_importing_the_verb_imports_no_library_of_the_extra(tmp_path):
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, surgicai_vision.commands.train, surgicai_vision.rl.settings\n"
+        "assert not {'stable_baselines3', 'd3rlpy', 'torch'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path)
+
+
+def test_whether_a_relabelled_goal_keeps_its_demand_follows_the_task():
+    def keeps(task, **changes):
+        settings = settings_of("td3-her", changes)
+        return Request("td3-her", TaskConfig(task), settings=settings, env_steps=1).keeps_demand
+
+    assert [keeps(task) for task in ("grasp", "place", "insert", "handoff", "pullout")] == [
+        False, False, True, False, True,
+    ]  # fmt: skip
+    assert keeps("grasp", relabel_demand="kept") and not keeps("insert", relabel_demand="achieved")
+
+
+def test_statistics_are_finite_and_floored(demos):
+    request, paths = request_of("bc", demos)
+    learner = training._learner(request, paths, 0)
+    assert torch.isfinite(learner.mean).all() and (learner.std >= training.SMALLEST_STD).all()
