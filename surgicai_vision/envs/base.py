@@ -31,6 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError, check_name
+from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.envs import hole_crossing, observation, poses, randomisation
 from surgicai_vision.envs.calibration import Calibration
@@ -38,7 +39,6 @@ from surgicai_vision.envs.camera_rig import Images
 from surgicai_vision.envs.control import Command, StepSize
 from surgicai_vision.envs.feasibility import refuse_impossible
 from surgicai_vision.envs.geometry import Stitch
-from surgicai_vision.envs.lazy_frames import LazyFrames
 from surgicai_vision.envs.observation import ObservationConfig
 from surgicai_vision.envs.relative import relative_features
 from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
@@ -434,11 +434,11 @@ class SuturingEnv(gymnasium.Env):
             return self._relative_state(target)
         beside = {"agent_pos": self.agent_pos()} if self.view.shows_agent_pos else {}
         if self._defers:
-            return LazyFrames(self._makers(), beside)
+            return LazyMapping(self._makers(), beside)
         return self._images.look(self.view) | beside
 
     def defer_images(self) -> None:
-        """Render each image of an observation when it is first looked at (`envs.lazy_frames`).
+        """Render each image of an observation when it is first looked at (`core.lazy`).
 
         For who looks at few of many views; an observation is then no plain dict.
         """

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.cameras import camera_number
-from surgicai_vision.envs.lazy_frames import LazyFrames
+from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
@@ -171,4 +171,4 @@ class CorruptedAgent(Agent):
             else functools.partial(frame_of, observation, key)
             for key in observation
         }
-        return LazyFrames(makers, {})
+        return LazyMapping(makers, {})
