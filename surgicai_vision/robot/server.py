@@ -50,6 +50,7 @@ from surgicai_vision.robot.messages import (
     StringStamped,
     TwistStamped,
 )
+from surgicai_vision.robot.recorder import Recorder
 from surgicai_vision.robot.simulated import PSM_NAMES, SimulatedRobot
 from surgicai_vision.robot.transport import Inbox, Publish, Received, Transport
 from surgicai_vision.scene.kinematics import Joints, forward_flat
@@ -107,13 +108,21 @@ class Server:
         robot: the robot, after its first reset.
         transport: carries the messages.
         config: what is published, and when.
+        recorder: records what clients do; None records nothing.
 
     Attributes:
         lateness: how late each control step of a real-time run began [s].
     """
 
-    def __init__(self, robot: SimulatedRobot, transport: Transport, config: ServeConfig):
+    def __init__(
+        self,
+        robot: SimulatedRobot,
+        transport: Transport,
+        config: ServeConfig,
+        recorder: Recorder | None = None,
+    ):
         self.robot = robot
+        self._recorder = recorder
         self.config = config
         self.lateness: list[float] = []
         self._transport = transport
@@ -283,7 +292,11 @@ class Server:
             target = psm.advance(seconds, self.robot.state(name))
             if target is not None:
                 targets[name] = target
+        if self._recorder is not None:
+            self._recorder.before_step()
         self.robot.step(targets, halfway)
+        if self._recorder is not None:
+            self._recorder.after_step()
         if self.robot.info["physics_error"]:
             for psm in self._psms.values():
                 if psm.operating.may_move:
@@ -292,6 +305,8 @@ class Server:
     def _reset(self, seed: int) -> None:
         """Begin another episode; arms that may move go on obeying, without what they were told."""
         self.robot.reset(seed)
+        if self._recorder is not None:
+            self._recorder.begin()
         for psm in self._psms.values():
             psm.forget()
 

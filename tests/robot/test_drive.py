@@ -5,6 +5,8 @@ import functools
 import io
 import json
 import math
+import os
+import pty
 
 import numpy as np
 import pytest
@@ -15,12 +17,14 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.expert import Expert
+from surgicai_vision.demos.store import list_demos, read_demo
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import ExpertAgent, RandomAgent
 from surgicai_vision.robot import topics
 from surgicai_vision.robot.client import Client, ClientConfig
+from surgicai_vision.robot.dead_man import HeldKey, HeldPedal
 from surgicai_vision.robot.driver import DriveConfig, DrivenRobot, Driver
 from surgicai_vision.robot.guards import (
     GuardConfig,
@@ -29,10 +33,12 @@ from surgicai_vision.robot.guards import (
     TargetGuard,
     problem_of_inputs,
 )
-from surgicai_vision.robot.messages import Header, StringStamped
+from surgicai_vision.robot.messages import Header, Joy, StringStamped
+from surgicai_vision.robot.recorder import Recorder
 from surgicai_vision.robot.server import ServeConfig, Server
 from surgicai_vision.robot.simulated import SimulatedRobot
 from surgicai_vision.scene import kinematics
+from surgicai_vision.teleoperation.recordings import open_recordings
 
 SEED = 900_003
 SIMULATED = DriveConfig(GuardConfig(), sends=True, is_simulated=True, is_stepped=True)
@@ -47,12 +53,13 @@ def env_of(task):
 class Served(MemoryTransport):
     """A transport at whose other end a stepped server is asked whenever the client waits."""
 
-    def __init__(self, task, views=()):
+    def __init__(self, task, views=(), recordings=None, tell=None):
         super().__init__()
         self.robot = SimulatedRobot(env_of(task))
         self.robot.reset(SEED)
         config = ServeConfig("stepped", views=views, size=(64, 64))
-        self.server = Server(self.robot, self, config)
+        recorder = Recorder(self.robot, recordings, tell) if recordings else None
+        self.server = Server(self.robot, self, config, recorder)
         self.server.__enter__()
 
     def wait(self, seconds):
@@ -150,6 +157,31 @@ def test_a_whole_procedure_succeeds_as_in_process():
     assert {line["phase"] for line in let_go} == {4}
 
 
+def test_what_a_client_does_is_recorded_as_it_was_told(tmp_path):
+    """Actions of the record are those that the client added; states are the simulation's."""
+    env = env_of("grasp")
+    env.reset(seed=SEED)
+    expert = Expert(env)
+    rows = []
+    ended = False
+    while not ended:
+        rows.append((-1, expert.action()))
+        _, _, ended, _, info = env.step(rows[-1][1])
+    assert info["is_success"]
+    told = []
+    with open_recordings(tmp_path / "demos", env.config, env.scene.hash) as recordings:
+        served = Served("grasp", recordings=recordings, tell=told.append)
+        episode, _, _, _ = drive(Script(rows), "grasp", 300, transport=served)
+    assert episode.success
+    demo = read_demo(list_demos(tmp_path / "demos")[0])
+    assert np.allclose(demo.action, [action for _, action in rows], atol=1e-5)
+    assert demo.success[-1]
+    assert demo.demonstrator == "robot"
+    assert demo.seed == SEED
+    assert np.array_equal(demo.state[-1], served.robot.env.get_state())
+    assert "0 % of them clipped" in told[0]
+
+
 def test_images_reach_the_agent_as_they_were_rendered():
     script = Script([(-1, np.zeros(7))] * 2, cameras=("front",))
     drive(script, "grasp", 2, views=("front",))
@@ -177,6 +209,34 @@ def test_nothing_is_sent_while_the_switch_is_not_held():
     assert [line["sent"] for line in lines] == [True, True, False, False, True]
     assert episode.held == 2
     assert "held: the dead-man's switch is not held" in told
+
+
+def test_a_pedal_counts_only_while_it_is_sent_anew():
+    transport = MemoryTransport()
+    pedal = HeldPedal(transport, "/pedal")
+    say = transport.publisher(topics.Topic("/pedal", Joy))
+    assert pedal.age() == math.inf
+    say(Joy(Header(), (), (1,)))
+    assert pedal.age() < 0.5
+    say(Joy(Header(), (), (0,)))
+    assert pedal.age() == math.inf
+
+
+def test_the_space_bar_of_a_terminal_is_a_switch(monkeypatch):
+    master, slave = pty.openpty()
+    with os.fdopen(slave) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        with HeldKey() as key:
+            assert key.age() == math.inf
+            os.write(master, b"x")
+            assert key.age() == math.inf
+            os.write(master, b"   ")
+            assert key.age() < 0.5
+    os.close(master)
+    with open(os.devnull) as nothing:
+        monkeypatch.setattr("sys.stdin", nothing)
+        with pytest.raises(InputError, match="no terminal"):
+            HeldKey()
 
 
 @pytest.mark.parametrize(("command", "ends"), [("pause", False), ("disable", True)])

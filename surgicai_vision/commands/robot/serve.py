@@ -1,13 +1,17 @@
 """`robot serve`: the simulation as a dVRK that speaks CRTK."""
 
 import dataclasses
+from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, Parameter, validators
 
+from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
+    DIRECTORY,
     FILE_ONLY,
     IMAGE_SIZE,
     NOT_NEGATIVE,
@@ -18,7 +22,7 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.commands.robot.network import INTERFACE, TRANSPORT, Domain, ros_domain
 from surgicai_vision.core import names
-from surgicai_vision.core.config import ADVANCES
+from surgicai_vision.core.config import ADVANCES, TaskConfig
 from surgicai_vision.core.processes import Terminated
 
 app = App(
@@ -29,6 +33,9 @@ example:
 
 It serves until Ctrl-C. docs/robot.md lists the topics; the extra `ros` is needed.""",
 )
+
+SECONDS = 60.0
+"""Time that a recorded subtask may take [s], as in `teleoperate`."""
 
 
 @Parameter(name="*")
@@ -46,6 +53,7 @@ class Options:
         compressed: Publish JPEG files besides the raw images.
         advance: How the judge of the whole procedure goes on: by the present subtask's success, or
             told on /simulation/enter, as a hierarchical policy with learned ends needs it.
+        record: Folder of demonstrations: keep every episode, from a reset to its success.
         truth: Publish the needle's pose and the subtask under way, which no robot knows.
         transport: What carries the messages.
         interface: See above.
@@ -63,6 +71,7 @@ class Options:
     ] = 25.0
     compressed: bool = False
     advance: Annotated[str, Parameter(choices=ADVANCES)] = ADVANCES[0]
+    record: Annotated[Path | None, DIRECTORY, default_text("keep nothing")] = None
     truth: bool = False
     transport: Annotated[str, TRANSPORT] = "cyclonedds"
     interface: Annotated[str, INTERFACE] = "lo"
@@ -79,9 +88,12 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     import numpy as np
 
     from surgicai_vision import envs
+    from surgicai_vision.demos.store import MARKER
+    from surgicai_vision.robot.recorder import Recorder
     from surgicai_vision.robot.server import ServeConfig, Server
     from surgicai_vision.robot.simulated import SimulatedRobot
     from surgicai_vision.robot.transport import LOOPBACK, open_transport
+    from surgicai_vision.teleoperation.recordings import open_recordings
 
     domain = ros_domain(options.domain)
     config = ServeConfig(
@@ -92,13 +104,23 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         options.compressed,
         options.truth,
     )
-    with open_transport(options.transport, options.interface, domain) as transport:
-        task = dataclasses.replace(task_config(options.task, options.env), advance=options.advance)
-        env = envs.make(task)
+    if options.record is not None:
+        folders.check_folder(options.record, MARKER, "--record")
+    with ExitStack() as stack:
+        transport = stack.enter_context(
+            open_transport(options.transport, options.interface, domain)
+        )
+        env = envs.make(_task(options))
         robot = SimulatedRobot(env)
         robot.reset(options.seed)
+        recorder = None
+        if options.record is not None:
+            recordings = stack.enter_context(
+                open_recordings(options.record, env.config, env.scene.hash)
+            )
+            recorder = Recorder(robot, recordings, console.note)
         limit = None if options.seconds is None else round(options.seconds * names.FPS)
-        with Server(robot, transport, config) as server:
+        with Server(robot, transport, config, recorder) as server:
             reach = (
                 "this machine alone"
                 if options.interface == LOOPBACK
@@ -127,3 +149,12 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         "late_ms_median": float(np.median(late)),
         "late_ms_p99": float(np.percentile(late, 99)),
     }
+
+
+def _task(options: Options) -> TaskConfig:
+    """Return the task; what is recorded may take the time that a person needs."""
+    task = dataclasses.replace(task_config(options.task, options.env), advance=options.advance)
+    if options.record is None or (options.env or {}).get("max_steps"):
+        return task
+    subtasks = len(names.SUBTASKS) if options.task == names.SUTURE else 1
+    return dataclasses.replace(task, max_steps=round(SECONDS * names.FPS) * subtasks)
