@@ -51,6 +51,7 @@ PACKAGES = {
     "surgicai_vision.training": "policy: training and checkpoints",
     "policies": "policy: the policies themselves",
     "surgicai_vision.evaluation": "evaluation: rollouts, measures, statistics, robustness",
+    "surgicai_vision.rl": "reinforcement and offline learning, by the libraries of the extra rl",
     "surgicai_vision.report": "report: one page from stored results",
     "surgicai_vision.experiments": "whole runs: quickstart, sweep, DAgger",
 }

@@ -139,7 +139,7 @@ class Slot:
                 self.watch.update(self.info)
         if self.info.get("physics_error"):
             self.error, self.diverged = self.error or "the physics diverged", True
-        self.steps += 1
+        self.steps += self.task_config.action_repeat
         self.touched = self.touched or bool(self.info.get("contact"))
         self.ended = bool(
             terminated or truncated or self.error or self.steps >= self.task_config.max_steps

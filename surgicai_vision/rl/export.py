@@ -26,7 +26,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from surgicai_vision.core.errors import check_name
+from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.files import write_bytes, write_json
 from surgicai_vision.core.tasks import env_id
 from surgicai_vision.envs.observation import ObservationConfig
@@ -177,7 +177,15 @@ def fill(buffer: "BaseBuffer", transitions: Transitions) -> None:
     Args:
         buffer: a `ReplayBuffer`, or a `HerReplayBuffer` where they are goal dicts.
         transitions: whose observations the buffer's space holds.
+
+    Raises:
+        InputError: a buffer of several envs.
     """
+    if buffer.n_envs != 1:
+        raise InputError(
+            f"The buffer is for {buffer.n_envs} envs side by side, and demonstrations are one "
+            "sequence; give a model of one env."
+        )
     last = ends(transitions)
     for row in range(len(transitions)):
         buffer.add(

@@ -27,12 +27,14 @@ from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
 from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.envs.relative import relative_features
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.rollout import run_share
 from surgicai_vision.rl.extra import check_extra
 from surgicai_vision.rl.learner import Learner
 from surgicai_vision.rl.settings import Request, read_by
 from surgicai_vision.rl.transitions import Transitions, of_demos
+from surgicai_vision.scene.kinematics import base_in_world
 from surgicai_vision.training.checkpoint import (
     CARD,
     Checkpoint,
@@ -184,7 +186,7 @@ def _learner(request: Request, demos: Sequence[Path], workers: int) -> Learner:
     if algorithm.needs_demos:
         obs_type = "goal" if algorithm.has_hindsight else request.observation
         transitions = of_demos(demos, request.env, obs_type)
-    mean, std = _statistics(request, demos if algorithm.needs_demos else (), transitions)
+    mean, std = _statistics(request, transitions)
     if algorithm.is_online:
         from surgicai_vision.rl.online import OnlineLearner
 
@@ -196,13 +198,19 @@ def _learner(request: Request, demos: Sequence[Path], workers: int) -> Learner:
 
 
 def _statistics(
-    request: Request, demos: Sequence[Path], transitions: Transitions | None
+    request: Request, transitions: Transitions | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return mean and standard deviation of the inputs: of demonstrations, else of random play."""
     if transitions is None:
         rows = _random_play(request)
     elif transitions.is_goal:
-        rows = of_demos(demos, request.env, request.observation).vector
+        seen = transitions.observation
+        rows = relative_features(
+            seen["observation"],
+            seen["achieved_goal"],
+            seen["desired_goal"],
+            base_in_world(names.ACTIVE_ARM[request.env.task])[:3, :3],
+        )
     else:
         rows = transitions.vector
     values = rows.astype(np.float64)

@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from policies.actor import VECTORS
 from surgicai_vision import envs
 from surgicai_vision.commands.main import main
+from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
 from surgicai_vision.demos.store import demos_digest, list_demos
@@ -164,6 +166,24 @@ def test_the_verb_trains_seeds_side_by_side_and_evaluate_takes_them(
     assert main(["evaluate", outs[1], "--episodes", "1", "--workers", "1"]) == 0
     assert "on grasp: 0/1" in capsys.readouterr().out
     assert list(tmp_path.glob("outputs/train/*-tensorboard/events*"))
+
+
+def test_an_actor_is_a_low_level_policy_of_a_hierarchical_one(demos, tmp_path):
+    request, paths = request_of("bc", demos, "insert", updates=2)
+    train(request, paths, tmp_path / "insert", tensorboard=False)
+    low = dict.fromkeys(names.SUBTASKS, "expert") | {"insert": str(tmp_path / "insert")}
+    text = yaml.safe_dump({**low, "termination": "privileged"})
+    (tmp_path / "h.yaml").write_text(text)
+    spec = open_policy(tmp_path / "h.yaml")
+    assert spec.config == TaskConfig("suture")
+    agent = spec.make_agent()
+    assert agent.privileged and not agent.cameras
+    env = envs.make(spec.config)
+    observation, _ = env.reset(seed=0)
+    agent.reset(0, env, 0)
+    env.enter(2)
+    ours = load_policy(tmp_path / "insert").act(None, env.relative_state()[None])
+    assert np.array_equal(agent.act([0], [env], [observation]), ours)
 
 
 def test_what_cannot_be_trained_is_refused_before_any_work(demos, tmp_path, capsys):
