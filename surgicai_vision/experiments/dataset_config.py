@@ -5,10 +5,11 @@ A training seed draws its own demonstrations: those of seed s are recorded at th
 and none meets the banks of validation and test. Training seed 0 begins at `names.TRAIN_SEED`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig, check_frame_stride
+from surgicai_vision.core.config import JSON, TaskConfig, check_frame_stride
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.demos.demonstrator import SCRIPTED_DEMONSTRATORS
 from surgicai_vision.demos.disturbance import Disturbance
@@ -37,6 +38,8 @@ class Demonstrations:
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
         post_success_steps: control steps an episode goes on after its success.
         frame_stride: control steps from frame to frame.
+        env: fields of `TaskConfig` in the place of the plan's: a world that varies more than the
+            one policies are evaluated in.
     """
 
     name: str
@@ -48,6 +51,7 @@ class Demonstrations:
     post_success_steps: int = 0
     frame_stride: int = 5
     upset_fraction: float = 0.0
+    env: Mapping[str, JSON] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_name("demonstrator", self.demonstrator, SCRIPTED_DEMONSTRATORS)

@@ -23,7 +23,9 @@ on what (`policies`), and what is evaluated in which conditions (`conditions`):
       - {name: moved, policies: [suture], env: {randomisation: {phantom_shift: 10}}}
       - {name: privileged, policies: [suture], procedure: {termination: privileged}}
 
-A policy takes part in the whole procedure by its name: the five subtasks and `hlp` make `suture`.
+A policy takes part in the whole procedure by its `part`, else by its name: the five subtasks and
+`hlp` make `suture`. So a plan may have both a `grasp`, counted on its own task, and a
+`{name: suture-grasp, part: grasp, …}` of whole procedures.
 Two commands take a plan:
 
 * `surgicai-vision sweep PLAN.yaml`: every training seed in every condition, in one folder
@@ -61,6 +63,8 @@ from surgicai_vision.training.run_config import BANKS, RunConfig, Starts, with_e
 
 HLP = "hlp"
 """Name of the high-level policy, and of its kind."""
+PARTS = (*names.SUBTASKS, HLP)
+"""The parts of the whole procedure."""
 AS_TRAINED = "as trained"
 """Name of the only condition of a plan that lists none."""
 
@@ -77,6 +81,8 @@ class PlannedPolicy:
         policy: its kind.
         encoder: its encoder; None takes the plan's. Likewise `pool` and `recipe`.
         change: what is changed in the recipe, "key=value" each.
+        part: its part in the whole procedure, a subtask or `HLP`; none is what its name says, where
+            no other policy has that part.
     """
 
     name: str
@@ -88,11 +94,12 @@ class PlannedPolicy:
     pool: str | None = None
     recipe: str | None = None
     change: tuple[str, ...] = ()
+    part: str = ""
 
     @property
     def acts(self) -> bool:
-        """Whether it can be evaluated by itself; a high-level policy is judged in the whole."""
-        return self.policy != HLP
+        """Whether it is evaluated by itself; what has a `part` is judged in the whole alone."""
+        return self.policy != HLP and not self.part
 
 
 @dataclass(frozen=True)
@@ -164,6 +171,9 @@ class Plan:
         check_name("bank of starts", self.starts, BANKS)
         _check_different("demonstrations", [recorded.name for recorded in self.demonstrations])
         _check_different("policies", [policy.name for policy in self.policies])
+        parts = [policy.part for policy in self.policies if policy.part]
+        if parts:
+            _check_different("parts", parts)
         _check_different("conditions", [condition.name for condition in self.conditions])
         _check_different("seed", self.seed)
         for seed in self.seed:
@@ -172,7 +182,7 @@ class Plan:
             if number < 1:
                 raise InputError(f"{name} is {number}; it must be at least 1.")
         for recorded in self.demonstrations:
-            self.task_config(recorded.task)
+            self.recorded_env(recorded)
             if recorded.episodes > MOST_EPISODES:
                 raise InputError(
                     f"demonstrations {recorded.name}: episodes is {recorded.episodes}; "
@@ -196,6 +206,8 @@ class Plan:
             check_name("subtask", policy.subtask, names.SUBTASKS)
         for view in policy.view:
             check_name("rendered view", view, self.recorded(policy).view)
+        if policy.part:
+            check_name("part of the whole procedure", policy.part, PARTS)
         encoders.check_encoder_name(policy.encoder or self.encoder)
 
     def _check_condition(self, condition: Condition) -> None:
@@ -226,13 +238,28 @@ class Plan:
         other = condition.env if condition else {}
         return from_mapping(TaskConfig, {**self.env, **other, "task": task}, "env")
 
+    def recorded_env(self, recorded: Demonstrations, task: str | None = None) -> TaskConfig:
+        """Return the env of demonstrations, by default with their own task."""
+        fields = {**self.env, **recorded.env, "task": task or recorded.task}
+        return from_mapping(TaskConfig, fields, "env")
+
+    def evaluated_env(self, condition: Condition | None = None) -> Mapping[str, JSON]:
+        """Return the fields of `TaskConfig` that an evaluation has, whatever was trained on.
+
+        An empty table keeps the env that the policies were trained in: so what demonstrations
+        alone have is named with its default.
+        """
+        plain = to_mapping(TaskConfig(names.SUTURE))
+        theirs = {key: plain[key] for recorded in self.demonstrations for key in recorded.env}
+        return {**theirs, **self.env, **(condition.env if condition else {})}
+
     def recorded(self, policy: PlannedPolicy) -> Demonstrations:
         """Return what a policy is trained on."""
         return next(each for each in self.demonstrations if each.name == policy.demonstrations)
 
     def dataset(self, recorded: Demonstrations, seed: int) -> DatasetConfig:
         """Return the dataset of demonstrations for a training seed."""
-        env = self.task_config(recorded.task)
+        env = self.recorded_env(recorded)
         return DatasetConfig(env, recorded, self.size, first_seed=first_seed(seed))
 
     def training(self, policy: PlannedPolicy, seed: int) -> RunConfig:
@@ -242,7 +269,7 @@ class Plan:
             change for change in policy.change if not (self.epochs and change.startswith("epochs="))
         )
         return RunConfig(
-            self.task_config(policy.subtask or recorded.task),
+            self.recorded_env(recorded, policy.subtask),
             (policy.encoder or self.encoder) if policy.view else None,
             policy.view,
             policy=policy.policy,
@@ -260,9 +287,16 @@ class Plan:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of everything that is built, the whole procedure last."""
-        parts = tuple(policy.name for policy in self.policies)
-        whole = {*names.SUBTASKS, HLP} <= set(parts)
-        return (*parts, names.SUTURE) if whole else parts
+        built = tuple(policy.name for policy in self.policies)
+        return (*built, names.SUTURE) if len(self.suture) == len(PARTS) else built
+
+    @functools.cached_property
+    def suture(self) -> Mapping[str, PlannedPolicy]:
+        """The policies of the whole procedure by their parts; not all where the plan lacks some."""
+        named = {policy.name: policy for policy in self.policies if not policy.part}
+        given = {policy.part: policy for policy in self.policies if policy.part}
+        found = {**named, **given}
+        return {part: found[part] for part in PARTS if part in found}
 
     def hierarchical(
         self, condition: Condition | None, parts: Mapping[str, str]
@@ -273,7 +307,7 @@ class Plan:
             condition: the condition; None takes the plan's own procedure.
             parts: name of each part → its folder; one that is not given stands for itself.
         """
-        everyone = {name: name for name in (*names.SUBTASKS, HLP)}
+        everyone = {part: part for part in PARTS}
         other = condition.procedure if condition else {}
         table = {**everyone, **parts, **self.procedure, **other}
         return from_mapping(HierarchicalConfig, table, "procedure")
@@ -312,7 +346,7 @@ class Plan:
         episodes = condition.episodes or self.episodes
         starts = Starts(BANKS[self.starts], episodes)
         if name == names.SUTURE:
-            seen = {view for policy in self._parts for view in policy.view}
+            seen = {view for policy in self.suture.values() for view in policy.view}
             return RunConfig(
                 self.task_config(name, condition),
                 views=tuple(view for view in view_names() if view in seen),
@@ -331,11 +365,6 @@ class Plan:
 
     def _policy(self, name: str) -> PlannedPolicy:
         return next(policy for policy in self.policies if policy.name == name)
-
-    @property
-    def _parts(self) -> tuple[PlannedPolicy, ...]:
-        """The policies of the whole procedure."""
-        return tuple(self._policy(name) for name in (*names.SUBTASKS, HLP))
 
     @property
     def _digest(self) -> str:
@@ -365,9 +394,9 @@ class Plan:
             return {name: self._training(self._policy(name), run.seed)}
         replaced = {**self.procedure, **condition.procedure}
         return {
-            policy.name: self._training(policy, run.seed)
-            for policy in self._parts
-            if policy.name not in replaced
+            part: self._training(policy, run.seed)
+            for part, policy in self.suture.items()
+            if part not in replaced
         }
 
     def _training(self, policy: PlannedPolicy, seed: int) -> Training:
@@ -377,7 +406,8 @@ class Plan:
     def evaluated(self, run: RunConfig) -> Evaluated:
         """Return how a run is evaluated."""
         condition = next(each for each in self.conditions if each.name == run.condition)
-        return Evaluated({**self.env, **condition.env}, {**self.procedure, **condition.procedure})
+        procedure = {**self.procedure, **condition.procedure}
+        return Evaluated(self.evaluated_env(condition), procedure)
 
     def references(self, runs: Sequence[RunConfig]) -> tuple[RunConfig, ...]:
         """Return the expert on each task and condition of the runs, where it is asked for."""

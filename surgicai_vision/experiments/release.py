@@ -32,7 +32,7 @@ from surgicai_vision.evaluation.provenance import command_line
 from surgicai_vision.evaluation.run import evaluate_once
 from surgicai_vision.evaluation.storage import read_rows
 from surgicai_vision.experiments.dataset_config import Demonstrations
-from surgicai_vision.experiments.plan_config import HLP, Plan, PlannedPolicy, plan_of
+from surgicai_vision.experiments.plan_config import Plan, PlannedPolicy, plan_of
 from surgicai_vision.experiments.prepare import check_dataset, make_dataset
 from surgicai_vision.experiments.run import train_run
 from surgicai_vision.features import encoders
@@ -149,15 +149,16 @@ class _Build:
             command=command_line(),
             code_version=__version__,
         )
-        if policies.policy_plugin(policy.policy).target == names.ACTION:
+        if policy.acts:
             card = self._counted(card, folder, policy.name)
         write_released(card, {name: (folder / name).read_bytes() for name in (CARD, WEIGHTS)})
         return read_card(policy.name)
 
     def procedure(self) -> ReleaseCard:
         """Count the whole procedure by the released parts, and release it."""
-        parts = {name: f"{PREFIX}{name}" for name in (*names.SUBTASKS, HLP)}
-        hashes = {name: read_card(name).files[WEIGHTS] for name in parts}
+        together = [policy.name for policy in self.plan.suture.values()]
+        hashes = {name: read_card(name).files[WEIGHTS] for name in together}
+        parts = {part: f"{PREFIX}{policy.name}" for part, policy in self.plan.suture.items()}
         config = self.plan.hierarchical(None, parts)
         content = yaml.safe_dump(to_mapping(config), sort_keys=False).encode()
         policy = f"{PREFIX}{names.SUTURE}"
@@ -165,7 +166,7 @@ class _Build:
             name=names.SUTURE,
             run=hierarchical_policy(config).run,
             scene_hash=self.scene_hash,
-            data=f"the released {', '.join(parts)}",
+            data=f"the released {', '.join(together)}",
             licence=self.plan.licence,
             encoder="",
             command=command_line(),

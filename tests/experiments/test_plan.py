@@ -35,6 +35,7 @@ from surgicai_vision.report.pairs import compare
 from surgicai_vision.training.checkpoint import read_checkpoint
 
 WHOLE = {"demonstrations": "whole", "change": ["frame_stride=10"]}
+VARIED = {"randomisation": {"phantom_shift": 3.0}}
 TABLE = {
     "size": 32,
     "encoder": "random-conv",
@@ -45,11 +46,25 @@ TABLE = {
     "epochs": 1,
     "procedure": {"max_steps": 20, "steps": 10, "termination": "learned"},
     "demonstrations": [
-        {"name": "whole", "task": "suture", "episodes": 2, "view": ["back"], "frame_stride": 10},
-        {"name": "own", "task": "place", "episodes": 2, "view": ["back"], "noise": 0.3},
+        {
+            "name": "whole",
+            "task": "suture",
+            "episodes": 2,
+            "view": ["back"],
+            "frame_stride": 10,
+            "env": VARIED,
+        },
+        {
+            "name": "own",
+            "task": "place",
+            "episodes": 2,
+            "view": ["back"],
+            "noise": 0.3,
+            "env": VARIED,
+        },
     ],
     "policies": [
-        {"name": "grasp", "subtask": "grasp", "view": ["back"], **WHOLE},
+        {"name": "first", "part": "grasp", "subtask": "grasp", "view": ["back"], **WHOLE},
         {"name": "place", "demonstrations": "own", "recipe": "paper", "change": ["frame_stride=5"]},
         *({"name": name, "subtask": name, **WHOLE} for name in names.SUBTASKS[2:]),
         {"name": "hlp", "policy": "hlp", **WHOLE},
@@ -141,8 +156,9 @@ def test_everything_is_built_once_and_evaluated_on_the_same_starts(quiet, tiny):
         starts = [row["seed"] for row in read_rows(out / "runs" / state.key / "evaluation")]
         assert starts == [900_000, 900_001][: len(starts)]
         assert stored.condition == state.run.condition and stored.seed == state.run.seed
-        moved = stored.env.randomisation.phantom_turn
-        assert moved == (15.0 if stored.condition == "moved" else 0.0)
+        world = stored.env.randomisation
+        expected = (10.0, 15.0) if stored.condition == "moved" else (0.0, 0.0)
+        assert (world.phantom_shift, world.phantom_turn) == expected, "whatever was trained on"
         if stored.is_hierarchical:
             ends = "privileged" if stored.condition == "privileged" else "learned"
             assert (stored.termination, stored.env.max_steps) == (ends, 20)
@@ -161,6 +177,8 @@ def test_a_policy_is_trained_on_what_the_plan_says(quiet, tiny):
     assert trained["grasp"].run.views == ("back",) and not trained["insert"].run.views
     assert trained["place"].run.recipe == "paper" and trained["insert"].run.recipe == "best"
     assert trained["place"].run.noise == 0.3 and trained["insert"].run.noise == 0.6
+    assert {card.run.env.randomisation.phantom_shift for card in trained.values()} == {3.0}
+    assert tiny.suture["grasp"].name == "first" and not tiny.suture["grasp"].acts
     privileged = next(run for run in tiny.runs if run.condition == "privileged")
     assert "handoff" not in tiny.parts(privileged), "the expert is in its place"
 
@@ -271,6 +289,8 @@ def test_a_file_is_tried_small_beside_the_whole(tmp_path, monkeypatch, capsys):
         ),
         ({"demonstrations": [{**TABLE["demonstrations"][0], "episodes": 9999}]}, "1 to 4000"),
         ({"policies": [{**TABLE["policies"][0], "view": ["front"]}]}, "'front'"),
+        ({"policies": [{**TABLE["policies"][0], "part": "grsp"}]}, "'grasp'"),
+        ({"policies": [TABLE["policies"][0], {**TABLE["policies"][0], "name": "a"}]}, "each once"),
         ({"encoder": "imagenet-lit"}, "imagenet-lite"),
         ({"polices": []}, "'policies'"),
     ],
