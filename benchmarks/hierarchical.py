@@ -36,7 +36,8 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent
-from surgicai_vision.evaluation.hierarchical import HierarchicalAgent, HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical import HierarchicalAgent
+from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.evaluation.slot import Episode
 

@@ -180,7 +180,7 @@ def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:
         evaluate_swaps,
         variants_of,
     )
-    from surgicai_vision.evaluation.hierarchical import SUFFIXES
+    from surgicai_vision.evaluation.hierarchical_config import SUFFIXES
     from surgicai_vision.training.released import resolve
 
     path = resolve(options.policy)

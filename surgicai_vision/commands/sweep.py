@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 app = App(
     name="sweep",
     help_epilogue="""\
-examples:
+example:
   surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/smoke --json
 a headline from nothing, for its first training seed; without --only for all of them:
   surgicai-vision sweep procedure --only seed=0

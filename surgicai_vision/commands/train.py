@@ -38,8 +38,9 @@ if TYPE_CHECKING:
 app = App(
     name="train",
     help_epilogue="""\
-examples:
+example:
   surgicai-vision train --encoder random --view back
+by reinforcement:
   surgicai-vision train --algo td3-her-bc --env-steps 25000""",
 )
 NO_ENCODER = "none"

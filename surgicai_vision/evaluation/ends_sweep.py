@@ -22,7 +22,7 @@ from surgicai_vision.core import files, names
 from surgicai_vision.core.config import JSON, to_mapping
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.progress import Stage
-from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import open_policy, read_hierarchical
 from surgicai_vision.evaluation.run import evaluate_once
 from surgicai_vision.evaluation.storage import Row

@@ -33,8 +33,7 @@ import numpy as np
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
-from surgicai_vision.core.config import DWELL
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,
@@ -44,91 +43,13 @@ from surgicai_vision.evaluation.agent import (
     Robot,
 )
 from surgicai_vision.evaluation.agents import PolicyAgent
-from surgicai_vision.training.run_config import TERMINATIONS
+from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.training.threads import one_thread
 
 if TYPE_CHECKING:
     from surgicai_vision.envs.suture import Suture
 
-ORDER = "order"
-SUFFIXES = (".yaml", ".yml")
 GRASP = names.SUBTASKS.index("grasp")
-MAX_STEPS = 2000
-"""Control steps of an episode: ten subtasks of full length."""
-
-
-@dataclass(frozen=True)
-class HierarchicalConfig:
-    """Who decides, who acts, and when a subtask ends.
-
-    Attributes:
-        hlp: folder of the high-level policy's checkpoint, "released:hlp", or "order".
-        grasp: what acts in the subtask, a checkpoint's folder, a released policy or a baseline;
-            likewise place, insert, handoff and pullout. A file names no code: "module:factory" is
-            refused.
-        termination: one of `TERMINATIONS`.
-        steps: control steps a subtask may take.
-        decisions: decisions an episode may take.
-        max_steps: control steps an episode may take.
-        grasp_hold: control steps a grasp must hold before it ends as `privileged`, at most the
-            env's own `DWELL`; a policy that learned to search (`demos.search_expert`) lets go again
-            sooner than that.
-        confidence: probability, by the high-level policy's softmax, that another subtask must have
-            before it counts as named (`learned`). More of it means later ends and fewer false ones.
-        patience: how often in a row the high-level policy must name the same other subtask before
-            a `learned` end is believed.
-        decide_every: control steps from one question to the high-level policy to the next
-            (`learned`); only then are its images rendered and encoded. A subtask takes at least
-            `decide_every` times `patience` steps.
-    """
-
-    hlp: str
-    grasp: str
-    place: str
-    insert: str
-    handoff: str
-    pullout: str
-    termination: str = "learned"
-    steps: int = 200
-    decisions: int = 50
-    max_steps: int = MAX_STEPS
-    grasp_hold: int = DWELL
-    confidence: float = 0.5
-    patience: int = 3
-    decide_every: int = 5
-
-    def __post_init__(self) -> None:
-        check_name("termination", self.termination, TERMINATIONS)
-        limits = {
-            "steps": self.steps,
-            "decisions": self.decisions,
-            "max_steps": self.max_steps,
-            "patience": self.patience,
-            "decide_every": self.decide_every,
-        }
-        for name, limit in limits.items():
-            if limit < 1:
-                raise InputError(f"{name} is {limit}; it must be at least 1.")
-        if not 1 <= self.grasp_hold <= DWELL:
-            raise InputError(f"grasp_hold is {self.grasp_hold}; allowed: 1 to {DWELL}.")
-        if not 0.0 <= self.confidence < 1.0:
-            raise InputError(f"confidence is {self.confidence}; allowed: 0 to below 1.")
-        if self.hlp == ORDER and self.termination == "learned":
-            raise InputError(
-                "A learned termination needs a high-level policy; give hlp: a checkpoint folder, "
-                "or termination: privileged, which ends a subtask by its measured success."
-            )
-
-    @property
-    def low(self) -> dict[str, str]:
-        """Subtask → what acts in it, in the order of the subtasks."""
-        policies = (self.grasp, self.place, self.insert, self.handoff, self.pullout)
-        return dict(zip(names.SUBTASKS, policies, strict=True))
-
-    @property
-    def advance(self) -> str:
-        """Who takes the env to its next subtask: `TaskConfig.advance`."""
-        return "told" if self.termination == "learned" else "success"
 
 
 @dataclass

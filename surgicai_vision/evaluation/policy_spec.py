@@ -32,12 +32,8 @@ from surgicai_vision.evaluation.agents import (
     ReplayAgent,
     mean_demonstration,
 )
-from surgicai_vision.evaluation.hierarchical import (
-    ORDER,
-    SUFFIXES,
-    HierarchicalAgent,
-    HierarchicalConfig,
-)
+from surgicai_vision.evaluation.hierarchical import HierarchicalAgent
+from surgicai_vision.evaluation.hierarchical_config import ORDER, SUFFIXES, HierarchicalConfig
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.training import policies, released

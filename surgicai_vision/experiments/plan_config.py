@@ -50,7 +50,7 @@ from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.files import configs_folder
-from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.experiments.dataset_config import (
     MOST_EPISODES,
     DatasetConfig,

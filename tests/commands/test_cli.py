@@ -14,7 +14,7 @@ import yaml
 from cyclopts import Parameter
 from read_options import read_options
 
-from surgicai_vision.commands import COMMANDS, dataset, evaluate, policy, quickstart
+from surgicai_vision.commands import COMMANDS, dataset, evaluate, policy, quickstart, robot
 from surgicai_vision.commands.console import QuietConsole
 from surgicai_vision.commands.main import INTERRUPTED, main
 from surgicai_vision.commands.options import COUNT, FILE_ONLY, VIEWS
@@ -23,7 +23,7 @@ from surgicai_vision.core.config import SceneConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.core.files import configs_folder
 
-GROUPS = {"dataset": dataset, "policy": policy}
+GROUPS = {"dataset": dataset, "policy": policy, "robot": robot}
 ALL_COMMANDS = (
     *(name for name in COMMANDS if name not in GROUPS),
     *(f"{group} {name}" for group, package in GROUPS.items() for name in package.COMMANDS),

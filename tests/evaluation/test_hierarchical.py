@@ -15,7 +15,8 @@ from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import ExpertAgent, PolicyAgent
-from surgicai_vision.evaluation.hierarchical import HierarchicalAgent, HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical import HierarchicalAgent
+from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.evaluation.metrics import summary
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.rollout import evaluate

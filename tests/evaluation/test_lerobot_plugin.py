@@ -478,7 +478,7 @@ def test_lerobot_eval_and_evaluate_see_the_same_through_the_encoder(
 
 def test_act_trains_beside_depth_and_is_evaluated(dataset: Path, tmp_path: Path, command) -> None:
     from surgicai_vision.evaluation import lerobot_agent
-    from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
+    from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
     from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
     from surgicai_vision.evaluation.rollout import evaluate
 

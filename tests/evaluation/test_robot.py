@@ -10,7 +10,8 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.evaluation.agents import PolicyAgent
-from surgicai_vision.evaluation.hierarchical import HierarchicalAgent, HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical import HierarchicalAgent
+from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 
 SEED = names.TEST_SEED
 

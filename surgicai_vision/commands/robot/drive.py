@@ -37,8 +37,9 @@ app = App(
     name="drive",
     help_epilogue="""\
 example:
-  surgicai-vision robot serve --clock stepped --advance told --view front,back &
   surgicai-vision robot drive hierarchical.yaml --simulated --clock stepped --send
+at the simulation that this serves in another terminal:
+  surgicai-vision robot serve --clock stepped --advance told --view front,back
 
 Without --send nothing is sent: it prints what would be. docs/robot.md says what the guards ask.""",
 )

@@ -17,7 +17,7 @@ from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import Stage, silent_stage, timed
 from surgicai_vision.dataset import Dataset, RenderedDataset, open_dataset
 from surgicai_vision.dataset.subset import of_subtask
-from surgicai_vision.evaluation.hierarchical import HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.evaluation.policy_spec import (
     PolicySpec,
     hierarchical_policy,
