@@ -38,6 +38,10 @@ RIGHT = 22
 TOP = 10
 BOTTOM = 40
 """Size and margins of a curve's drawing, in its own units."""
+NAMES = 104
+BAR = 20
+"""Width of the names beside bars, and height of a bar with its gap."""
+BAR_COLOUR = COLOURS[5]
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,54 @@ class Series:
 
     name: str
     points: tuple[Point, ...]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A share with another one and its bounds beside it, and the words a reader hears."""
+
+    name: str
+    share: float
+    beside: tuple[float, float, float] | None
+    text: str
+
+
+def bars(rows: Sequence[Bar], label: str) -> Markup:
+    """Draw shares as bars on an axis from 0 to 1; what is beyond 1.1 is cut.
+
+    Args:
+        rows: from top to bottom.
+        label: what a screen reader says.
+    """
+    height = TOP + BAR * len(rows) + 24
+
+    def place(share: float) -> float:
+        return NAMES + (WIDTH - NAMES - RIGHT) * min(share, 1.1)
+
+    parts = []
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        x = place(share)
+        parts.append(
+            f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{height - 22}"/>'
+            f'<text x="{x:.1f}" y="{height - 8}" text-anchor="middle">{100 * share:.0f}</text>'
+        )
+    for index, row in enumerate(rows):
+        y = TOP + BAR * index + BAR / 2
+        beside = ""
+        if row.beside is not None:
+            at, low, high = map(place, row.beside)
+            beside = (
+                f'<line class="beside" x1="{low:.1f}" x2="{high:.1f}" y1="{y:.1f}" y2="{y:.1f}"/>'
+                f'<circle class="beside" cx="{at:.1f}" cy="{y:.1f}" r="3"/>'
+            )
+        parts.append(
+            f'<g><title>{escape(row.text)}</title><text class="name" x="{NAMES - 6}"'
+            f' y="{y + 4:.1f}" text-anchor="end">{escape(row.name)}</text><rect x="{NAMES}"'
+            f' y="{y - 6:.1f}" width="{place(row.share) - NAMES:.1f}" height="12"'
+            f' fill="{BAR_COLOUR}"/>{beside}</g>'
+        )
+    box = f'viewBox="0 0 {WIDTH} {height}" role="img"'
+    return Markup(f'<svg class="curve" {box} aria-label="{escape(label)}">{"".join(parts)}</svg>')
 
 
 def heat(rate: float) -> tuple[str, str]:

@@ -33,7 +33,7 @@ def data_curves(groups: Sequence[Group]) -> list[Chart]:
     """Return success against the number of demonstrations, one chart a task with several."""
     found = []
     for task in task_names():
-        candidates = [item for item in groups if _evaluated(item, task) and item.condition.plain]
+        candidates = [item for item in groups if evaluated(item, task) and item.condition.plain]
         candidates = [item for item in candidates if item.condition.demonstrations]
         members = _by_condition(
             candidates, lambda item: replace(item.condition, demonstrations=None)
@@ -54,10 +54,10 @@ def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
         mine = [
             item
             for item in groups
-            if _evaluated(item, task) and not (item.condition.expert_swap or item.condition.upset)
+            if evaluated(item, task) and not (item.condition.expert_swap or item.condition.upset)
         ]
         for axis in dict.fromkeys(item.condition.axis for item in mine if item.condition.axis):
-            members = _by_condition(_with_zero(mine, axis), _base)
+            members = _by_condition(with_zero(mine, axis), base_of)
             lines = _series(members, lambda item: item.condition.strength)
             if lines:
                 areas = {base.label: _area(items) for base, items in members.items()}
@@ -66,19 +66,20 @@ def robustness_curves(groups: Sequence[Group]) -> list[Chart]:
     return found
 
 
-def _with_zero(groups: Sequence[Group], axis: str) -> list[Group]:
+def with_zero(groups: Sequence[Group], axis: str) -> list[Group]:
     """Return the evaluations of one axis.
 
     An evaluation without a shift is strength 0 where none was made.
     """
     of_axis = [item for item in groups if item.condition.axis == axis]
-    lacking = {_base(item) for item in of_axis} - {
-        _base(item) for item in of_axis if item.condition.strength == 0
+    lacking = {base_of(item) for item in of_axis} - {
+        base_of(item) for item in of_axis if item.condition.strength == 0
     }
     return [*(item for item in groups if item.condition in lacking), *of_axis]
 
 
-def _base(item: Group) -> Condition:
+def base_of(item: Group) -> Condition:
+    """Return the condition without its shift."""
     return replace(item.condition, axis="", strength=0.0)
 
 
@@ -168,7 +169,7 @@ def procedure(groups: Sequence[Group]) -> Chart | None:
     lines = []
     rows = []
     for item in groups:
-        if not _evaluated(item, names.SUTURE, trained=False):
+        if not evaluated(item, names.SUTURE, trained=False):
             continue
         stages = [int(row.get("stages") or 0) for row in item.rows]
         counts = [sum(stage > index for stage in stages) for index in range(len(names.SUBTASKS))]
@@ -195,7 +196,8 @@ def procedure(groups: Sequence[Group]) -> Chart | None:
     return Chart("", drawing, key, ("policy", *names.SUBTASKS), tuple(rows), more)
 
 
-def _evaluated(item: Group, task: str, trained: bool = True) -> bool:
+def evaluated(item: Group, task: str, trained: bool = True) -> bool:
+    """Return True for an evaluation of a task, by a trained policy if so asked."""
     return bool(
         item.episodes and item.condition.task == task and (item.condition.trained or not trained)
     )

@@ -16,6 +16,7 @@ from surgicai_vision.report.high_level import high_level_policies
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.probes import probes
 from surgicai_vision.report.reader import Collected
+from surgicai_vision.report.retention import looks, retentions
 
 FEW = 12
 """Rows up to which a table of every cell is open from the start."""
@@ -65,6 +66,8 @@ def numbers(
         "measures": sections.measures(groups),
         "data_curves": curves.data_curves(groups),
         "robustness": curves.robustness_curves(groups),
+        "retentions": retentions(groups),
+        "looks": looks(groups),
         "procedure": curves.procedure(groups),
         "high_level": high_level_policies(collected.results),
         "subtasks": names.SUBTASKS,

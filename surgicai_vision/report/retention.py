@@ -1,0 +1,198 @@
+"""Retention: what a policy keeps of its success under each shift, and in looks never seen.
+
+`retentions(groups)` is one chart a task and policy with several axes: bars of the area under the
+retention curve (the mean over the strengths of the success that is left, as a share of the plain
+one), the worst axis on top, with the retention at the largest strength and its interval beside it.
+`looks(groups)` sets a policy's evaluation in looks for training beside the one in held-out looks.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from markupsafe import Markup
+
+from surgicai_vision.core import names
+from surgicai_vision.core.tasks import task_names
+from surgicai_vision.evaluation import statistics
+from surgicai_vision.evaluation.robustness import ALL
+from surgicai_vision.report import charts, text
+from surgicai_vision.report.charts import Bar
+from surgicai_vision.report.curves import Chart, base_of, evaluated, with_zero
+from surgicai_vision.report.groups import Group
+from surgicai_vision.report.reader import Result
+
+Start = tuple[int, int]
+"""Training seed and start seed of an episode."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is left along one axis.
+
+    Attributes:
+        axis: the axis.
+        area: area under the retention curve; None where nothing is left to divide by.
+        strength: the largest strength.
+        plain: successes and episodes without the shift.
+        shifted: the same at the largest strength.
+        last: retention there, with its interval.
+    """
+
+    axis: str
+    area: float | None
+    strength: float
+    plain: tuple[int, int]
+    shifted: tuple[int, int]
+    last: statistics.Retention
+
+
+def retentions(groups: Sequence[Group]) -> list[Chart]:
+    """Return a chart of bars for each task and policy that was shifted along several axes."""
+    found = []
+    for task in task_names():
+        mine = [item for item in groups if evaluated(item, task) and not item.condition.expert_swap]
+        axes = list(dict.fromkeys(item.condition.axis for item in mine if item.condition.axis))
+        kept: dict[str, list[Kept]] = {}
+        for axis in axes:
+            along: dict[str, list[Group]] = {}
+            for item in with_zero(mine, axis):
+                along.setdefault(base_of(item).label, []).append(item)
+            for label, items in along.items():
+                one = _kept(axis, items)
+                if one is not None:
+                    kept.setdefault(label, []).append(one)
+        found += [_chart(task, label, rows) for label, rows in kept.items() if len(rows) > 1]
+    return found
+
+
+def _kept(axis: str, items: Sequence[Group]) -> Kept | None:
+    """Return what is left along an axis; None without the plain evaluation or a shifted one."""
+    ordered = sorted(items, key=lambda item: item.condition.strength)
+    first, last = ordered[0], ordered[-1]
+    if first.condition.strength > 0 or last is first:
+        return None
+    strengths = [item.condition.strength for item in ordered]
+    area = statistics.area_under_curve(strengths, [item.rate for item in ordered])
+    plain, shifted = _paired(_wins(first.results), _wins(last.results))
+    return Kept(
+        axis,
+        area / first.rate if first.successes else None,
+        last.condition.strength,
+        (first.successes, first.episodes),
+        (last.successes, last.episodes),
+        statistics.retention(plain, shifted) if plain else statistics.Retention(None, None, None),
+    )
+
+
+def _wins(results: Sequence[Result]) -> dict[Start, bool]:
+    """Return the success of every start."""
+    return {
+        (result.seed, int(row["seed"])): bool(row["success"])
+        for result in results
+        for row in result.rows
+    }
+
+
+def _paired(
+    one: Mapping[Start, bool], other: Mapping[Start, bool]
+) -> tuple[list[bool], list[bool]]:
+    """Return the successes on the starts that both have."""
+    common = [start for start in one if start in other]
+    return [one[start] for start in common], [other[start] for start in common]
+
+
+def _chart(task: str, label: str, rows: list[Kept]) -> Chart:
+    """Draw the axes of one policy, the worst first."""
+    rows = sorted(rows, key=lambda row: row.area or 0.0)
+    bars = [
+        Bar(row.axis.replace("_", " "), row.area or 0.0, _last(row), _words(row)) for row in rows
+    ]
+    worst = next((row for row in rows if row.axis != ALL), rows[0])
+    title = f"{task}: {label}"
+    return Chart(
+        title,
+        charts.bars(bars, f"{title}: area under the retention curve [%]"),
+        Markup(""),
+        ("axis", "area under retention", "plain", "at strength", "shifted", "kept there"),
+        tuple(_row(row) for row in rows),
+        f"Worst single axis: {worst.axis.replace('_', ' ')}, {_share(worst.area)} kept on average.",
+    )
+
+
+def _last(row: Kept) -> tuple[float, float, float] | None:
+    """Return the retention at the largest strength with its bounds."""
+    last = row.last
+    if last.ratio is None or last.low is None or last.high is None:
+        return None
+    return last.ratio, last.low, last.high
+
+
+def _share(value: float | None) -> str:
+    return text.ABSENT if value is None else text.percent(value)
+
+
+def _words(row: Kept) -> str:
+    """Return the numbers of one axis as a sentence."""
+    return (
+        f"{row.axis.replace('_', ' ')}: {_share(row.area)} of the plain success on average over "
+        f"the strengths; {_kept_text(row)} at {row.strength:g}"
+    )
+
+
+def _kept_text(row: Kept) -> str:
+    """Return the retention at the largest strength with its interval."""
+    last = _last(row)
+    return text.ABSENT if last is None else f"{text.percent(last[0])} ({text.interval(last[1:])})"
+
+
+def _row(row: Kept) -> tuple[str, ...]:
+    return (
+        row.axis.replace("_", " "),
+        _share(row.area),
+        "{}/{}".format(*row.plain),
+        f"{row.strength:g}",
+        "{}/{}".format(*row.shifted),
+        _kept_text(row),
+    )
+
+
+# -- looks -----------------------------------------------------------------------------------------
+
+
+def looks(groups: Sequence[Group]) -> list[tuple[str, ...]]:
+    """Return task, policy, counts in held-in and in held-out looks, and what is kept, as text.
+
+    A policy is in a row if it was evaluated in both; it is the same by all but where it stands and
+    what it looked at.
+    """
+    seen: dict[tuple[str, str], dict[bool, list[Result]]] = {}
+    for item in groups:
+        if not (item.episodes and item.condition.plain and item.condition.trained):
+            continue
+        label = replace(item.condition, place="").label
+        for result in item.results:
+            axes = result.config.randomisation
+            if axes.appearance in (names.TRAIN, *names.TRAIN_APPEARANCES) or axes.shows_heldout:
+                by_look = seen.setdefault((item.condition.task, label), {})
+                by_look.setdefault(axes.shows_heldout, []).append(result)
+    rows = []
+    for (task, label), by_look in seen.items():
+        if len(by_look) == 2:
+            held_in, held_out = _wins(by_look[False]), _wins(by_look[True])
+            rows.append((task, label, _count(held_in), _count(held_out), _ratio(held_in, held_out)))
+    return rows
+
+
+def _count(wins: Mapping[Start, bool]) -> str:
+    """Return k/n with its interval."""
+    won, all_ = sum(wins.values()), len(wins)
+    return f"{won}/{all_} ({text.interval(statistics.clopper_pearson(won, all_))})"
+
+
+def _ratio(held_in: Mapping[Start, bool], held_out: Mapping[Start, bool]) -> str:
+    """Return the share that is kept on the starts that both have, with its interval."""
+    one, other = _paired(held_in, held_out)
+    kept = statistics.retention(one, other) if one else None
+    if kept is None or kept.ratio is None or kept.low is None or kept.high is None:
+        return text.ABSENT
+    return f"{text.percent(kept.ratio)} ({text.interval((kept.low, kept.high))})"

@@ -1,0 +1,75 @@
+"""Retention in the report: bars per axis, the worst axis, held-in against held-out looks."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sweep_results import CHECKPOINT, evaluation, run_of
+from test_report import assert_stands_alone, painted_stage
+
+from surgicai_vision import report
+from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig
+from surgicai_vision.envs import contact_sheet
+from surgicai_vision.evaluation import statistics
+from surgicai_vision.report.groups import group
+from surgicai_vision.report.reader import collect
+from surgicai_vision.report.retention import looks, retentions
+from surgicai_vision.training.run_config import Shift
+
+LEFT_AT_ONE = {"light": 1.5, "blur": 0.1, "all": -0.5}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Evaluations of one policy along three axes, and of another in two sets of looks."""
+    out = tmp_path_factory.mktemp("retention")
+    generator = np.random.default_rng(5)
+    about = {"checkpoint": CHECKPOINT}
+    for axis, left in LEFT_AT_ONE.items():
+        for strength, rate in ((0.0, 1.5), (0.5, 0.5 * (1.5 + left)), (1.0, left)):
+            run = run_of("grasp", "imagenet", ("back",), 0, shift=Shift(axis, strength))
+            evaluation(out / axis / f"{strength:g}", run, rate, generator, about)
+    for look, rate in ((names.TRAIN, 1.5), (names.HELDOUT, 0.5)):
+        shown = TaskConfig("insert", randomisation=RandomisationConfig(appearance=look))
+        run = replace(run_of("insert", "imagenet", ("back",), 0), env=shown)
+        evaluation(out / "looks" / look, run, rate, generator, about)
+    return out
+
+
+def test_bars_say_what_is_left_with_the_worst_axis_first(folder):
+    (chart,) = retentions(group(collect(folder)))
+    assert [row[0] for row in chart.rows] == ["all", "blur", "light"]
+    assert "Worst single axis: blur" in chart.more
+    for axis, area, plain, strength, shifted, kept in chart.rows:
+        rows = [
+            [bool(row["success"]) for result in item.results for row in result.rows]
+            for item in sorted(group(collect(folder)), key=lambda item: item.condition.strength)
+            if item.condition.axis == axis
+        ]
+        curve = statistics.area_under_curve([0.0, 0.5, 1.0], [np.mean(row) for row in rows])
+        assert area == f"{100 * curve / np.mean(rows[0]):.0f} %"
+        assert (plain, strength) == (f"{sum(rows[0])}/20", "1")
+        assert shifted == f"{sum(rows[-1])}/20"
+        assert kept.startswith(f"{100 * sum(rows[-1]) / sum(rows[0]):.0f} %")
+    widths = [float(word) for word in re.findall(r'<rect[^>]* width="([\d.]+)"', chart.drawing)]
+    assert widths == sorted(widths) and len(widths) == 3
+
+
+def test_held_out_looks_stand_beside_those_for_training(folder):
+    ((task, label, held_in, held_out, kept),) = looks(group(collect(folder)))
+    assert (task, label.split(" ")[0]) == ("insert", "imagenet")
+    first, second = (int(words.split("/")[0]) for words in (held_in, held_out))
+    assert first > second
+    assert kept.startswith(f"{100 * second / first:.0f} %")
+
+
+def test_the_page_shows_both_and_stands_alone(folder, monkeypatch):
+    monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
+    report.write_report(folder)
+    text = (folder / "report.html").read_text()
+    assert_stands_alone(text)
+    section = text.split('id="retention"')[1].split("<h2")[0]
+    assert section.count('<svg class="curve"') == 1
+    assert "held-out looks" in section and "Worst single axis: blur" in section
