@@ -63,6 +63,7 @@ COMMANDS = MappingProxyType(
         "policy": "Share a trained policy, or tune one.",
         "evaluate": "Run a policy from held-out starts and count successes.",
         "watch": "Look at a policy while it acts, in the browser or in a window.",
+        "saliency": "Show which parts of its images a policy's actions depend on.",
         "robustness": "Run a policy while light, cameras, images or the arm shift.",
         "robot": "Speak CRTK: serve the simulation as a dVRK, or drive one by a policy.",
         "sweep": "Encode, train and evaluate every run of a grid.",

@@ -352,7 +352,7 @@ def test_conditions_that_differ_in_two_things_are_no_pair():
 def test_curves_procedure_and_probes_are_drawn_with_their_numbers(text, groups):
     for section in ("curves", "procedure", "probes"):
         assert f'<h2 id="{section}">' in text
-    curves = text.split('id="curves"')[1].split('id="procedure"')[0]
+    curves = text.split('id="curves"')[1].split('id="retention"')[0]
     assert curves.count('<svg class="curve"') == 3
     assert curves.count("<th>area (interval)</th>") == 2
     lite = [

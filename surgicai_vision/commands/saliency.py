@@ -1,0 +1,87 @@
+"""`saliency`: show which parts of its images a policy's actions depend on."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
+from surgicai_vision.commands import folders
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.evaluate import open_given
+from surgicai_vision.commands.options import (
+    ACCEPT_LICENCE,
+    FILE_ONLY,
+    NOT_NEGATIVE,
+    TASK,
+    UNIQUE,
+    WEIGHTS,
+    default_text,
+    within,
+)
+from surgicai_vision.core import names
+from surgicai_vision.features.encoders import WeightsSource
+
+SUFFIXES = (".png", ".jpg", ".pdf", ".svg")
+app = App(
+    name="saliency",
+    help_epilogue="""\
+example:
+  surgicai-vision saliency released:grasp --seed 20003 --step 0,30,60 --out saliency.png""",
+)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `saliency`.
+
+    Attributes:
+        policy: A checkpoint folder, released:NAME (see `policies`) or module:factory, of a policy
+            that sees images.
+        task: The task.
+        seed: Seed of the start.
+        step: Control steps at which parts of the images are hidden.
+        patch: Side of the hidden square [px]; squares lie half a side apart.
+        out: Image to write.
+    """
+
+    policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
+    task: Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")] = None
+    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    step: Annotated[tuple[int, ...], UNIQUE, Parameter(metavar="N[,N]")] = (0, 20, 40, 60)
+    patch: Annotated[int, within(2, 960), Parameter(metavar="PX")] = 32
+    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
+    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    out: Annotated[Path, Parameter(metavar="FILE")] = Path("saliency.png")
+    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+
+
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
+    """Run one episode, hide parts of the images at some steps, and draw what mattered."""
+    from surgicai_vision.evaluation.occlusion import occlusion
+
+    folders.check_file(options.out, "--out", SUFFIXES)
+    spec = open_given(
+        options.policy,
+        options.task,
+        options.env,
+        None,
+        WeightsSource.parse(options.weights, options.accept_licence),
+    )
+    with console.stage("hiding parts of images"):
+        found = occlusion(spec.make_agent(), spec.config, options.seed, options.step, options.patch)
+    ended = f"{'success' if found.success else 'failure'} after {found.steps} steps"
+    title = f"{spec.name}: {spec.config.task}, start {options.seed}, {ended}"
+    found.sheet(title).savefig(options.out, dpi=100)
+    console.say(f"{ended}; an action changes by up to {found.largest:.2f} of its range")
+    console.say(f"image: {options.out}")
+    return {
+        "policy": spec.name,
+        "task": spec.config.task,
+        "success": found.success,
+        "steps": found.steps,
+        "largest": found.largest,
+        "image": str(options.out),
+    }
