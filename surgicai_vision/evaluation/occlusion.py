@@ -135,19 +135,17 @@ def occlusion(
     while not ended:
         features.clear()
         seen = _drawn(observation)
-        if taken in asked:
-            others = [_without(seen, view, place) for view, place in hidden]
-            answers = _act(agent, [0, *asked.pop(taken)], env, [seen, *others])
-            change = np.linalg.norm(answers[1:] - answers[0], axis=1)
+        now = asked.pop(taken, range(0))
+        later = [slot for slots in asked.values() for slot in slots]
+        others = [_without(seen, view, place) for view, place in hidden] if now else []
+        answers = _act(agent, [0, *now, *later], env, [seen, *others, *[seen] * len(later)])
+        if now:
+            change = np.linalg.norm(answers[1 : 1 + len(now)] - answers[0], axis=1)
             for index, view in enumerate(agent.cameras):
                 mine = change[index * len(places) : (index + 1) * len(places)]
                 image = np.asarray(seen[view], np.uint8)
                 found.append(Sensitivity(taken, view, image, spread(image, places, mine)))
-            action = answers[0]
-        else:
-            later = [slot for slots in asked.values() for slot in slots]
-            action = _act(agent, [0, *later], env, [seen] * (1 + len(later)))[0]
-        observation, _, terminated, truncated, info = env.step(action)
+        observation, _, terminated, truncated, info = env.step(answers[0])
         taken += 1
         ended = terminated or truncated
     env.close()
