@@ -112,8 +112,8 @@ def occlusion(
         patch: side of the hidden square [px].
 
     Raises:
-        InputError: a policy without images or of the whole procedure, no step, or a square that is
-            no part of the image.
+        InputError: a policy without images or of the whole procedure, no step within the episode, or
+            a square that is no part of the image.
     """
     _check(agent, config, steps, patch)
     env = env_of(agent, config)
@@ -149,6 +149,8 @@ def occlusion(
         taken += 1
         ended = terminated or truncated
     env.close()
+    if not found:
+        raise InputError(f"The episode ended after {taken} steps; give a step before that.")
     return Occlusion(tuple(found), bool(info["is_success"]), taken)
 
 
