@@ -112,8 +112,8 @@ def occlusion(
         patch: side of the hidden square [px].
 
     Raises:
-        InputError: a policy without images or of the whole procedure, no step within the episode, or
-            a square that is no part of the image.
+        InputError: a policy without images or of the whole procedure, no step within the episode,
+            or a square that is no part of the image.
     """
     _check(agent, config, steps, patch)
     env = env_of(agent, config)

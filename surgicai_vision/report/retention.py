@@ -175,7 +175,7 @@ def looks(groups: Sequence[Group]) -> list[tuple[str, ...]]:
             if axes.appearance in (names.TRAIN, *names.TRAIN_APPEARANCES) or axes.shows_heldout:
                 by_look = seen.setdefault((item.condition.task, label), {})
                 by_look.setdefault(axes.shows_heldout, []).append(result)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for (task, label), by_look in seen.items():
         if len(by_look) == 2:
             held_in, held_out = _wins(by_look[False]), _wins(by_look[True])
