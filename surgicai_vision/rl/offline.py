@@ -1,12 +1,14 @@
 """Offline learning by d3rlpy: from demonstrations alone, without a step in an env."""
 
 import io
+import logging
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, final
 
 import d3rlpy
 import numpy as np
+import structlog
 import torch
 from d3rlpy.algos import AWACConfig, BCConfig, BCQConfig, CalQLConfig, IQLConfig
 from d3rlpy.models.encoders import VectorEncoderFactory
@@ -105,6 +107,8 @@ class OfflineLearner(Learner):
         self.request = request
         self.mean = torch.from_numpy(mean).float()
         self.std = torch.from_numpy(std).float()
+        # The library tells of every step on stdout, where --json prints.
+        structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
         d3rlpy.seed(request.seed)
         rows = ((transitions.vector - mean) / std).astype(np.float32)
         self._dataset = d3rlpy.dataset.MDPDataset(
