@@ -37,6 +37,7 @@ from surgicai_vision.evaluation.hierarchical_config import ORDER, SUFFIXES, Hier
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.training import policies, released
+from surgicai_vision.training.checkpoint import read_checkpoint
 from surgicai_vision.training.progress_input import progress_policy_folder
 from surgicai_vision.training.run_config import OWN, RunConfig
 
@@ -253,8 +254,6 @@ def _from_checkpoint(folder: Path, weights: WeightsSource) -> PolicySpec:
         InputError: a high-level policy.
         MissingWeights: the encoder's weights are not at hand.
     """
-    from surgicai_vision.training.checkpoint import read_checkpoint
-
     checkpoint = read_checkpoint(folder)
     if policies.policy_plugin(checkpoint.policy).target != names.ACTION:
         raise InputError(
@@ -329,8 +328,6 @@ def hierarchical_policy(
         BadFile: a folder that is no checkpoint.
         InputError: a policy of another subtask or scene than it is to act in.
     """
-    from surgicai_vision.training.checkpoint import read_checkpoint
-
     # With experts in every place a policy knows no scene: the task is that of all its policies.
     known: dict[str, RunConfig] = {}
     low: dict[str, MakeAgent] = {}

@@ -248,8 +248,9 @@ def write_transitions(path: Path, transitions: Transitions) -> None:
         **{f"observation.{key}": part for key, part in transitions.observation.items()},
         **{f"next_observation.{key}": part for key, part in transitions.next_observation.items()},
         **{name: getattr(transitions, name) for name in _ARRAYS},
+        "about": np.array(json.dumps(about)),
     }
-    np.savez_compressed(content, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(content, **arrays)  # type: ignore[arg-type]
     write_bytes(path, content.getvalue())
 
 
