@@ -52,6 +52,7 @@ PACKAGES = {
     "policies": "policy: the policies themselves",
     "surgicai_vision.evaluation": "evaluation: rollouts, measures, statistics, robustness",
     "surgicai_vision.rl": "reinforcement and offline learning, by the libraries of the extra rl",
+    "surgicai_vision.robot": "a dVRK that speaks CRTK, simulated or driven, over ROS 2's messages",
     "surgicai_vision.report": "report: one page from stored results",
     "surgicai_vision.experiments": "whole runs: quickstart, sweep, DAgger",
 }

@@ -71,7 +71,7 @@ def test_a_free_arm_is_told_what_it_was_told() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
         command = env.simulation.commands[names.PSM2]
-        assert env.simulation._within_reach(names.PSM2) is command
+        assert env.simulation.within_reach(names.PSM2) is command
         env.step(rng.uniform(-1.0, 1.0, 7).astype(np.float32))
 
 

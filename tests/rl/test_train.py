@@ -15,6 +15,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
 from surgicai_vision.demos.store import demos_digest, list_demos
+from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.rl import train as training
 from surgicai_vision.rl.algorithms import ALGORITHMS
@@ -172,10 +173,10 @@ def test_an_actor_is_a_low_level_policy_of_a_hierarchical_one(demos, tmp_path):
     request, paths = request_of("bc", demos, "insert", updates=2)
     train(request, paths, tmp_path / "insert", tensorboard=False)
     low = dict.fromkeys(names.SUBTASKS, "expert") | {"insert": str(tmp_path / "insert")}
-    text = yaml.safe_dump({**low, "termination": "privileged"})
+    text = yaml.safe_dump({"hlp": "order", **low, "termination": "privileged"})
     (tmp_path / "h.yaml").write_text(text)
     spec = open_policy(tmp_path / "h.yaml")
-    assert spec.config == TaskConfig("suture")
+    assert spec.config == TaskConfig("suture", max_steps=MAX_STEPS)
     agent = spec.make_agent()
     assert agent.privileged and not agent.cameras
     env = envs.make(spec.config)
