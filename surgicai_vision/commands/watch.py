@@ -85,6 +85,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     from surgicai_vision.envs.live.window import Window, check_display
     from surgicai_vision.evaluation.films import outcome_of
     from surgicai_vision.evaluation.watch import Player, watch_in_window, watch_on_page
+    from surgicai_vision.training.released import is_released
 
     if options.window:
         check_display()
@@ -117,7 +118,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         with Window(player.env.model, player.env.data) as window:
             watch_in_window(player, window)
     else:
-        title = f"{spec.name}: {spec.config.task}"
+        name = options.policy if is_released(options.policy) else spec.name
+        title = f"{name}: {spec.config.task}"
         with LivePage(title, camera_names(), controls=True, port=options.port) as page:
             player = player_for(page)
             views = LiveViews(player.env, options.view, options.size)

@@ -53,11 +53,13 @@ class Sewer:
 
     Attributes:
         spec: what acts.
+        name: its name.
         who: who that is, in words.
         why: why it is not the one that was asked for; "" where it is.
     """
 
     spec: PolicySpec
+    name: str
     who: str
     why: str = ""
 
@@ -74,15 +76,15 @@ def find_sewer(given: str) -> Sewer:
     """
     expert = "the scripted expert, which reads the simulator's state and sees no image"
     if given == "expert":
-        return Sewer(open_policy(given, task=names.SUTURE), expert)
+        return Sewer(open_policy(given, task=names.SUTURE), given, expert)
     try:
         spec = open_policy(given, task=names.SUTURE)
     except InputError as error:
         if not is_released(given):
             raise
         why = str(error).removeprefix(given).removeprefix(":").strip()
-        return Sewer(open_policy("expert", task=names.SUTURE), expert, why)
-    return Sewer(spec, f"{given}, a policy that sees images" if spec.run.views else given)
+        return Sewer(open_policy("expert", task=names.SUTURE), "expert", expert, why)
+    return Sewer(spec, given, f"{given}, a policy that sees images" if spec.run.views else given)
 
 
 def sew(
@@ -116,7 +118,7 @@ def sew(
         attempts = _attempts(slot, starts, say, stage)
         shown = attempts[-1]
         row = shown.row
-        title = f"{row.policy}, start {row.seed}"
+        title = f"{sewer.name}, start {row.seed}"
         frames = video_frames(
             sewer.spec.config, slot.states, slot.moments, title, outcome_of(row), LOOK
         )
