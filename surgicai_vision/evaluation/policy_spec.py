@@ -8,10 +8,9 @@ open_policy("hierarchical.yaml")             # a high-level policy over low-leve
 open_policy("my_package.my_module:factory")  # a function that returns an `agent.Agent`
 """
 
-import dataclasses
 import functools
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -135,7 +134,7 @@ def open_policy(
     else:
         spec = _from_folder(path, task, weights)
     if released.is_released(text):
-        spec = dataclasses.replace(spec, about={**spec.about, "folder": text})
+        spec = replace(spec, about={**spec.about, "folder": text})
     if task not in (None, spec.config.task):
         raise InputError(
             f"{text} was trained for '{spec.config.task}', not for '{task}'; "
@@ -181,7 +180,7 @@ def in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
             )
         limit = {"max_steps": spec.config.max_steps, "advance": spec.config.advance}
     config = from_mapping(TaskConfig, {**limit, **env, "task": spec.config.task}, "env")
-    return dataclasses.replace(spec, run=dataclasses.replace(spec.run, env=config))
+    return replace(spec, run=replace(spec.run, env=config))
 
 
 def _replay(dataset: "Dataset") -> PolicySpec:
@@ -312,6 +311,29 @@ def read_hierarchical(path: Path) -> HierarchicalConfig:
     return from_mapping(HierarchicalConfig, table or {}, str(path))
 
 
+def _common_env(trained_in: Iterable[TaskConfig]) -> TaskConfig:
+    """Return the env that policies have in common, whatever their tasks.
+
+    What varies from episode to episode may have differed in their trainings; then nothing varies.
+
+    Raises:
+        InputError: they were trained in different scenes or with different steps.
+    """
+    whole = TaskConfig(names.SUTURE)
+    alike = {
+        replace(env, task=whole.task, max_steps=whole.max_steps, advance=whole.advance)
+        for env in trained_in
+    } or {whole}
+    if len(alike) > 1:
+        alike = {replace(env, randomisation=whole.randomisation) for env in alike}
+    if len(alike) > 1:
+        raise InputError(
+            "The policies were trained in different scenes or with different steps; "
+            "give policies of one scene and step size."
+        )
+    return alike.pop()
+
+
 def hierarchical_policy(
     config: HierarchicalConfig,
     expert_swap: str | None = None,
@@ -358,23 +380,13 @@ def hierarchical_policy(
             }
         known["hlp"] = checkpoint.run
         high = functools.partial(policy_agent, folder, weights)
-    envs = {
-        dataclasses.replace(
-            run.env, task=names.SUTURE, max_steps=config.max_steps, advance=config.advance
-        )
-        for run in known.values()
-    } or {TaskConfig(names.SUTURE, max_steps=config.max_steps, advance=config.advance)}
-    if len(envs) > 1:
-        raise InputError(
-            "The policies were trained in different scenes or with different steps; "
-            "give policies of one scene and step size."
-        )
+    env = _common_env([run.env for run in known.values()])
     if expert_swap is not None:
         low[check_name("subtask", expert_swap, names.SUBTASKS)] = BASELINES["expert"]
         known.pop(expert_swap, None)
     seen = {view for run in known.values() for view in run.views}
     run = RunConfig(
-        envs.pop(),
+        replace(env, task=names.SUTURE, max_steps=config.max_steps, advance=config.advance),
         views=tuple(view for view in view_names() if view in seen),
         termination=config.termination,
         parts=digest(config),

@@ -11,7 +11,7 @@ from checkpoints import checkpoint
 from surgicai_vision import envs
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig, from_mapping
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import ExpertAgent, PolicyAgent
@@ -230,6 +230,22 @@ def test_trained_policies_act_together_in_any_batch(tmp_path: Path) -> None:
     assert (spec.config.advance, spec.config.reward) == ("told", "dense")
     with pytest.raises(InputError, match="follows from the termination"):
         open_policy(written(tmp_path, hlp, low), env={"advance": "success"})
+
+
+def test_policies_may_have_learned_in_worlds_that_vary_and_not_in_different_scenes(
+    tmp_path: Path,
+) -> None:
+    moved = TaskConfig("grasp", randomisation=RandomisationConfig(phantom_shift=10))
+    grasp = checkpoint(tmp_path / "grasp", "grasp", env=moved)
+    place = checkpoint(tmp_path / "place", "place")
+    low = {**PRIVILEGED, "grasp": grasp}
+    alone = hierarchical_policy(HierarchicalConfig("order", **low))
+    assert alone.config.randomisation == moved.randomisation
+    both = hierarchical_policy(HierarchicalConfig("order", **{**low, "place": place}))
+    assert both.config.randomisation == RandomisationConfig()
+    fine = checkpoint(tmp_path / "fine", "place", env=TaskConfig("place", step="released"))
+    with pytest.raises(InputError, match="different scenes or with different steps"):
+        hierarchical_policy(HierarchicalConfig("order", **{**low, "place": fine}))
 
 
 def written(folder: Path, hlp: str, low: dict[str, str]) -> Path:

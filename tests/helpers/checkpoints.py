@@ -9,11 +9,11 @@ from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
 from surgicai_vision.training.run_config import RunConfig
 
 
-def checkpoint(folder: Path, task: str, policy: str = "bc") -> str:
-    """Write an untrained policy that sees no image."""
+def checkpoint(folder: Path, task: str, policy: str = "bc", env: TaskConfig | None = None) -> str:
+    """Write an untrained policy that sees no image, by default of the plain env of its task."""
     plugin = {"bc": BC, "hlp": HLP}[policy]
     written = Checkpoint(
-        run=RunConfig(TaskConfig(task), policy=policy, demonstrations=1),
+        run=RunConfig(env or TaskConfig(task), policy=policy, demonstrations=1),
         recipe=to_mapping(plugin.recipe()),
         image_size=32,
         encoder=None,
