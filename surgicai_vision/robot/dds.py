@@ -7,11 +7,8 @@ loopback there is no multicast: participants find each other at 127.0.0.1, as th
 `ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`.
 """
 
-import os
-import socket
 import struct
-from pathlib import Path
-from typing import Self, final
+from typing import Self, cast, final
 from xml.sax.saxutils import quoteattr
 
 from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState
@@ -26,21 +23,17 @@ from cyclonedds.topic import Topic as DdsTopic
 from cyclonedds.util import duration
 
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.robot.idl import CODECS
+from surgicai_vision.robot.codecs import ROS_NAMES
+from surgicai_vision.robot.idl import CODECS, TYPES
 from surgicai_vision.robot.messages import Message
-from surgicai_vision.robot.topics import EVENT, IMAGE, LATCHED, SERVO, STATE, Topic
+from surgicai_vision.robot.sockets import check_domain, check_interface, keep_to, open_sockets
+from surgicai_vision.robot.topics import DEPTHS, STAYING, Topic
 from surgicai_vision.robot.transport import LOOPBACK, Inbox, Publish, Received
 
-LAST_DOMAIN = 232
-"""Highest domain number whose ports exist (DDSI-RTPS 9.6.1.1)."""
 PARTICIPANTS = 60
 """Processes on the loopback that are looked for; ROS 2's own default is 32."""
-DEPTHS = {STATE: 10, EVENT: 10, LATCHED: 1, SERVO: 1, IMAGE: 2}
-STAYING = (EVENT, LATCHED)
-"""Qualities whose messages are also for those who come later."""
 BLOCKED_MS = 100
 """Time for which a writer waits for a slow reader [ms]; ROS 2's default."""
-SO_BINDTODEVICE = socket.SO_BINDTODEVICE
 
 
 def configuration(interface: str) -> str:
@@ -75,12 +68,9 @@ class CycloneTransport:
     """
 
     def __init__(self, interface: str, domain: int):
-        if not 0 <= domain <= LAST_DOMAIN:
-            raise InputError(f"The domain is {domain}; allowed: 0 to {LAST_DOMAIN}.")
-        names = [name for _, name in socket.if_nameindex()]
-        if interface not in names:
-            raise InputError(f"There is no interface '{interface}'; there are {', '.join(names)}.")
-        before = _sockets()
+        check_domain(domain)
+        check_interface(interface)
+        before = open_sockets()
         try:
             self._domain = Domain(domain, configuration(interface))
             self._participant = DomainParticipant(domain)
@@ -93,7 +83,7 @@ class CycloneTransport:
         self._writers: dict[str, DataWriter[IdlStruct]] = {}
         self._topics: dict[str, DdsTopic[IdlStruct]] = {}
         try:
-            _keep_to(_sockets() - before, interface)
+            keep_to(open_sockets() - before, interface)
         except OSError as error:
             self.__exit__()
             raise InputError(
@@ -112,18 +102,16 @@ class CycloneTransport:
 
     def publisher(self, topic: Topic) -> Publish:
         """Return what publishes messages on a topic."""
-        codec = CODECS[topic.type]
         writer = DataWriter(self._participant, self._topic(topic), qos=_quality(topic))
         self._writers[topic.name] = writer
 
         def publish(message: Message) -> None:
-            writer.write(codec.encode(message))
+            writer.write(cast(IdlStruct, CODECS.encode(message)))
 
         return publish
 
     def inbox(self, topic: Topic) -> Inbox:
         """Return what takes the messages that have come on a topic; what cannot be read is left."""
-        codec = CODECS[topic.type]
         reader = DataReader(self._participant, self._topic(topic), qos=_quality(topic))
         condition = ReadCondition(reader, ViewState.Any | SampleState.NotRead | InstanceState.Alive)
         self._waiting.attach(condition)
@@ -138,7 +126,7 @@ class CycloneTransport:
                         return found
                     info: SampleInfo = vars(samples[0])["sample_info"]
                     if info.valid_data:
-                        message = codec.decode(samples[0])
+                        message = CODECS.decode(topic.type, samples[0])
                         source = f"{info.publication_handle:x}"
                         found.append(Received(message, source, info.source_timestamp))
                 except (InputError, ValueError, IndexError, struct.error):
@@ -157,7 +145,7 @@ class CycloneTransport:
     def _topic(self, topic: Topic) -> DdsTopic[IdlStruct]:
         """Return a topic under the name that ROS 2 gives it on the wire."""
         if topic.name not in self._topics:
-            made = DdsTopic(self._participant, f"rt{topic.name}", CODECS[topic.type].type)
+            made = DdsTopic(self._participant, f"rt{topic.name}", TYPES[ROS_NAMES[topic.type]])
             self._topics[topic.name] = made
         return self._topics[topic.name]
 
@@ -182,23 +170,3 @@ def _quality(topic: Topic) -> Qos:
             )
         )
     return Qos(*policies)
-
-
-def _sockets() -> set[int]:
-    """Return the file descriptors of this process that are sockets."""
-    found = set()
-    for entry in Path("/proc/self/fd").iterdir():
-        try:
-            if os.readlink(entry).startswith("socket:"):
-                found.add(int(entry.name))
-        except OSError:  # the folder's own descriptor, closed by now
-            continue
-    return found
-
-
-def _keep_to(descriptors: set[int], interface: str) -> None:
-    """Let sockets hear nothing but what comes in by an interface; OSError: not allowed."""
-    for descriptor in descriptors:
-        with socket.socket(fileno=os.dup(descriptor)) as one:
-            if one.family in (socket.AF_INET, socket.AF_INET6):
-                one.setsockopt(socket.SOL_SOCKET, SO_BINDTODEVICE, interface.encode() + b"\0")

@@ -1,4 +1,4 @@
-"""IDL: the ROS messages as DDS types, and the way there and back.
+"""IDL: the ROS messages as DDS types.
 
 ROS 2 names a type `geometry_msgs/msg/PoseStamped` on the wire `geometry_msgs::msg::dds_::
 PoseStamped_` and a topic `/PSM1/servo_cp` `rt/PSM1/servo_cp` (design.ros2.org, "Topic and Service
@@ -10,7 +10,7 @@ are copied as they are, in CDR's own form: a count of four bytes, then the bytes
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Protocol, Self, cast
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Protocol, Self, cast
 from cyclonedds.idl import IdlStruct
 
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.robot import messages as m
+from surgicai_vision.robot.codecs import Codecs, Dialect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -309,180 +309,20 @@ class CompressedImage(IdlStruct, typename="sensor_msgs::msg::dds_::CompressedIma
         return _read_bytes(cls, "s", data, has_header, use_version_2)
 
 
-def _to_header(header: m.Header) -> Header:
-    sec, nanosec = divmod(header.stamp, SECOND)
-    return Header(Time(sec, nanosec), header.frame)
+def _time(nanoseconds: int) -> Time:
+    sec, nanosec = divmod(nanoseconds, SECOND)
+    return Time(sec, nanosec)
 
 
-def _from_header(header: Header) -> m.Header:
-    return m.Header(header.stamp.sec * SECOND + header.stamp.nanosec, header.frame_id)
-
-
-def _to_joints(state: m.JointState) -> JointState:
-    return JointState(
-        _to_header(state.header),
-        list(state.names),
-        list(state.position),
-        list(state.velocity),
-        list(state.effort),
-    )
-
-
-def _from_joints(sample: JointState) -> m.JointState:
-    return m.JointState(
-        _from_header(sample.header),
-        tuple(sample.name),
-        tuple(sample.position),
-        tuple(sample.velocity),
-        tuple(sample.effort),
-    )
-
-
-def _to_pose(message: m.PoseStamped) -> PoseStamped:
-    pose = Pose(Point(*message.position), Quaternion(*message.quaternion))
-    return PoseStamped(_to_header(message.header), pose)
-
-
-def _from_pose(sample: PoseStamped) -> m.PoseStamped:
-    place = sample.pose.position
-    turn = sample.pose.orientation
-    return m.PoseStamped(
-        _from_header(sample.header), (place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w)
-    )
-
-
-def _to_twist(message: m.TwistStamped) -> TwistStamped:
-    twist = Twist(Vector3(*message.linear), Vector3(*message.angular))
-    return TwistStamped(_to_header(message.header), twist)
-
-
-def _from_twist(sample: TwistStamped) -> m.TwistStamped:
-    linear = sample.twist.linear
-    angular = sample.twist.angular
-    return m.TwistStamped(
-        _from_header(sample.header),
-        (linear.x, linear.y, linear.z),
-        (angular.x, angular.y, angular.z),
-    )
-
-
-def _to_state(message: m.OperatingState) -> OperatingState:
-    header = _to_header(message.header)
-    return OperatingState(header, message.state, message.is_homed, message.is_busy)
-
-
-def _from_state(sample: OperatingState) -> m.OperatingState:
-    header = _from_header(sample.header)
-    return m.OperatingState(header, sample.state, bool(sample.is_homed), bool(sample.is_busy))
-
-
-def _to_image(image: m.Image) -> Image:
-    header = _to_header(image.header)
-    return Image(header, image.height, image.width, "rgb8", 0, 3 * image.width, image.data)
-
-
-def _from_image(sample: Image) -> m.Image:
-    """Return an image of red, green, blue.
-
-    Raises:
-        InputError: another encoding, or another size than announced.
-    """
-    height = sample.height
-    width = sample.width
-    if sample.encoding not in ("rgb8", "bgr8"):
-        raise InputError(f"an image of encoding {sample.encoding[:20]}; allowed: rgb8, bgr8.")
-    if sample.step != 3 * width or len(sample.data) != 3 * width * height:
-        raise InputError(f"an image of {height} × {width} with {len(sample.data)} bytes.")
-    data = bytes(sample.data)
-    if sample.encoding == "bgr8":
-        turned = bytearray(data)
-        turned[0::3] = data[2::3]
-        turned[2::3] = data[0::3]
-        data = bytes(turned)
-    return m.Image(_from_header(sample.header), height, width, data)
-
-
-def _to_info(info: m.CameraInfo) -> CameraInfo:
-    a, b, c, d, e, f, g, h, i = info.intrinsics
-    return CameraInfo(
-        _to_header(info.header),
-        info.height,
-        info.width,
-        "plumb_bob",
-        [0.0] * 5,
-        [*info.intrinsics],
-        [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        [a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0],
-        0,
-        0,
-        RegionOfInterest(0, 0, 0, 0, False),
-    )
-
-
-def _from_info(sample: CameraInfo) -> m.CameraInfo:
-    header = _from_header(sample.header)
-    return m.CameraInfo(header, sample.height, sample.width, tuple(sample.k))
-
-
-@dataclass(frozen=True)
-class Codec:
-    """A message's DDS type, and the way there and back.
-
-    Attributes:
-        type: the DDS type.
-        encode: makes a sample of a message.
-        decode: makes a message of a sample; InputError: it cannot be used.
-    """
-
-    type: type[IdlStruct]
-    encode: Callable[[m.Message], IdlStruct]
-    decode: Callable[[IdlStruct], m.Message]
-
-
-def _codec[M, S](
-    sample: type[IdlStruct], encode: Callable[[M], S], decode: Callable[[S], M]
-) -> Codec:
-    return Codec(
-        sample,
-        cast(Callable[[m.Message], IdlStruct], encode),
-        cast(Callable[[IdlStruct], m.Message], decode),
-    )
-
-
-CODECS = MappingProxyType(
+TYPES: Mapping[str, type[IdlStruct]] = MappingProxyType(
     {
-        m.JointState: _codec(JointState, _to_joints, _from_joints),
-        m.PoseStamped: _codec(PoseStamped, _to_pose, _from_pose),
-        m.TwistStamped: _codec(TwistStamped, _to_twist, _from_twist),
-        m.OperatingState: _codec(OperatingState, _to_state, _from_state),
-        m.StringStamped: _codec(
-            StringStamped,
-            lambda message: StringStamped(_to_header(message.header), message.text),
-            lambda sample: m.StringStamped(_from_header(sample.header), sample.string),
-        ),
-        m.String: _codec(
-            String, lambda message: String(message.text), lambda sample: m.String(sample.data)
-        ),
-        m.Image: _codec(Image, _to_image, _from_image),
-        m.CompressedImage: _codec(
-            CompressedImage,
-            lambda message: CompressedImage(
-                _to_header(message.header), message.format, message.data
-            ),
-            lambda sample: m.CompressedImage(
-                _from_header(sample.header), sample.format, bytes(sample.data)
-            ),
-        ),
-        m.CameraInfo: _codec(CameraInfo, _to_info, _from_info),
-        m.Joy: _codec(
-            Joy,
-            lambda message: Joy(
-                _to_header(message.header), list(message.axes), list(message.buttons)
-            ),
-            lambda sample: m.Joy(
-                _from_header(sample.header), tuple(sample.axes), tuple(sample.buttons)
-            ),
-        ),
+        kind.__idl_typename__.replace("::msg::dds_::", "/").rstrip("_"): kind
+        for kind in (
+            *(Header, String, Vector3, Point, Quaternion, Pose, PoseStamped, Twist, TwistStamped),
+            *(JointState, OperatingState, StringStamped, Joy, RegionOfInterest, CameraInfo),
+            *(Image, CompressedImage),
+        )
     }
 )
-"""Message → its codec."""
+"""A type's name, as ROS has it → the type."""
+CODECS = Codecs(Dialect(TYPES, _time, lambda stamp: stamp.sec * SECOND + stamp.nanosec))

@@ -21,6 +21,10 @@ SERVO = "servo"
 """Reliable, the last one: a set point supersedes the one before."""
 IMAGE = "image"
 """Reliable, the last two: images are large."""
+DEPTHS = MappingProxyType({STATE: 10, EVENT: 10, LATCHED: 1, SERVO: 1, IMAGE: 2})
+"""Quality → how many messages are kept."""
+STAYING = (EVENT, LATCHED)
+"""Qualities whose messages are also for those who come later."""
 
 
 @dataclass(frozen=True)

@@ -64,8 +64,37 @@ class Transport(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
 
-TRANSPORTS = MappingProxyType({"cyclonedds": "surgicai_vision.robot.dds:CycloneTransport"})
-"""Name → what carries messages by it, made with (interface, domain)."""
+@dataclass(frozen=True)
+class _Entry:
+    """A transport of the table.
+
+    Attributes:
+        place: "module:class" of what carries messages, made with (interface, domain).
+        needs: what to do where something it imports is missing.
+    """
+
+    place: str
+    needs: str
+
+
+TRANSPORTS = MappingProxyType(
+    {
+        "cyclonedds": _Entry(
+            "surgicai_vision.robot.dds:CycloneTransport", "pip install 'surgicai-vision[ros]'"
+        ),
+        "rclpy": _Entry(
+            "surgicai_vision.robot.ros2:RclpyTransport",
+            "source ROS 2's setup.bash, of a Python like this one, and that of a workspace with "
+            "crtk_msgs; or take --transport cyclonedds, which needs no ROS",
+        ),
+        "rospy": _Entry(
+            "surgicai_vision.robot.ros1:RospyTransport",
+            "source ROS 1's setup.bash (Debian: apt-get install python3-rospy "
+            "python3-sensor-msgs, and PYTHONPATH=/usr/lib/python3/dist-packages)",
+        ),
+    }
+)
+"""Name → what carries messages by it."""
 
 
 def open_transport(name: str, interface: str = LOOPBACK, domain: int = 0) -> Transport:
@@ -81,12 +110,14 @@ def open_transport(name: str, interface: str = LOOPBACK, domain: int = 0) -> Tra
         InputError: what it needs is not installed, or the interface cannot be used.
     """
     check_name("transport", name, TRANSPORTS)
-    module, _, member = TRANSPORTS[name].partition(":")
+    entry = TRANSPORTS[name]
+    module, _, member = entry.place.partition(":")
     try:
         make: Callable[[str, int], Transport] = vars(importlib.import_module(module))[member]
+        return make(interface, domain)
     except ImportError as error:
+        missing = error.name or str(error).splitlines()[0]
         raise InputError(
-            f"The transport {name} needs a package that is not installed ({error.name}): "
-            "pip install 'surgicai-vision[ros]'."
+            f"The transport {name} needs a package that is not installed ({missing}): "
+            f"{entry.needs}."
         ) from None
-    return make(interface, domain)

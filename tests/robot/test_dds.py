@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from example_messages import EXAMPLES
 from served import DOMAIN, serving
 
 from surgicai_vision import envs
@@ -24,22 +25,10 @@ from surgicai_vision.robot.topics import Topic
 from surgicai_vision.robot.transport import open_transport
 
 pytest.importorskip("cyclonedds", reason="the extra `ros` is not installed")
-from surgicai_vision.robot.dds import _sockets
-from surgicai_vision.robot.idl import CODECS
+from surgicai_vision.robot.codecs import ROS_NAMES
+from surgicai_vision.robot.idl import TYPES
+from surgicai_vision.robot.sockets import open_sockets
 
-HEADER = m.Header(1_795_000_000_123_456_789, "ECM_view")
-EXAMPLES = [
-    m.JointState(HEADER, ("yaw", "pitch"), (0.1, -0.2), (0.0, 1e-9), ()),
-    m.PoseStamped(HEADER, (0.1, 0.2, 0.3), (0.0, 0.6, 0.0, 0.8)),
-    m.TwistStamped(HEADER, (0.1, 0.2, 0.3), (1.0, 2.0, 3.0)),
-    m.OperatingState(HEADER, "ENABLED", True, False),
-    m.StringStamped(HEADER, "clear_fault"),
-    m.String("400006"),
-    m.Image(HEADER, 2, 3, bytes(range(18))),
-    m.CompressedImage(HEADER, "jpeg", b"\xff\xd8 and so on"),
-    m.Joy(HEADER, (0.5, -1.0), (1, 0)),
-    m.CameraInfo(HEADER, 2, 3, tuple(float(value) for value in range(9))),
-]
 SEED = 900_001
 
 
@@ -75,13 +64,13 @@ def test_a_type_has_the_name_that_ros_gives_it(message):
         "StringStamped": "crtk_msgs",
     }.get(type(message).__name__, "geometry_msgs")
     wanted = f"{package}::msg::dds_::{type(message).__name__}_"
-    assert CODECS[type(message)].type.__idl_typename__ == wanted
+    assert TYPES[ROS_NAMES[type(message)]].__idl_typename__ == wanted
 
 
 def test_every_socket_hears_the_loopback_alone(transport):
     """Bound to the device: what comes by another interface is dropped by the kernel."""
     checked = 0
-    for descriptor in _sockets():
+    for descriptor in open_sockets():
         with socket.socket(fileno=os.dup(descriptor)) as one:
             if one.family != socket.AF_INET or one.type != socket.SOCK_DGRAM:
                 continue

@@ -7,9 +7,10 @@ from cyclopts import Parameter
 
 from surgicai_vision.commands.options import within
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.robot.sockets import LAST_DOMAIN
+from surgicai_vision.robot.transport import TRANSPORTS
 
-TRANSPORT = Parameter(choices=("cyclonedds",))
-LAST_DOMAIN = 232
+TRANSPORT = Parameter(choices=tuple(TRANSPORTS))
 INTERFACE = Parameter(
     help="Network interface that is used and heard, and no other; lo is this machine alone.",
     metavar="NAME",

@@ -1,0 +1,129 @@
+"""Programs that run with a real ROS, in a Python that imports it, beside the test."""
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+ROSPY_PATH = os.environ.get("SURGICAI_ROSPY_PATH", "/usr/lib/python3/dist-packages")
+"""Folder of rospy's packages (Debian: python3-rospy, python3-rosmaster, python3-sensor-msgs)."""
+RCLPY_PYTHON = os.environ.get("SURGICAI_RCLPY_PYTHON", sys.executable)
+"""A Python that imports rclpy; of this Python's version where it is to import us too."""
+APPENDED = "import sys; sys.path += {paths!r}\n"
+"""What makes a Python find packages after its own."""
+MASTER = """
+import os, time
+from rosmaster.master import Master
+master = Master(port=int(sys.argv[1]))
+master.start()
+print("up", flush=True)
+while True:
+    time.sleep(1.0)
+"""
+COMMAND = "from surgicai_vision.commands.main import main\nsys.exit(main())\n"
+ECHO = """
+import json, time
+from example_messages import EXAMPLES
+from surgicai_vision.robot import topics
+from surgicai_vision.robot.transport import open_transport
+
+name, domain = sys.argv[1], int(sys.argv[2])
+with open_transport(name, domain=domain) as transport:
+    same = {}
+    for message in EXAMPLES:
+        kind = type(message).__name__
+        topic = topics.Topic(f"/test/{kind}", type(message), topics.EVENT)
+        publish = transport.publisher(topic)
+        inbox = transport.inbox(topic)
+        found = []
+        ends = time.monotonic() + 10.0
+        while not found and time.monotonic() < ends:
+            if transport.listeners(topic):
+                publish(message)
+            transport.wait(0.2)
+            found = inbox()
+        same[kind] = bool(found) and repr(found[0].message) == repr(message)
+        sources = {received.source for received in found}
+    print(json.dumps({"same": same, "sources": len(sources)}))
+"""
+
+
+def missing_rospy():
+    """Return why rospy cannot be used here, or ""."""
+    probe = run_ros("rospy", "import rospy, rosmaster, sensor_msgs.msg")
+    return (
+        ""
+        if probe.returncode == 0
+        else (
+            "no rospy here (Debian: python3-rospy, python3-rosmaster, python3-sensor-msgs); "
+            "SURGICAI_ROSPY_PATH may name the folder of its packages"
+        )
+    )
+
+
+def missing_rclpy(*packages):
+    """Return why rclpy cannot be used here, or ""."""
+    imports = ", ".join(("rclpy", "numpy", "cyclopts", "surgicai_vision.robot.ros2", *packages))
+    probe = run_ros("rclpy", f"import {imports}")
+    return (
+        ""
+        if probe.returncode == 0
+        else (
+            f"no rclpy here that imports us and {', '.join(packages)}; SURGICAI_RCLPY_PYTHON may "
+            "name a Python of this version that has both"
+        )
+    )
+
+
+def ros_command(kind, code, *arguments):
+    """Return the command that runs code with the ROS of that kind, and its environment."""
+    python = RCLPY_PYTHON if kind == "rclpy" else sys.executable
+    own = [str(ROOT), str(ROOT / "tests/helpers")]
+    if kind == "rclpy":
+        appended = [*own, *(path for path in sys.path if path.endswith("site-packages"))]
+    else:
+        appended = [*own, ROSPY_PATH]
+    text = APPENDED.format(paths=appended) + code
+    env = {**os.environ, "MUJOCO_GL": "egl", "ROS_IP": "127.0.0.1"}
+    return [python, "-c", text, *map(str, arguments)], env
+
+
+def run_ros(kind, code, *arguments, timeout=120):
+    """Run code to its end."""
+    command, env = ros_command(kind, code, *arguments)
+    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=timeout)
+
+
+@contextlib.contextmanager
+def running(kind, code, *arguments, until):
+    """Run code beside the test once its output has a line with `until`."""
+    command, env = ros_command(kind, code, *arguments)
+    process = subprocess.Popen(
+        command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        said = ""
+        for line in process.stdout:
+            said += line
+            if until in line:
+                break
+        else:
+            raise AssertionError(said)
+        yield process
+    finally:
+        process.terminate()
+        process.wait(20)
+        process.stdout.close()
+
+
+@contextlib.contextmanager
+def master(monkeypatch):
+    """Run a rosmaster on a free port of the loopback; ROS_MASTER_URI names it."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    monkeypatch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{port}")
+    with running("rospy", MASTER, port, until="up"):
+        yield
