@@ -14,14 +14,14 @@ import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import yaml
 from cyclopts import App, Parameter, Token, validators
 from cyclopts.argument import Argument, ArgumentCollection
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import TaskConfig, convert, from_mapping
-from surgicai_vision.core.errors import BadFile, InputError, UnknownName
+from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.core.files import read_yaml
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.features import encoders
 
@@ -217,23 +217,3 @@ def _written_as(hint: type) -> type:
     if hint is Path:
         return str
     return tuple[str, ...] if hint == tuple[Path, ...] else hint
-
-
-def read_yaml(path: Path) -> dict[str, object]:
-    """Read a YAML file that holds a table.
-
-    Raises:
-        BadFile: the file is missing, or holds something else.
-    """
-    try:
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadFile(f"{path} is not valid YAML ({' '.join(str(error).split())}).") from None
-    except (RecursionError, ValueError) as error:
-        problem = " ".join(str(error).split())[:100]
-        raise BadFile(f"{path} is refused: {type(error).__name__} ({problem}).") from None
-    if not isinstance(table, dict) or not all(isinstance(key, str) for key in table):
-        raise BadFile(f"{path} holds no table of keys; write one `key: value` a line.")
-    return table

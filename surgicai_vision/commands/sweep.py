@@ -14,11 +14,10 @@ from surgicai_vision.commands.options import (
     EXECUTOR,
     IMAGE_SIZE,
     default_text,
-    read_yaml,
 )
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, UnknownName
-from surgicai_vision.core.files import configs_folder
+from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.experiments.plan_config import plan_of
 from surgicai_vision.experiments.sweep.grid import AXES, Grid
 

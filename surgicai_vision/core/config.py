@@ -337,7 +337,7 @@ def read_changes(texts: Iterable[str]) -> dict[str, JSON]:
             )
         try:
             changes[key] = yaml.safe_load(value)
-        except yaml.YAMLError:
+        except (yaml.YAMLError, ValueError, RecursionError):  # a date that does not exist, …
             raise InputError(f"change '{text}': {value!r} is no YAML value.") from None
     return changes
 

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import yaml
 from filelock import FileLock
 
 from surgicai_vision import __version__
@@ -53,6 +54,32 @@ def read_json(path: Path) -> Any:
         raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
     except ValueError as error:
         raise BadFile(f"{path} is not valid JSON ({error}).") from None
+
+
+def read_yaml(path: Path, *, may_be_empty: bool = False) -> dict[str, object]:
+    """Read a YAML file that holds a table.
+
+    Args:
+        path: the file.
+        may_be_empty: a file of nothing, or of comments alone, is an empty table.
+
+    Raises:
+        BadFile: the file is missing or damaged, or holds something else.
+    """
+    try:
+        table = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BadFile(f"{path} is not valid YAML ({' '.join(str(error).split())}).") from None
+    except (RecursionError, ValueError) as error:
+        problem = " ".join(str(error).split())[:100]
+        raise BadFile(f"{path} is refused: {type(error).__name__} ({problem}).") from None
+    if table is None and may_be_empty:
+        return {}
+    if not isinstance(table, dict) or not all(isinstance(key, str) for key in table):
+        raise BadFile(f"{path} holds no table of keys; write one `key: value` a line.")
+    return table
 
 
 @contextmanager

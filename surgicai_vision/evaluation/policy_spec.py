@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import yaml
-
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
-from surgicai_vision.core.errors import BadFile, InputError, UnknownName, check_name
+from surgicai_vision.core.errors import InputError, UnknownName, check_name
+from surgicai_vision.core.files import read_yaml
 from surgicai_vision.core.plugins import resolve
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.evaluation import lerobot_agent
@@ -304,11 +303,7 @@ def read_hierarchical(path: Path) -> HierarchicalConfig:
         BadFile: it cannot be read.
         InputError: a key or a value that is not allowed.
     """
-    try:
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadFile(f"Cannot read {path}: {' '.join(str(error).split())}.") from None
-    return from_mapping(HierarchicalConfig, table or {}, str(path))
+    return from_mapping(HierarchicalConfig, read_yaml(path), str(path))
 
 
 def _common_env(trained_in: Iterable[TaskConfig]) -> TaskConfig:

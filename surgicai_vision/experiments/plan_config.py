@@ -43,13 +43,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import yaml
-
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
-from surgicai_vision.core.errors import BadFile, InputError, check_name
-from surgicai_vision.core.files import configs_folder
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.experiments.dataset_config import (
     MOST_EPISODES,
@@ -521,8 +519,4 @@ def read_plan(path: Path | None = None) -> Plan:
         InputError: a key or a value that is not allowed.
     """
     path = path or configs_folder() / "release.yaml"
-    try:
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadFile(f"Cannot read {path}: {' '.join(str(error).split())}.") from None
-    return plan_of(table or {}, str(path))
+    return plan_of(read_yaml(path), str(path))

@@ -10,11 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import yaml
-
 from surgicai_vision.core.config import JSON, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name
-from surgicai_vision.core.files import configs_folder
+from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.core.plugins import POLICIES_GROUP, Registry
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training import released
@@ -87,12 +85,7 @@ def load_recipe(
     if path.suffix not in (".yaml", ".yml"):
         check_name("recipe", str(recipe), recipe_names())
         path = (configs_folder() / "recipes") / f"{recipe}.yaml"
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadFile(f"Cannot read the recipe {path}: {' '.join(str(error).split())}.") from None
-    if not isinstance(values, Mapping):
-        raise BadFile(f"The recipe {path} is not a table of keys.")
+    values = read_yaml(path, may_be_empty=True)
     return from_mapping(plugin.recipe, {**values, **(changes or {})}, f"recipe {recipe}")
 
 

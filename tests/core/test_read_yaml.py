@@ -1,0 +1,62 @@
+"""YAML files of a user: every reader refuses the same ones, in one line."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from surgicai_vision.commands.sweep import read_experiment
+from surgicai_vision.core.config import read_changes
+from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.core.files import read_yaml
+from surgicai_vision.evaluation.policy_spec import read_hierarchical
+from surgicai_vision.experiments.plan_config import read_plan
+from surgicai_vision.training.policies import load_recipe
+
+WRONG = {
+    "list": (b"- 1\n- 2\n", "no table"),
+    "no list": (b"[]", "no table"),
+    "text": (b"true", "no table"),
+    "numbers as keys": (b"1: 2", "no table"),
+    "open": (b"a: [", "not valid YAML"),
+    "code": (b"!!python/object/apply:os.system ['true']", "not valid YAML"),
+    "bytes": (b"\xff\xfe\x00", "not valid YAML"),
+    "no such day": (b"a: 2026-02-31", "refused: ValueError"),
+    "deep": (b"a: " + b"[" * 5000, "refused: RecursionError"),
+}
+READERS: dict[str, Callable[[Path], object]] = {
+    "table": read_yaml,
+    "recipe": lambda path: load_recipe("bc", path),
+    "hierarchical": read_hierarchical,
+    "plan": read_plan,
+    "experiment": read_experiment,
+}
+
+
+@pytest.mark.parametrize("read", READERS.values(), ids=READERS)
+def test_every_reader_refuses_what_is_no_table(read, tmp_path):
+    path = tmp_path / "given.yaml"
+    for content, told in WRONG.values():
+        path.write_bytes(content)
+        with pytest.raises(BadFile, match=told) as caught:
+            read(path)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    for missing in (tmp_path / "missing.yaml", tmp_path):
+        with pytest.raises(BadFile, match=f"Cannot read {missing}"):
+            read_yaml(missing)
+
+
+def test_an_empty_file_is_a_table_only_where_it_may_be(tmp_path):
+    path = tmp_path / "given.yaml"
+    path.write_text("# nothing yet\n")
+    assert read_yaml(path, may_be_empty=True) == {}
+    assert load_recipe("bc", path) == load_recipe("bc", path, {})
+    for read in (read_yaml, read_hierarchical, read_plan):
+        with pytest.raises(BadFile, match="no table"):
+            read(path)
+
+
+def test_a_change_that_no_value_stands_for_is_refused():
+    for value in ("[", "2026-02-31", "[" * 5000):
+        with pytest.raises(InputError, match="no YAML value"):
+            read_changes((f"a={value}",))
