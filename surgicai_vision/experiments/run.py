@@ -5,12 +5,12 @@ the one that is there, so running again continues.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from policies.base import Policy
+from encoders.base import Encoder
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.subset import (
@@ -64,9 +64,10 @@ def train_run(
     start_policy = policies.load_policy(start) if start else None
     features = _encode(run, dataset, stage, weights)
     if progress_policy is not None:
-        fed = with_progress(
-            dataset, progress_policy, _seen_by(progress_policy, dataset, stage, weights)
-        )
+        encoder = policies.load_encoder_of(progress_policy.checkpoint, weights)
+        views = progress_policy.checkpoint.views
+        seen = _encode_views(encoder, views, dataset, stage, "features of the progress")
+        fed = with_progress(dataset, progress_policy, seen)
         dataset = fed
         features = [entry.part(fed.rows, fed.fingerprint) for entry in features]
     subsets: list[Callable[[Dataset], DatasetSubset]] = []
@@ -95,20 +96,6 @@ def train_run(
         )
 
 
-def _seen_by(
-    policy: Policy, dataset: Dataset, stage: Stage, weights: WeightsSource
-) -> list[Features]:
-    """Return the features of a dataset as a trained policy sees it, cached or encoded now."""
-    encoder = policies.load_encoder_of(policy.checkpoint, weights)
-    if encoder is None:
-        return []
-    features = []
-    for view in policy.checkpoint.views:
-        with stage(f"features of the progress: {view}", "frames") as progress:
-            features.append(encode(dataset, view, encoder, progress=progress))
-    return features
-
-
 def encode_run(
     run: RunConfig, dataset: Dataset, stage: Stage, weights: WeightsSource = ANYWHERE
 ) -> list[Features]:
@@ -121,11 +108,18 @@ def _encode(
     run: RunConfig, dataset: Dataset, stage: Stage, weights: WeightsSource
 ) -> list[Features]:
     """Encode a run's views, all frames of `dataset`."""
-    if not run.encoder:
-        return []
-    encoder = load_encoder(run.encoder, run.pool, weights)
-    features = []
-    for view in run.views:
-        with stage(f"features: {run.encoder}, {view}", "frames") as progress:
+    encoder = load_encoder(run.encoder, run.pool, weights) if run.encoder else None
+    return _encode_views(encoder, run.views, dataset, stage, f"features: {run.encoder}")
+
+
+def _encode_views(
+    encoder: Encoder | None, views: Sequence[str], dataset: Dataset, stage: Stage, title: str
+) -> list[Features]:
+    """Encode all frames of `dataset`, one entry a view; none without an encoder."""
+    features: list[Features] = []
+    if encoder is None:
+        return features
+    for view in views:
+        with stage(f"{title}, {view}", "frames") as progress:
             features.append(encode(dataset, view, encoder, progress=progress))
     return features

@@ -21,10 +21,11 @@ machine.
 """
 
 import ctypes
+import functools
 import io
 import json
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -174,6 +175,14 @@ class _Task:
             seed=self.seed,
         )
 
+    @functools.cached_property
+    def columns(self) -> Mapping[str, NDArray[np.generic]]:
+        """What it is fed beside features (else the state), and what it learns, by their names."""
+        with torch.random.fork_rng(devices=[]):
+            vector = self.untrained().inputs.vector
+        keys = (vector or names.STATE, self.policy.target)
+        return {key: column(self.dataset, key) for key in keys}
+
     def untrained(self) -> Policy:
         """Return the policy as it is before training."""
         return self.policy.make(self.recipe, tuple(entry.shape for entry in self.features))
@@ -201,10 +210,8 @@ def _check(task: _Task) -> None:
         raise InputError(
             "The features come from several encoders; encode every view by the same one."
         )
-    with torch.random.fork_rng(devices=[]):
-        vector = task.untrained().inputs.vector
-    for key in (vector or names.STATE, task.policy.target):
-        if not np.isfinite(column(task.dataset, key)).all():
+    for key, values in task.columns.items():
+        if not np.isfinite(values).all():
             raise InputError(f"Column '{key}' of the dataset holds values that are not finite.")
 
 
@@ -241,8 +248,8 @@ class _Training:
         torch.manual_seed(task.seed)
         self.policy = task.untrained()
         vector = self.policy.inputs.vector
-        self.vector = np.asarray(column(task.dataset, vector), np.float32) if vector else None
-        target = column(task.dataset, task.policy.target)
+        self.vector = np.asarray(task.columns[vector], np.float32) if vector else None
+        target = task.columns[task.policy.target]
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
         self.target = torch.from_numpy(target.astype(kind))
         if start is None:
@@ -410,9 +417,8 @@ class _Training:
             "policy": self.policy.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "schedule": self.schedule.state_dict() if self.schedule else {},
-            "order": json.dumps(
-                self.order.bit_generator.state
-            ),  # its integers are wider than a tensor's
+            # Its integers are wider than a tensor's.
+            "order": json.dumps(self.order.bit_generator.state),
             "random": torch.get_rng_state(),
             "losses": self.losses,
             "held_losses": self.held_losses,
