@@ -16,14 +16,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import JSON, to_mapping
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.progress import Stage
-from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
-from surgicai_vision.evaluation.policy_spec import open_policy, read_hierarchical
+from surgicai_vision.evaluation.hierarchical_config import (
+    HierarchicalConfig,
+    hierarchical_yaml,
+    read_hierarchical,
+)
+from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.run import evaluate_once
 from surgicai_vision.evaluation.storage import Row
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
@@ -109,19 +111,14 @@ def sweep_ends(
     tried = {}
     for config in configs:
         name = f"confidence-{config.confidence:g}-patience-{config.patience}"
-        file = _write(out / f"{name}.yaml", config)
+        file = out / f"{name}.yaml"
+        files.write_bytes(file, hierarchical_yaml(config))
         opened = functools.partial(open_policy, file, env=env, weights=weights)
         row = evaluate_once(out / name, opened, starts.seeds, stage, workers)
         tried[config] = _ends(config, row)
     best = min(configs, key=lambda config: tried[config].rank())
-    _write(out / CHOSEN, best)
+    files.write_bytes(out / CHOSEN, hierarchical_yaml(best))
     return sorted(tried.values(), key=Ends.rank)
-
-
-def _write(path: Path, config: HierarchicalConfig) -> Path:
-    """Write the YAML file of a hierarchical policy and return its path."""
-    files.write_bytes(path, yaml.safe_dump(to_mapping(config), sort_keys=False).encode())
-    return path
 
 
 def _ends(config: HierarchicalConfig, summary: Row) -> Ends:

@@ -11,7 +11,8 @@ from pathlib import Path
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import JSON, to_mapping
 from surgicai_vision.core.progress import Stage
-from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy, read_hierarchical
+from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
+from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.evaluation.run import evaluate_into
 from surgicai_vision.evaluation.statistics import clopper_pearson, holm, mcnemar
 from surgicai_vision.evaluation.storage import MARKER, Row, parquet_bytes, read_rows

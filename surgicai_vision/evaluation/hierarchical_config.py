@@ -1,13 +1,22 @@
 """What a hierarchical policy consists of, as data; light to import, for the command line.
 
+Interface:
+
+* `HierarchicalConfig`: who decides, who acts, and when a subtask ends.
+* `read_hierarchical(path)`, `hierarchical_yaml(config)`: from its YAML file and back.
+
 What it does: `evaluation.hierarchical`.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import DWELL
+from surgicai_vision.core.config import DWELL, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.files import read_yaml
 from surgicai_vision.training.run_config import TERMINATIONS
 
 ORDER = "order"
@@ -88,3 +97,18 @@ class HierarchicalConfig:
     def advance(self) -> str:
         """Who takes the env to its next subtask: `TaskConfig.advance`."""
         return "told" if self.termination == "learned" else "success"
+
+
+def read_hierarchical(path: Path) -> HierarchicalConfig:
+    """Read the YAML file of a hierarchical policy.
+
+    Raises:
+        BadFile: it cannot be read.
+        InputError: a key or a value that is not allowed.
+    """
+    return from_mapping(HierarchicalConfig, read_yaml(path), str(path))
+
+
+def hierarchical_yaml(config: HierarchicalConfig) -> bytes:
+    """Return the YAML file of a hierarchical policy, its keys in the order of the fields."""
+    return yaml.safe_dump(to_mapping(config), sort_keys=False).encode()

@@ -18,7 +18,6 @@ from surgicai_vision.core import names
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, UnknownName, check_name
-from surgicai_vision.core.files import read_yaml
 from surgicai_vision.core.plugins import resolve
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.evaluation import lerobot_agent
@@ -31,7 +30,12 @@ from surgicai_vision.evaluation.agents import (
     mean_demonstration,
 )
 from surgicai_vision.evaluation.hierarchical import HierarchicalAgent
-from surgicai_vision.evaluation.hierarchical_config import ORDER, SUFFIXES, HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical_config import (
+    ORDER,
+    SUFFIXES,
+    HierarchicalConfig,
+    read_hierarchical,
+)
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.training import policies, released
@@ -294,16 +298,6 @@ def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent
         policy.inputs.vector or names.STATE,
         policy_agent(progress, weights) if progress else None,
     )
-
-
-def read_hierarchical(path: Path) -> HierarchicalConfig:
-    """Read the YAML file of a hierarchical policy.
-
-    Raises:
-        BadFile: it cannot be read.
-        InputError: a key or a value that is not allowed.
-    """
-    return from_mapping(HierarchicalConfig, read_yaml(path), str(path))
 
 
 def _common_env(trained_in: Iterable[TaskConfig]) -> TaskConfig:

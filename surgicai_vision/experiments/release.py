@@ -17,8 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import yaml
-
 from surgicai_vision import __version__
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import digest, to_mapping
@@ -27,6 +25,7 @@ from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.subset import of_subtask
+from surgicai_vision.evaluation.hierarchical_config import hierarchical_yaml
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.provenance import command_line
 from surgicai_vision.evaluation.run import evaluate_once
@@ -160,7 +159,7 @@ class _Build:
         hashes = {name: read_card(name).files[WEIGHTS] for name in together}
         parts = {part: f"{PREFIX}{policy.name}" for part, policy in self.plan.suture.items()}
         config = self.plan.hierarchical(None, parts)
-        content = yaml.safe_dump(to_mapping(config), sort_keys=False).encode()
+        content = hierarchical_yaml(config)
         policy = f"{PREFIX}{names.SUTURE}"
         card = ReleaseCard(
             name=names.SUTURE,

@@ -9,7 +9,7 @@ from surgicai_vision.commands.sweep import read_experiment
 from surgicai_vision.core.config import read_changes
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_yaml
-from surgicai_vision.evaluation.policy_spec import read_hierarchical
+from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.experiments.plan_config import read_plan
 from surgicai_vision.training.policies import load_recipe
 

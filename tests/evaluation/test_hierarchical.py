@@ -16,7 +16,11 @@ from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import ExpertAgent, PolicyAgent
 from surgicai_vision.evaluation.hierarchical import HierarchicalAgent
-from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical_config import (
+    HierarchicalConfig,
+    hierarchical_yaml,
+    read_hierarchical,
+)
 from surgicai_vision.evaluation.metrics import summary
 from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
 from surgicai_vision.evaluation.rollout import evaluate
@@ -313,13 +317,14 @@ def test_wrong_hierarchical_policies_are_refused(
     assert "'place'" in capsys.readouterr().err
 
 
-def test_the_documented_hierarchical_policy_is_one(root: Path) -> None:
-    import yaml
-
+def test_the_documented_hierarchical_policy_is_one(root: Path, tmp_path: Path) -> None:
     text = (root / "docs" / "hierarchical.md").read_text(encoding="utf-8")
-    made = from_mapping(
-        HierarchicalConfig, yaml.safe_load(text.split("```yaml\n")[1].split("```")[0])
-    )
+    path = tmp_path / "hierarchical.yaml"
+    path.write_text(text.split("```yaml\n")[1].split("```")[0])
+    made = read_hierarchical(path)
     assert made.termination in TERMINATIONS and all(
         f"{s}-of-suture-state" in getattr(made, s) for s in EXPERTS
     )
+    changed = replace(made, confidence=0.65, grasp="released:grasp")
+    path.write_bytes(hierarchical_yaml(changed))
+    assert read_hierarchical(path) == changed
