@@ -33,6 +33,7 @@ from surgicai_vision.experiments.sweep.lerobot import _arguments
 from surgicai_vision.experiments.sweep.plan import Jobs, plan, read_experiment_of, run_key
 from surgicai_vision.experiments.sweep.selection import read_choice
 from surgicai_vision.report.experiment_key import condition_of
+from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import read_checkpoint
 from surgicai_vision.training.run_config import OWN, RunConfig, Starts
 
@@ -225,6 +226,33 @@ def test_hierarchical_runs_share_their_policies():
     assert len({part for run in runs for part in parts_of(run).values()}) == 6
     with pytest.raises(InputError, match="no depth views"):
         RunConfig(TaskConfig("suture"), "random", ("front_depth",), termination="learned")
+
+
+def test_a_grid_gives_the_high_level_policy_a_recipe_of_its_kind():
+    shipped = Grid(
+        ("suture",),
+        ("random",),
+        (("front",),),
+        recipe=policies.recipe_names(),
+        hierarchical=("learned",),
+    )
+    for run in shipped.runs:
+        if not run.is_hierarchical or run.recipe == "high-level":
+            continue
+        parts = parts_of(run)
+        assert {part.recipe for name, part in parts.items() if name != "hlp"} == {run.recipe}
+        high = policies.recipe_of(parts["hlp"])
+        assert not high.clock, "it would be ignored: a high-level policy is fed none"
+        assert high.progress or run.recipe == "paper"
+
+
+def test_a_policy_that_does_not_act_is_refused_before_any_work(tmp_path):
+    grid = Grid(("suture",), ("random",), (("front",),), policy=("hlp",))
+    with pytest.raises(InputError, match="write `hierarchical:`"):
+        sweep(grid, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="needs task: suture"):
+        Grid(("grasp",), ("random",), (("front",),), hierarchical=("learned",))
 
 
 def test_features_are_made_once_for_all_runs(tmp_path):

@@ -48,6 +48,10 @@ AXES: Mapping[str, Callable[[RunConfig], object]] = MappingProxyType(
 """Keys of a grid that hold lists, and a run's value on each; one value alone may be written without
 brackets.
 """
+HIGH_LEVEL: Mapping[str, str] = MappingProxyType({"best": "high-level", "endoscope": "high-level"})
+"""Recipe of the low-level policies → the high-level policy's; any other trains both, as the paper's
+does.
+"""
 
 
 @dataclass(frozen=True)
@@ -178,6 +182,11 @@ class Grid:
         if not self.runs or len(set(self.runs)) != len(self.runs):
             raise InputError(
                 f"The grid has {len(self.runs)} runs, {len(set(self.runs))} of them different."
+            )
+        if self.hierarchical and not any(run.is_hierarchical for run in self.runs):
+            raise InputError(
+                f"hierarchical adds no run here; it needs task: {names.SUTURE}, an encoder and "
+                "views, or leave it out."
             )
 
     def _check_numbers(self) -> None:
@@ -398,14 +407,18 @@ class Grid:
 
 
 def parts_of(run: RunConfig) -> dict[str, RunConfig]:
-    """Return the policies of a hierarchical run: "hlp", and each subtask's but the one swapped."""
+    """Return the policies of a hierarchical run: "hlp", and each subtask's but the one swapped.
+
+    The high-level policy has its own recipe where `HIGH_LEVEL` names one.
+    """
     alone = replace(of_training(run), termination=None)
     low = {
         subtask: replace(alone, env=with_task(run.env, subtask))
         for subtask in names.SUBTASKS
         if subtask != run.expert_swap
     }
-    return {"hlp": replace(alone, policy="hlp"), **low}
+    recipe = HIGH_LEVEL.get(run.recipe, run.recipe)
+    return {"hlp": replace(alone, policy="hlp", recipe=recipe), **low}
 
 
 def with_task(config: TaskConfig, task: str) -> TaskConfig:

@@ -8,7 +8,7 @@ from typing import Final
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, digest, from_mapping, to_mapping
-from surgicai_vision.core.errors import BadFile, MissingWeights
+from surgicai_vision.core.errors import BadFile, InputError, MissingWeights
 from surgicai_vision.core.executor import Job, register_job
 from surgicai_vision.core.files import read_json
 from surgicai_vision.evaluation.storage import GRID_FILE, RESULT_FILE, read_versioned
@@ -114,12 +114,15 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
 
     Raises:
         UnknownName: a recipe, or a change of one, that does not exist.
-        InputError: a recipe that is fed progress, which no sweep says.
+        InputError: a recipe that is fed progress, which no sweep says, or a policy that chooses
+            subtasks where one that acts is needed.
     """
     for run in experiment.runs:
         for trained in trained_by(experiment, run):
             if trained.policy not in LEROBOT_POLICIES:
                 policies.check_progress_from(policies.recipe_of(trained), None)
+        if not experiment.parts(run):
+            _check_acts(run.policy)
     jobs = Jobs(experiment, out)
     weights = WeightsSource(accept_licence=experiment.accept_licence)
     missing = functools.lru_cache(functools.partial(_missing, weights=weights))
@@ -129,6 +132,16 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
 def trained_by(experiment: Experiment, run: RunConfig) -> list[RunConfig]:
     """Return the policies that must be trained for a run: its parts, or its own."""
     return [part.run for part in experiment.parts(run).values()] or [run]
+
+
+def _check_acts(policy: str) -> None:
+    """Refuse a policy that cannot be evaluated by itself."""
+    if policy in LEROBOT_POLICIES or policies.policy_plugin(policy).target == names.ACTION:
+        return
+    raise InputError(
+        f"policy: '{policy}' chooses subtasks and does not act; it is evaluated over a policy for "
+        "each subtask: write `hierarchical:` in place of it (docs/sweeps.md)."
+    )
 
 
 def _missing(encoder: str, weights: WeightsSource) -> str:
