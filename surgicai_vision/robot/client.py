@@ -6,17 +6,16 @@
     client.send("/PSM1/servo_cp", pose)
     client.step(["/PSM1/servo_cp"])      # only where the simulation's clock is ours
 
-The topics are a dVRK's (`robot.topics`); `ClientConfig` renames them where a robot's differ. What
-is sent has its own stamp; what is received is as old as its arrival here, since clocks differ.
+The topics are a dVRK's (`robot.topics`); a `RenamedTransport` renames them where a robot's differ.
+What is sent has its own stamp; what is received is as old as its arrival here, since clocks differ.
 """
 
-import dataclasses
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import final
 
-from surgicai_vision.core.errors import InputError, SurgicaiError, UnknownName
+from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.robot import topics
 from surgicai_vision.robot.messages import Header, Message, String, StringStamped
 from surgicai_vision.robot.simulated import PSM_NAMES
@@ -38,21 +37,19 @@ _DUE = (
 
 @dataclass(frozen=True)
 class ClientConfig:
-    """What a client hears and how a robot's topics are called.
+    """What a client hears.
 
     Attributes:
         arms: arms it hears and moves.
         views: views whose images it hears.
         is_compressed: hear the compressed images, not the raw ones.
         is_simulated: also use the topics that only a served simulation has.
-        renamed: topic of `robot.topics` → the robot's own name of it.
     """
 
     arms: tuple[str, ...] = tuple(PSM_NAMES)
     views: tuple[str, ...] = ()
     is_compressed: bool = False
     is_simulated: bool = False
-    renamed: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -88,15 +85,11 @@ class Client:
         if config.is_simulated:
             heard += [topics.STEPPED, topics.JUDGEMENT]
             said += [topics.STEP, topics.RESET, topics.ENTER]
-        known = {topic.name for topic in (*heard, *said)}
-        for name in config.renamed:
-            if name not in known:
-                raise UnknownName("topic", name, known)
         for topic in heard:
-            self._inboxes[topic.name] = transport.inbox(_renamed(topic, config.renamed))
-        self._said = [_renamed(topic, config.renamed) for topic in said]
-        for topic, renamed in zip(said, self._said, strict=True):
-            self._publishers[topic.name] = transport.publisher(renamed)
+            self._inboxes[topic.name] = transport.inbox(topic)
+        self._said = said
+        for topic in said:
+            self._publishers[topic.name] = transport.publisher(topic)
         self._is_simulated = config.is_simulated
 
     def connect(self, seconds: float = CONNECT_S) -> None:
@@ -235,8 +228,3 @@ def _is_older(message: Message, than: Message) -> bool:
     if isinstance(message, String) or isinstance(than, String):
         return False
     return 0 < message.header.stamp < than.header.stamp
-
-
-def _renamed(topic: Topic, table: Mapping[str, str]) -> Topic:
-    """Return a topic under the robot's own name of it."""
-    return dataclasses.replace(topic, name=table.get(topic.name, topic.name))

@@ -1,16 +1,12 @@
 """Driver: a policy at a dVRK, simulated or real, through its topics alone.
 
-    robot = DrivenRobot(client, views, task)
-    driver = Driver(agent, robot, config, log)
+    robot = DrivenRobot(client, views, task, size)
+    driver = Driver(agent, robot, task, config, dead_man, log, tell)
     driver.episode(seed, max_steps)
 
-Each control step the agent is given measured poses, jaws and images; its action is added to the
-set point that the robot itself publishes, as the envs add it to theirs, and sent as `servo_cp` and
-`jaw/servo_jp`, if the guards (`robot.guards`) find nothing against it. A set point is sent in the
-frame of the robot's own `setpoint_cp`: a dVRK reads no other, whatever a header says.
-
-Where the high-level policy begins the pull-out, PSM2 lets go, as the envs make it: the jaw opens,
-then the tool is drawn back along its axis. Nothing else is done that the policy has not said.
+Each control step the agent is given measured poses, jaws and images (`robot.driven`); what its
+action becomes, and whether it is sent, is `robot.setpoints`'. Nothing else is done that the policy
+has not said, but PSM2's letting go where the pull-out begins.
 """
 
 import json
@@ -26,212 +22,20 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, TaskConfig
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.envs import observation, poses
-from surgicai_vision.envs.control import JAW_OPEN, StepSize, moved
-from surgicai_vision.envs.simulation import RELEASE_JAW, RELEASE_SHIFT, RELEASE_STEPS
-from surgicai_vision.envs.suture import PULLOUT_PHASE
-from surgicai_vision.evaluation.agent import Agent, Observation
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.control import StepSize
+from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.robot import topics
-from surgicai_vision.robot.arm import FINGER_SHARE, JAW_NAME
-from surgicai_vision.robot.client import Client
-from surgicai_vision.robot.frames import T_WORLD_VIEW, VIEW, WORLD, read_pose, write_pose
-from surgicai_vision.robot.guards import (
-    BASE,
-    GuardConfig,
-    Input,
-    Planned,
-    TargetGuard,
-    problem_of_inputs,
-)
-from surgicai_vision.robot.messages import (
-    CompressedImage,
-    Header,
-    Image,
-    JointState,
-    OperatingState,
-    PoseStamped,
-    StringStamped,
-)
+from surgicai_vision.robot.driven import Command, DrivenRobot
+from surgicai_vision.robot.frames import WORLD
+from surgicai_vision.robot.guards import GuardConfig
+from surgicai_vision.robot.messages import StringStamped
 from surgicai_vision.robot.operating_state import DISABLED, FAULT
-from surgicai_vision.scene.kinematics import Pose
+from surgicai_vision.robot.setpoints import Setpoints
 
-RELEASED = names.PSM2.upper()
-"""The arm that lets go when the pull-out, which is the other one's, begins."""
-RELEASE_OPEN = 0.5
-"""Finger's angle to which PSM2 opens when it lets go [rad] (`Simulation._let_go`)."""
-SAME_M = 0.002
-"""Distance within which a set point that was sent still is the one that is obeyed [m]."""
 CONTROL_S = 1.0 / names.FPS
 STOPS = (DISABLED, FAULT)
 """States after which a run is over: somebody stopped the robot, and a person begins again."""
-
-
-@dataclass(frozen=True)
-class Command:
-    """What is sent to an arm: T_base_tip and one finger's angle [rad]."""
-
-    pose: Pose
-    jaw: float
-
-
-@final
-class DrivenRobot:
-    """What an agent may ask of a dVRK (`evaluation.agent.Robot`), from its topics.
-
-    Args:
-        client: hears and sends.
-        views: views of the agent.
-        task: its task; the active arm follows.
-        size: height and width the agent sees [pixel].
-    """
-
-    def __init__(self, client: Client, views: tuple[str, ...], task: str, size: int):
-        self.client = client
-        self.views = views
-        self._size = size
-        is_whole = task == names.SUTURE
-        self.phase = 0 if is_whole else names.SUBTASKS.index(task)
-        self._first = self.phase
-        self._entered: Callable[[str], object] | None = None
-        self.release_steps = 0
-
-    def on_enter(self, tell: Callable[[str], object]) -> None:
-        """Tell somebody which subtask is entered: the judge of a served simulation."""
-        self._entered = tell
-
-    def begin(self) -> None:
-        """Go back to the first subtask: an episode begins."""
-        self.phase = self._first
-        self.release_steps = 0
-
-    @property
-    def subtask(self) -> str:
-        """Return the present subtask's name."""
-        return names.SUBTASKS[self.phase]
-
-    @property
-    def active(self) -> str:
-        """Return the active arm's name on the topics."""
-        return names.ACTIVE_ARM[self.subtask].upper()
-
-    @property
-    def arms(self) -> tuple[str, ...]:
-        """Return the arms that may be moved now."""
-        return (self.active, RELEASED) if self.release_steps else (self.active,)
-
-    # -- evaluation.agent.Robot --------------------------------------------------------------------
-
-    def agent_pos(self) -> NDArray[np.float32]:
-        """Return the active arm's measured tip in its base, (7,), in m and rad."""
-        return np.array(self._seven(self.active), np.float32)
-
-    def both_arms(self) -> NDArray[np.float32]:
-        """Return both arms' `agent_pos`, psm1 first, (14,)."""
-        return np.array([self._seven(arm.upper()) for arm in names.ARMS], np.float32).ravel()
-
-    def enter(self, phase: int) -> None:
-        """Make a subtask the present one: its arm is active now."""
-        if not 0 <= phase < len(names.SUBTASKS):
-            raise InputError(f"There is no subtask {phase}; allowed: 0 to 4.")
-        if phase == self.phase:
-            return
-        self.phase = phase
-        self.release_steps = RELEASE_STEPS if phase == PULLOUT_PHASE else 0
-        if self._entered is not None:
-            self._entered(self.subtask)
-
-    # -- what the guards and the driver read -------------------------------------------------------
-
-    def measured(self, arm: str) -> Pose:
-        """Return the measured T_base_tip of an arm."""
-        return read_pose(self._pose(f"/{arm}/local/measured_cp"))
-
-    def told(self, arm: str) -> Command:
-        """Return an arm's set points as the robot publishes them."""
-        pose = read_pose(self._pose(f"/{arm}/local/setpoint_cp"))
-        return Command(pose, self._angle(f"/{arm}/jaw/setpoint_js"))
-
-    def frame(self, arm: str) -> tuple[str, Pose]:
-        """Return the frame of an arm's `setpoint_cp` and the base in it, T_frame_base.
-
-        It follows from the same set point in the base and in the frame.
-        """
-        outer = self._pose(f"/{arm}/setpoint_cp")
-        inner = read_pose(self._pose(f"/{arm}/local/setpoint_cp"))
-        return outer.header.frame, poses.compose(read_pose(outer), poses.invert(inner))
-
-    def base_in(self, arm: str, frame: str) -> Pose:
-        """Return the base in a workspace's frame, T_frame_base.
-
-        Raises:
-            InputError: the robot's own frame is another one.
-        """
-        if frame == BASE:
-            return poses.IDENTITY
-        own, base = self.frame(arm)
-        if own == frame:
-            return base
-        if (own, frame) == (VIEW, WORLD):  # the simulation's world, where its endoscope stands
-            return poses.compose(T_WORLD_VIEW, base)
-        raise InputError(f"{arm} speaks of '{own}'; the workspace's frame is '{frame}'.")
-
-    def operating(self, arm: str) -> tuple[str, bool]:
-        """Return an arm's operating state, "" before the first, and whether it is homed."""
-        heard = self.client.newest(f"/{arm}/operating_state")
-        if heard is None or not isinstance(heard.message, OperatingState):
-            return "", False
-        return heard.message.state, heard.message.is_homed
-
-    def input_topics(self) -> tuple[list[str], list[str]]:
-        """Return the topics of poses and jaws that are read, and those of images."""
-        channels = (
-            *("local/measured_cp", "local/setpoint_cp", "setpoint_cp"),
-            *("jaw/measured_js", "jaw/setpoint_js"),
-        )
-        states = [f"/{arm.upper()}/{channel}" for arm in names.ARMS for channel in channels]
-        return states, [self.client.image_topic(view) for view in self.views]
-
-    def observation(self) -> Observation:
-        """Return the images, view → (height, width, 3), and the active arm's pose."""
-        if not self.views:
-            return np.zeros(0, np.float32)
-        seen: dict[str, NDArray[np.uint8]] = {view: self._image(view) for view in self.views}
-        return {**seen, "agent_pos": self.agent_pos()}
-
-    def _seven(self, arm: str) -> list[float]:
-        finger = self._angle(f"/{arm}/jaw/measured_js")
-        return observation.seven(arm.lower(), self.measured(arm), finger)
-
-    def _pose(self, topic: str) -> PoseStamped:
-        heard = self.client.newest(topic)
-        assert heard is not None and isinstance(heard.message, PoseStamped), "the guards asked"
-        return heard.message
-
-    def _angle(self, topic: str) -> float:
-        """Return one finger's angle [rad] of a jaw's joint state."""
-        heard = self.client.newest(topic)
-        assert heard is not None and isinstance(heard.message, JointState), "the guards asked"
-        if len(heard.message.position) != 1 or not math.isfinite(heard.message.position[0]):
-            raise InputError(f"{topic} says {heard.message.position}; a jaw has one finite angle.")
-        return float(heard.message.position[0]) * FINGER_SHARE
-
-    def _image(self, view: str) -> NDArray[np.uint8]:
-        heard = self.client.newest(self.client.image_topic(view))
-        assert heard is not None, "the guards asked"
-        message = heard.message
-        if isinstance(message, CompressedImage):
-            frame = _decoded(message)
-        else:
-            assert isinstance(message, Image)
-            shape = (message.height, message.width, 3)
-            frame = np.frombuffer(message.data, np.uint8).reshape(shape)
-        if frame.shape[:2] != (self._size, self._size):
-            height, width = frame.shape[:2]
-            raise InputError(
-                f"the images of {view} are {height} × {width}; the policy sees "
-                f"{self._size} × {self._size}."
-            )
-        return frame
 
 
 @dataclass(frozen=True)
@@ -316,12 +120,16 @@ class Driver:
         self._client = robot.client
         self._task = task
         self._config = config
-        self._dead_man = dead_man
         self._log = log
         self._tell = tell
-        self._step_size = StepSize.of(task.step)
-        self._guard = TargetGuard(config.guards, self._step_size)
-        self._sent: dict[str, Command] = {}
+        self._setpoints = Setpoints(
+            robot,
+            StepSize.of(task.step),
+            config.guards,
+            dead_man,
+            sends=config.sends,
+            is_stepped=config.is_stepped,
+        )
         self._told = ""
         self._next_line = 0.0
         if config.is_simulated:
@@ -339,8 +147,7 @@ class Driver:
             self._client.reset(seed)
             self._check_judge()
         robot.begin()
-        self._guard.forget()
-        self._sent.clear()
+        self._setpoints.forget()
         self._agent.reset(0, robot, seed)
         steps = held = 0
         latencies: list[float] = []
@@ -348,7 +155,7 @@ class Driver:
         due = time.monotonic()
         for number in range(max_steps):
             self._client.update()
-            problem = self._problem()
+            problem = self._setpoints.problem_of_inputs()
             commands: Mapping[str, Command] = {}
             action: NDArray[np.float32] | None = None
             seen: list[float] = []
@@ -357,11 +164,11 @@ class Driver:
                 try:
                     seen = robot.both_arms().tolist()
                     action = self._agent.act([0], [robot], [robot.observation()])[0]
-                    commands, problem = self._planned(action, now)
+                    commands, problem = self._setpoints.of_action(action, now)
                 except InputError as error:  # what has come cannot be used
                     problem = str(error)
-                latencies.append(self._youngest())
-            self._send(commands if not problem else {})
+                latencies.append(self._setpoints.youngest())
+            self._setpoints.send(commands if not problem else {})
             steps += not problem
             held += bool(problem)
             latency = latencies[-1] if action is not None else None
@@ -394,98 +201,7 @@ class Driver:
                 f"--advance {self._task.advance}."
             )
 
-    # -- what is asked before ----------------------------------------------------------------------
-
-    def _problem(self) -> str:
-        """Return why nothing may be sent now, or ""."""
-        limits = self._config.guards
-        states, images = self._robot.input_topics()
-        inputs = [Input(topic, self._age(topic), limits.max_age) for topic in states]
-        inputs += [Input(topic, self._age(topic), limits.max_image_age) for topic in images]
-        operating = {arm: self._robot.operating(arm) for arm in self._robot.arms}
-        return problem_of_inputs(inputs, operating, self._dead_man())
-
-    def _age(self, topic: str) -> float:
-        """Return a message's age [s]; where the clock is ours, all are of the last step."""
-        age = self._client.age(topic)
-        return 0.0 if self._config.is_stepped and math.isfinite(age) else age
-
-    def _youngest(self) -> float:
-        """Return how long ago the newest pose came [s]."""
-        states, _ = self._robot.input_topics()
-        return min(self._client.age(topic) for topic in states)
-
-    def _planned(self, action: NDArray[np.float32], now: float) -> tuple[dict[str, Command], str]:
-        """Return what would be sent to which arm at `now` [s], and why it may not be, or ""."""
-        robot = self._robot
-        values = np.asarray(action, np.float64).tolist()
-        if len(values) != 7 or not all(map(math.isfinite, values)):
-            return {}, "the policy's action is not seven finite numbers"
-        values = [min(max(value, -1.0), 1.0) for value in values]
-        commands = {robot.active: self._moved(robot.told(robot.active), values)}
-        if robot.release_steps:
-            commands[RELEASED] = self._released()
-        planned = {}
-        for arm, command in commands.items():
-            base = robot.base_in(arm, self._config.guards.frame)
-            told = self._present(arm)
-            plan = Planned(arm, told.pose, robot.measured(arm), command.pose, base)
-            if self._guard.is_outside(plan):  # as an env: the jaw moves, the tip does not
-                command = Command(told.pose, command.jaw)
-                plan = Planned(arm, told.pose, robot.measured(arm), command.pose, base)
-            problem = self._guard.problem_of_target(plan, now)
-            if problem:
-                return commands, problem
-            planned[arm] = (command, plan)
-        for _, plan in planned.values():
-            self._guard.remember(plan, now)
-        return {arm: command for arm, (command, _) in planned.items()}, ""
-
-    def _moved(self, told: Command, values: list[float]) -> Command:
-        jaw = min(max(told.jaw + values[6] * self._step_size.jaw, 0.0), JAW_OPEN)
-        return Command(moved(told.pose, values, self._step_size), jaw)
-
-    def _released(self) -> Command:
-        """Return PSM2's next set point while it lets go (`Simulation._let_go`)."""
-        told = self._present(RELEASED)
-        jaw = min(told.jaw + RELEASE_JAW, RELEASE_OPEN)
-        if jaw < RELEASE_OPEN:
-            return Command(told.pose, jaw)
-        return Command(poses.shifted_along_z(told.pose, -RELEASE_SHIFT), jaw)
-
-    def _present(self, arm: str) -> Command:
-        """Return where an arm is told to be: as it was last sent, where that is still obeyed.
-
-        What is published is drawn back towards what is measured; the active arm goes on from there.
-        """
-        told = self._robot.told(arm)
-        sent = self._sent.get(arm)
-        if arm == self._robot.active or sent is None:
-            return told
-        return sent if poses.distance(sent.pose, told.pose) < SAME_M else told
-
     # -- what is done ------------------------------------------------------------------------------
-
-    def _send(self, commands: Mapping[str, Command]) -> None:
-        """Send commands, and let a clock that is ours go on."""
-        stamp = self._client.stamp()
-        sent = []
-        if self._config.sends:
-            for arm, command in commands.items():
-                frame, base = self._robot.frame(arm)
-                pose = write_pose(poses.compose(base, command.pose), stamp, frame)
-                jaw = JointState(Header(stamp), (JAW_NAME,), (command.jaw / FINGER_SHARE,))
-                for topic, message in (
-                    (f"/{arm}/servo_cp", pose),
-                    (f"/{arm}/jaw/servo_jp", jaw),
-                ):
-                    self._client.send(topic, message)
-                    sent.append(topic)
-                self._sent[arm] = command
-        if self._robot.release_steps and commands:
-            self._robot.release_steps -= 1
-        if self._config.is_stepped:
-            self._client.step(sent, stamp)
 
     def _stop(self, action: NDArray[np.float32] | None) -> str:
         """Return why the episode is over, or ""."""
@@ -556,7 +272,7 @@ class Driver:
             x, y, z = (1e3 * value for value in poses.position(command.pose))
             self._tell(
                 f"dry run, {self._robot.subtask}: {arm} would be told ({x:.1f}, {y:.1f}, {z:.1f}) "
-                f"mm in its base, jaw {math.degrees(command.jaw / FINGER_SHARE):.0f}°"
+                f"mm in its base, jaw {math.degrees(command.jaw / self._robot.jaw_scale):.0f}°"
             )
 
 
@@ -577,14 +293,3 @@ def check_drivable(agent: Agent, task: TaskConfig) -> None:
         raise InputError("a policy trained with action_repeat or hold_jaw cannot be driven yet.")
     if task.task not in (*names.SUBTASKS, names.SUTURE):
         raise InputError(f"the task {task.task} is not of a dVRK's two arms.")
-
-
-def _decoded(message: CompressedImage) -> NDArray[np.uint8]:
-    """Return a compressed image as (height, width, 3)."""
-    import cv2
-
-    found = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
-    if found is None:
-        raise InputError(f"an image of format {message.format[:20]} cannot be read.")
-    frame: NDArray[np.uint8] = np.ascontiguousarray(found[..., ::-1]).astype(np.uint8, copy=False)
-    return frame

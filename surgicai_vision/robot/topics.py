@@ -6,6 +6,7 @@ own (`<view>/image_raw`, `…/compressed`, `<view>/camera_info`). The topics und
 the needle's pose are the simulation's, and no robot has them.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -133,3 +134,18 @@ def compressed_topic(view: str) -> Topic:
 def info_topic(view: str) -> Topic:
     """Return the topic of a view's camera info."""
     return Topic(f"/{view}/camera_info", m.CameraInfo, STATE)
+
+
+def known_topics(views: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of all topics that a robot with these views and the simulation may have."""
+    arms = [
+        topic.name
+        for heard in (True, False)
+        for of, name in ((psm_topics, "PSM1"), (psm_topics, "PSM2"), (ecm_topics, "ECM"))
+        for topic in of(name, heard=heard).values()
+    ]
+    cameras = [
+        of(view).name for view in views for of in (image_topic, compressed_topic, info_topic)
+    ]
+    own = (NEEDLE, LABEL, RESET, ENTER, STEP, STEPPED, JUDGEMENT)
+    return (*arms, *cameras, *(topic.name for topic in own))

@@ -11,15 +11,16 @@ A transport has no threads that call back: whoever wants messages takes them, in
 came. Nothing leaves this machine unless another interface than the loopback is named.
 """
 
+import dataclasses
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Protocol, Self
+from typing import Protocol, Self, final
 
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.robot.messages import Message
-from surgicai_vision.robot.topics import Topic
+from surgicai_vision.robot.topics import Topic, known_topics
 
 LOOPBACK = "lo"
 """The loopback's name on Linux."""
@@ -62,6 +63,59 @@ class Transport(Protocol):
     def __enter__(self) -> Self: ...
 
     def __exit__(self, *_: object) -> None: ...
+
+
+@final
+class RenamedTransport:
+    """Carries messages of topics that a robot calls otherwise.
+
+    Args:
+        inner: what carries them; whoever opened it closes it.
+        renamed: topic of `robot.topics` → the robot's own name of it.
+        views: views whose topics there are.
+
+    Raises:
+        UnknownName: a topic that there is not.
+        InputError: a name that is none, or two topics of one name.
+    """
+
+    def __init__(self, inner: Transport, renamed: Mapping[str, str], views: Iterable[str]):
+        known = known_topics(views)
+        for name, own in renamed.items():
+            check_name("topic", name, known)
+            if not own.startswith("/") or not own.strip("/"):
+                raise InputError(f"topics: {name} is called '{own}'; a topic begins with '/'.")
+        names = [renamed.get(name, name) for name in known]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError(f"topics: two are called {', '.join(twice)}.")
+        self._inner = inner
+        self._renamed = dict(renamed)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the inner transport open."""
+
+    def publisher(self, topic: Topic) -> Publish:
+        """Return what publishes messages on a topic."""
+        return self._inner.publisher(self._own(topic))
+
+    def inbox(self, topic: Topic) -> Inbox:
+        """Return what takes the messages that have come on a topic since it was last called."""
+        return self._inner.inbox(self._own(topic))
+
+    def listeners(self, topic: Topic) -> int:
+        """Return how many hear what a publisher of this transport says on a topic."""
+        return self._inner.listeners(self._own(topic))
+
+    def wait(self, seconds: float) -> None:
+        """Wait until a message comes, or so long."""
+        self._inner.wait(seconds)
+
+    def _own(self, topic: Topic) -> Topic:
+        return dataclasses.replace(topic, name=self._renamed.get(topic.name, topic.name))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from surgicai_vision.evaluation.agents import RandomAgent
 from surgicai_vision.robot import frames, topics
 from surgicai_vision.robot import messages as m
 from surgicai_vision.robot.client import Client, ClientConfig
-from surgicai_vision.robot.driver import DriveConfig, DrivenRobot, Driver
+from surgicai_vision.robot.driven import DrivenRobot
+from surgicai_vision.robot.driver import DriveConfig, Driver
 from surgicai_vision.robot.guards import GuardConfig
 from surgicai_vision.robot.topics import Topic
 from surgicai_vision.robot.transport import open_transport

@@ -17,6 +17,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.expert import Expert
+from surgicai_vision.demos.imports.rosbag.config import Frames as BagFrames
 from surgicai_vision.demos.store import list_demos, read_demo
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.control import StepSize
@@ -25,7 +26,9 @@ from surgicai_vision.evaluation.agents import ExpertAgent, RandomAgent
 from surgicai_vision.robot import topics
 from surgicai_vision.robot.client import Client, ClientConfig
 from surgicai_vision.robot.dead_man import HeldKey, HeldPedal
-from surgicai_vision.robot.driver import DriveConfig, DrivenRobot, Driver
+from surgicai_vision.robot.driven import DrivenRobot
+from surgicai_vision.robot.driver import DriveConfig, Driver
+from surgicai_vision.robot.frames import read_pose, write_pose
 from surgicai_vision.robot.guards import (
     GuardConfig,
     Input,
@@ -33,10 +36,11 @@ from surgicai_vision.robot.guards import (
     TargetGuard,
     problem_of_inputs,
 )
-from surgicai_vision.robot.messages import Header, Joy, StringStamped
+from surgicai_vision.robot.messages import Header, Joy, PoseStamped, StringStamped
 from surgicai_vision.robot.recorder import Recorder
 from surgicai_vision.robot.server import ServeConfig, Server
 from surgicai_vision.robot.simulated import SimulatedRobot
+from surgicai_vision.robot.transport import RenamedTransport
 from surgicai_vision.scene import kinematics
 from surgicai_vision.teleoperation.recordings import open_recordings
 
@@ -91,31 +95,131 @@ class Script(Agent):
         return np.asarray([action], np.float32)
 
 
-def drive(agent, task, steps, config=SIMULATED, dead_man=lambda: 0.0, transport=None, views=()):
+def drive(
+    agent,
+    task,
+    steps,
+    config=SIMULATED,
+    dead_man=lambda: 0.0,
+    transport=None,
+    views=(),
+    through=None,
+    frames=None,
+):
     """Drive one episode; returns it, the lines of its log, what was told, and the transport."""
     served = transport or Served(task, views)
-    client = Client(served, ClientConfig(views=views, is_simulated=config.is_simulated))
+    client = Client(through or served, ClientConfig(views=views, is_simulated=config.is_simulated))
     client.connect()
     log = io.StringIO()
     told = []
-    robot = DrivenRobot(client, views, task, 64)
+    robot = DrivenRobot(client, views, task, 64, frames)
     driver = Driver(agent, robot, TaskConfig(task), config, dead_man, log, told.append)
     episode = driver.episode(SEED, steps)
     return episode, [json.loads(line) for line in log.getvalue().splitlines()], told, served
 
 
 def test_a_driven_policy_moves_as_in_process():
+    episode, lines, _, served = drive(RandomAgent(), "grasp", 50)
+    assert episode.steps == 50
+    assert episode.held == 0
+    assert np.allclose(served.robot.env.data.qpos, random_positions(50), atol=1e-8)
+    assert all(line["sent"] for line in lines)
+
+
+def random_positions(steps):
+    """Return the joints after a random policy's steps in this process."""
     own = envs.make(TaskConfig("grasp"))
     own.reset(seed=SEED)
     agent = RandomAgent()
     agent.reset(0, own, SEED)
-    for _ in range(50):
+    for _ in range(steps):
         own.step(agent.act([0], [own], [own.observe()])[0])
-    episode, lines, _, served = drive(RandomAgent(), "grasp", 50)
-    assert episode.steps == 50
+    return own.data.qpos.copy()
+
+
+class OtherFrames:
+    """A robot whose local frames and tip are others: a transport that turns its poses."""
+
+    def __init__(self, inner, bases, tip):
+        self.inner = inner
+        self.bases = bases
+        self.tip = tip
+        self.wait = inner.wait
+        self.listeners = inner.listeners
+
+    def publisher(self, topic):
+        publish = self.inner.publisher(topic)
+        if not topic.name.endswith("servo_cp"):
+            return publish
+
+        def turned(message):
+            pose = poses.compose(read_pose(message), poses.invert(self.tip))
+            publish(write_pose(pose, message.header.stamp, message.header.frame))
+
+        return turned
+
+    def inbox(self, topic):
+        take = self.inner.inbox(topic)
+        if not topic.name.endswith("_cp"):
+            return take
+        base = self.bases.get(topic.name[1:5]) if "/local/" in topic.name else poses.IDENTITY
+        return lambda: [self._said(received, base) for received in take()]
+
+    def _said(self, received, base):
+        message = received.message
+        pose = poses.compose(poses.invert(base), poses.compose(read_pose(message), self.tip))
+        said = write_pose(pose, message.header.stamp, message.header.frame)
+        return dataclasses.replace(received, message=said)
+
+
+def test_a_robot_with_frames_of_its_own_is_driven_the_same():
+    turn = (0.5, 0.5, -0.5, 0.5)
+    given = BagFrames(
+        psm1=(0.1, 0.0, -0.2, *turn),
+        psm2=(0.0, 0.3, 0.1, *turn),
+        tip=(0.0, 0.0, 0.01, 0.6, 0.8, 0, 0),
+    )
+
+    def pose(values):
+        x, y, z, w, qx, qy, qz = values
+        return read_pose(PoseStamped(Header(), (x, y, z), (qx, qy, qz, w)))
+
+    served = Served("grasp")
+    other = OtherFrames(
+        served, {"PSM1": pose(given.psm1), "PSM2": pose(given.psm2)}, pose(given.tip)
+    )
+    episode, lines, _, _ = drive(
+        RandomAgent(), "grasp", 30, transport=served, through=other, frames=given
+    )
     assert episode.held == 0
-    assert np.allclose(served.robot.env.data.qpos, own.data.qpos, atol=1e-8)
-    assert all(line["sent"] for line in lines)
+    assert np.allclose(served.robot.env.data.qpos, random_positions(30), atol=1e-7)
+
+
+def test_a_robot_with_names_of_its_own_is_driven_the_same():
+    served = Served("grasp")
+    renamed = {"/PSM2/servo_cp": "/dvrk/PSM2/servo_cp", "/PSM2/local/measured_cp": "/where"}
+    served.server = Server(
+        served.robot, RenamedTransport(served, renamed, ()), ServeConfig("stepped")
+    )
+    served.server.__enter__()
+    episode, _, _, _ = drive(
+        RandomAgent(), "grasp", 10, transport=served, through=RenamedTransport(served, renamed, ())
+    )
+    assert episode.steps == 10
+    assert np.allclose(served.robot.env.data.qpos, random_positions(10), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("renamed", "problem"),
+    [
+        ({"/PSM3/servo_cp": "/x"}, "Unknown topic"),
+        ({"/PSM1/servo_cp": "x"}, "begins with '/'"),
+        ({"/PSM1/servo_cp": "/PSM2/servo_cp"}, "two are called /PSM2/servo_cp"),
+    ],
+)
+def test_names_that_cannot_be_used_are_refused(renamed, problem):
+    with pytest.raises(InputError, match=problem):
+        RenamedTransport(MemoryTransport(), renamed, ())
 
 
 def test_an_agent_reads_the_same_poses_as_in_process():

@@ -21,7 +21,13 @@ from surgicai_vision.commands.options import (
     WEIGHTS,
     default_text,
 )
-from surgicai_vision.commands.robot.network import INTERFACE, TRANSPORT, Domain, ros_domain
+from surgicai_vision.commands.robot.network import (
+    INTERFACE,
+    TRANSPORT,
+    Domain,
+    renamed_topics,
+    ros_domain,
+)
 from surgicai_vision.core import names
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import InputError
@@ -97,6 +103,8 @@ class Options:
     env: Annotated[dict[str, object] | None, FILE_ONLY] = None
     guards: Annotated[dict[str, object] | None, FILE_ONLY] = None
     topics: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    frames: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    jaw_scale: Annotated[float | None, FILE_ONLY] = None
 
 
 @app.default
@@ -105,10 +113,13 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     import numpy as np
 
     from surgicai_vision.core.files import code_version
+    from surgicai_vision.demos.imports.rosbag.config import Frames
+    from surgicai_vision.robot.arm import FINGER_SHARE
     from surgicai_vision.robot.client import Client, ClientConfig
-    from surgicai_vision.robot.driver import DriveConfig, DrivenRobot, Driver, check_drivable
+    from surgicai_vision.robot.driven import DrivenRobot
+    from surgicai_vision.robot.driver import DriveConfig, Driver, check_drivable
     from surgicai_vision.robot.guards import GuardConfig
-    from surgicai_vision.robot.transport import open_transport
+    from surgicai_vision.robot.transport import RenamedTransport, open_transport
 
     spec = open_given(
         options.policy,
@@ -123,7 +134,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         options.simulated,
         options.clock == "stepped",
     )
-    renamed = {name: str(topic) for name, topic in (options.topics or {}).items()}
+    frames = from_mapping(Frames, options.frames or {}, "frames")
+    jaw_scale = FINGER_SHARE if options.jaw_scale is None else options.jaw_scale
     out = options.out or folders.OUTPUTS / "drive" / f"{spec.config.task}-{spec.name}"
     folders.check_folder(out, LOG)
     agent = spec.make_agent()
@@ -139,12 +151,11 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         )
         dead_man = _dead_man(options, transport, stack)
         client = Client(
-            transport,
+            RenamedTransport(transport, renamed_topics(options.topics), views),
             ClientConfig(
                 views=views,
                 is_compressed=options.compressed,
                 is_simulated=options.simulated,
-                renamed=renamed,
             ),
         )
         client.connect()
@@ -158,7 +169,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
             "code_version": code_version(),
         }
         log.write(json.dumps(about) + "\n")
-        robot = DrivenRobot(client, views, spec.config.task, agent.image_size)
+        robot = DrivenRobot(client, views, spec.config.task, agent.image_size, frames, jaw_scale)
         driver = Driver(agent, robot, spec.config, config, dead_man, log, console.note)
         if not options.send:
             console.note("dry run: nothing is sent; --send sends it")

@@ -1,6 +1,7 @@
 """What the commands of `robot` share: how they reach the network."""
 
 import os
+from collections.abc import Mapping
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -38,3 +39,8 @@ def ros_domain(given: int | None) -> int:
     if not text.isdecimal() or int(text) > LAST_DOMAIN:
         raise InputError(f"ROS_DOMAIN_ID is '{text}'; allowed: 0 to {LAST_DOMAIN}.")
     return int(text)
+
+
+def renamed_topics(given: Mapping[str, object] | None) -> dict[str, str]:
+    """Return `topics:` of a file: topic of ours → the robot's own name of it."""
+    return {name: str(topic) for name, topic in (given or {}).items()}

@@ -20,7 +20,13 @@ from surgicai_vision.commands.options import (
     default_text,
     task_config,
 )
-from surgicai_vision.commands.robot.network import INTERFACE, TRANSPORT, Domain, ros_domain
+from surgicai_vision.commands.robot.network import (
+    INTERFACE,
+    TRANSPORT,
+    Domain,
+    renamed_topics,
+    ros_domain,
+)
 from surgicai_vision.core import names
 from surgicai_vision.core.config import ADVANCES, TaskConfig
 from surgicai_vision.core.processes import Terminated
@@ -80,6 +86,7 @@ class Options:
         float | None, Parameter(validator=validators.Number(gt=0)), default_text("until Ctrl-C")
     ] = None
     env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    topics: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
 @app.default
@@ -92,7 +99,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     from surgicai_vision.robot.recorder import Recorder
     from surgicai_vision.robot.server import ServeConfig, Server
     from surgicai_vision.robot.simulated import SimulatedRobot
-    from surgicai_vision.robot.transport import LOOPBACK, open_transport
+    from surgicai_vision.robot.transport import LOOPBACK, RenamedTransport, open_transport
     from surgicai_vision.teleoperation.recordings import open_recordings
 
     domain = ros_domain(options.domain)
@@ -107,9 +114,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     if options.record is not None:
         folders.check_folder(options.record, MARKER, "--record")
     with ExitStack() as stack:
-        transport = stack.enter_context(
-            open_transport(options.transport, options.interface, domain)
-        )
+        opened = stack.enter_context(open_transport(options.transport, options.interface, domain))
+        transport = RenamedTransport(opened, renamed_topics(options.topics), options.view)
         env = envs.make(_task(options))
         robot = SimulatedRobot(env)
         robot.reset(options.seed)

@@ -1,0 +1,183 @@
+"""Set points: what an action becomes, whether the guards let it through, and its sending.
+
+    problem = setpoints.problem_of_inputs()
+    commands, problem = setpoints.of_action(action, now)
+    setpoints.send({} if problem else commands)
+
+An action is added to the set point that the robot itself publishes, as the envs add it to theirs,
+and sent as `servo_cp` and `jaw/servo_jp`. A set point is sent in the frame of the robot's own
+`setpoint_cp`: a dVRK reads no other, whatever a header says.
+
+Where the pull-out begins, PSM2 lets go, as the envs make it: the jaw opens, then the tool is drawn
+back along its axis.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.control import JAW_OPEN, StepSize, moved
+from surgicai_vision.envs.simulation import RELEASE_JAW, RELEASE_SHIFT
+from surgicai_vision.robot.arm import JAW_NAME
+from surgicai_vision.robot.driven import RELEASED, Command, DrivenRobot
+from surgicai_vision.robot.frames import write_pose
+from surgicai_vision.robot.guards import (
+    GuardConfig,
+    Input,
+    Planned,
+    TargetGuard,
+    problem_of_inputs,
+)
+from surgicai_vision.robot.messages import Header, JointState
+
+RELEASE_OPEN = 0.5
+"""Finger's angle to which PSM2 opens when it lets go [rad] (`Simulation._let_go`)."""
+SAME_M = 0.002
+"""Distance within which a set point that was sent still is the one that is obeyed [m]."""
+
+
+@final
+class Setpoints:
+    """Makes, guards and sends set points; see the module's docstring.
+
+    Args:
+        robot: the robot.
+        step: the step size of actions.
+        guards: the limits.
+        dead_man: returns for how long the dead-man's switch was last held [s].
+        sends: send what is let through; else nothing is.
+        is_stepped: the simulation's clock is ours; sending lets it take one control step.
+    """
+
+    def __init__(
+        self,
+        robot: DrivenRobot,
+        step: StepSize,
+        guards: GuardConfig,
+        dead_man: Callable[[], float],
+        *,
+        sends: bool,
+        is_stepped: bool,
+    ):
+        self._robot = robot
+        self._client = robot.client
+        self._step_size = step
+        self._limits = guards
+        self._guard = TargetGuard(guards, step)
+        self._dead_man = dead_man
+        self._sends = sends
+        self._is_stepped = is_stepped
+        self._sent: dict[str, Command] = {}
+
+    def forget(self) -> None:
+        """Forget what was sent: an episode begins."""
+        self._guard.forget()
+        self._sent.clear()
+
+    def problem_of_inputs(self) -> str:
+        """Return why nothing may be sent now, or ""."""
+        limits = self._limits
+        states, images = self._robot.input_topics()
+        inputs = [Input(topic, self._age(topic), limits.max_age) for topic in states]
+        inputs += [Input(topic, self._age(topic), limits.max_image_age) for topic in images]
+        operating = {arm: self._robot.operating(arm) for arm in self._robot.arms}
+        return problem_of_inputs(inputs, operating, self._dead_man())
+
+    def _age(self, topic: str) -> float:
+        """Return a message's age [s]; where the clock is ours, all are of the last step."""
+        age = self._client.age(topic)
+        return 0.0 if self._is_stepped and math.isfinite(age) else age
+
+    def youngest(self) -> float:
+        """Return how long ago the newest pose came [s]."""
+        states, _ = self._robot.input_topics()
+        return min(self._client.age(topic) for topic in states)
+
+    def of_action(
+        self, action: NDArray[np.float32], now: float
+    ) -> tuple[Mapping[str, Command], str]:
+        """Return what would be sent at `now` [s] for an action, and why it may not be, or "".
+
+        Args:
+            action: (7,) increments of the active arm, in [-1, 1].
+            now: of the control step [s].
+        """
+        robot = self._robot
+        values = np.asarray(action, np.float64).tolist()
+        if len(values) != 7 or not all(map(math.isfinite, values)):
+            return {}, "the policy's action is not seven finite numbers"
+        values = [min(max(value, -1.0), 1.0) for value in values]
+        commands = {robot.active: self._moved(robot.told(robot.active), values)}
+        if robot.release_steps:
+            commands[RELEASED] = self._released()
+        return self.guarded(commands, now)
+
+    def guarded(
+        self, commands: Mapping[str, Command], now: float
+    ) -> tuple[Mapping[str, Command], str]:
+        """Return what of set points would be sent at `now` [s], and why it may not be, or ""."""
+        robot = self._robot
+        planned = {}
+        for arm, command in commands.items():
+            base = robot.base_in(arm, self._limits.frame)
+            told = self._present(arm)
+            plan = Planned(arm, told.pose, robot.measured(arm), command.pose, base)
+            if self._guard.is_outside(plan):  # as an env: the jaw moves, the tip does not
+                command = Command(told.pose, command.jaw)
+                plan = Planned(arm, told.pose, robot.measured(arm), command.pose, base)
+            problem = self._guard.problem_of_target(plan, now)
+            if problem:
+                return commands, problem
+            planned[arm] = (command, plan)
+        for _, plan in planned.values():
+            self._guard.remember(plan, now)
+        return {arm: command for arm, (command, _) in planned.items()}, ""
+
+    def _moved(self, told: Command, values: list[float]) -> Command:
+        jaw = min(max(told.jaw + values[6] * self._step_size.jaw, 0.0), JAW_OPEN)
+        return Command(moved(told.pose, values, self._step_size), jaw)
+
+    def _released(self) -> Command:
+        """Return PSM2's next set point while it lets go (`Simulation._let_go`)."""
+        told = self._present(RELEASED)
+        jaw = min(told.jaw + RELEASE_JAW, RELEASE_OPEN)
+        if jaw < RELEASE_OPEN:
+            return Command(told.pose, jaw)
+        return Command(poses.shifted_along_z(told.pose, -RELEASE_SHIFT), jaw)
+
+    def _present(self, arm: str) -> Command:
+        """Return where an arm is told to be: as it was last sent, where that is still obeyed.
+
+        What is published is drawn back towards what is measured; the active arm goes on from there.
+        """
+        told = self._robot.told(arm)
+        sent = self._sent.get(arm)
+        if arm == self._robot.active or sent is None:
+            return told
+        return sent if poses.distance(sent.pose, told.pose) < SAME_M else told
+
+    def send(self, commands: Mapping[str, Command]) -> None:
+        """Send commands, and let a clock that is ours go on."""
+        stamp = self._client.stamp()
+        sent = []
+        if self._sends:
+            for arm, command in commands.items():
+                frame, base = self._robot.frame(arm)
+                tip = poses.compose(command.pose, self._robot.tip)
+                pose = write_pose(poses.compose(base, tip), stamp, frame)
+                jaw = JointState(Header(stamp), (JAW_NAME,), (command.jaw / self._robot.jaw_scale,))
+                for topic, message in (
+                    (f"/{arm}/servo_cp", pose),
+                    (f"/{arm}/jaw/servo_jp", jaw),
+                ):
+                    self._client.send(topic, message)
+                    sent.append(topic)
+                self._sent[arm] = command
+        if self._robot.release_steps and commands:
+            self._robot.release_steps -= 1
+        if self._is_stepped:
+            self._client.step(sent, stamp)
