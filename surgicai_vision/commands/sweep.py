@@ -20,6 +20,7 @@ from surgicai_vision.core.errors import BadFile, UnknownName
 from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.experiments.plan_config import plan_of
 from surgicai_vision.experiments.sweep.grid import AXES, Grid
+from surgicai_vision.experiments.sweep.rl_grid import RLGrid
 
 if TYPE_CHECKING:
     from surgicai_vision.experiments.sweep.experiment import Experiment
@@ -32,6 +33,8 @@ example:
   surgicai-vision sweep configs/sweep/smoke.yaml --out outputs/sweeps/smoke --json
 a headline from nothing, for its first training seed; without --only for all of them:
   surgicai-vision sweep procedure --only seed=0
+algorithms of reinforcement learning:
+  surgicai-vision sweep rl-demonstrations --only algo=td3-her-bc task=grasp
 to try a file in minutes:
   surgicai-vision sweep procedure --demonstrations 5 --epochs 1 --episodes 2 --size 64""",
 )
@@ -151,9 +154,19 @@ def grid_file(given: str) -> Path:
 
 
 def read_experiment(path: Path) -> "Experiment":
-    """Read a grid, or a plan, which lists its policies."""
+    """Read a grid, a plan, which lists its policies, or a grid over algorithms."""
     table = read_yaml(path)
+    if "algo" in table:
+        return from_mapping(RLGrid, _with_lists(table), str(path))
     return plan_of(table, str(path)) if "policies" in table else read_grid(path)
+
+
+def _with_lists(table: dict[str, object]) -> dict[str, object]:
+    """Return a table whose axes are lists, where one value may be written without brackets."""
+    return {
+        key: [value] if key in AXES and type(value) in (str, int) else value
+        for key, value in table.items()
+    }
 
 
 def read_grid(path: Path) -> Grid:

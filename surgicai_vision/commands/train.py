@@ -21,13 +21,16 @@ from surgicai_vision.commands.options import (
     VIEWS,
     WEIGHTS,
     default_text,
+    read_yaml,
     task_config,
 )
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig, read_changes
+from surgicai_vision.core.config import TaskConfig, from_mapping, read_changes
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.features import encoders
 from surgicai_vision.rl.algorithms import ALGORITHMS
+from surgicai_vision.rl.high_level_config import DECISIONS, SAVE_EVERY, HighLevelRequest
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import Checkpoint, read_checkpoint
 from surgicai_vision.training.run_config import RunConfig, with_epochs
@@ -41,7 +44,9 @@ app = App(
 example:
   surgicai-vision train --encoder random --view back
 by reinforcement:
-  surgicai-vision train --algo td3-her-bc --env-steps 25000""",
+  surgicai-vision train --algo td3-her-bc --env-steps 25000
+a high-level policy over policies of the subtasks:
+  surgicai-vision train --task suture --algo ppo --low hierarchical.yaml""",
 )
 NO_ENCODER = "none"
 """`--encoder`: proprioception alone."""
@@ -85,6 +90,9 @@ class Options:
         updates: Updates of an offline algorithm.
         validation: Episodes of each evaluation on the way.
         seeds: Train so many seeds, from --seed on, side by side.
+        low: YAML file of a hierarchical policy (docs/hierarchical.md) with hlp: order; PPO learns
+            the high-level policy over its subtasks' policies.
+        decisions: Decisions that it learns from.
         workers: Processes that train seeds, or step the envs of a single one; 0 for this one.
         env: Fields of the env, such as hold_jaw.
     """
@@ -133,6 +141,8 @@ class Options:
     updates: Annotated[int, COUNT] = 10_000
     validation: Annotated[int, NOT_NEGATIVE] = 20
     seeds: Annotated[int, COUNT] = 1
+    low: Annotated[Path | None, Parameter(metavar="FILE.yaml")] = None
+    decisions: Annotated[int, COUNT] = DECISIONS
     workers: Annotated[int, NOT_NEGATIVE] = 0
     env: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
@@ -140,6 +150,8 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode what is not in the cache, train and print where the checkpoint is."""
+    if options.low:
+        return _high_level(options, options.low, console)
     if options.algo:
         return _reinforce(options, options.algo, console)
     weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
@@ -281,4 +293,48 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
     for out in outs:
         console.say(f"checkpoint: {out}")
     console.say(f"next: surgicai-vision evaluate {outs[0]}")
+    return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}
+
+
+def _high_level(options: Options, low: Path, console: Console) -> dict[str, object]:
+    """Train PPO as high-level policy over low-level ones; print where the checkpoints are."""
+    from surgicai_vision.rl.extra import check_extra
+
+    if options.algo != "ppo" or options.task != names.SUTURE:
+        raise InputError(
+            f"--low goes with --task {names.SUTURE} --algo ppo; got --task {options.task} --algo "
+            f"{options.algo}."
+        )
+    for name in (*IMITATION, "demos", "demonstrations"):
+        if getattr(options, name) is not None:
+            raise InputError(f"--{name} does not go with --low; leave it out.")
+    if options.change or options.env:
+        raise InputError("--change and env do not go with --low; leave them out.")
+    if options.out and options.seeds > 1:
+        raise InputError("--out names one folder; leave it out where --seeds trains several.")
+    check_extra("--low", "stable_baselines3")
+    config = from_mapping(HierarchicalConfig, read_yaml(low), str(low))
+    requests = [
+        HighLevelRequest(
+            config,
+            options.decisions,
+            seed=options.seed + index,
+            validation=options.validation,
+            save_every=options.save_every or SAVE_EVERY,
+        )
+        for index in range(options.seeds)
+    ]
+    from surgicai_vision.rl.high_level import run_of, train_high_level
+    from surgicai_vision.rl.train import REQUEST
+
+    outs = []
+    for request in requests:
+        run = run_of(request, TaskConfig(names.SUTURE))
+        out = options.out or folders.train_folder(run.task, run.name, run.seed)
+        folders.check_folder(out, REQUEST)
+        with console.stage(f"high-level policy: {run.name}", "decisions") as progress:
+            train_high_level(request, out, progress=progress)
+        console.say(f"checkpoint: {out}")
+        outs.append(out)
+    console.say(f"next: give {outs[0]} as hlp: of {low}, and surgicai-vision evaluate {low}")
     return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}

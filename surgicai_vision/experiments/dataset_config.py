@@ -32,7 +32,7 @@ class Demonstrations:
         name: how the policies' `demonstrations` call them.
         task: the task that is demonstrated.
         episodes: how many.
-        view: rendered views.
+        view: rendered views; none where no image is learned from.
         demonstrator: who demonstrates.
         noise: how much what the demonstrator executes is disturbed.
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).

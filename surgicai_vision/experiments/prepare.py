@@ -27,7 +27,7 @@ def make_dataset(dataset: DatasetConfig, folder: Path, context: RunContext) -> P
     """Record and render what `dataset` says, into `folder`/demos and `folder`/dataset.
 
     Returns:
-        The dataset's folder.
+        The dataset's folder; that of the demonstrations where nothing is rendered.
     """
     recorded = dataset.demonstrations
     return prepare_dataset(
@@ -63,8 +63,10 @@ def prepare_dataset(
 ) -> Path:
     """Record demonstrations into `folder`/demos and render them into `folder`/dataset.
 
+    Without views nothing is rendered.
+
     Returns:
-        The dataset's folder.
+        The dataset's folder; that of the demonstrations where nothing is rendered.
     """
     record(
         config,
@@ -76,6 +78,8 @@ def prepare_dataset(
         post_success_steps=post_success_steps,
         context=context,
     )
+    if not views:
+        return folder / "demos"
     render_demos(
         folder / "demos",
         folder / "dataset",

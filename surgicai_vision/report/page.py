@@ -16,6 +16,7 @@ from surgicai_vision.report.high_level import high_level_policies
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.probes import probes
 from surgicai_vision.report.reader import Collected
+from surgicai_vision.report.reinforcement import learned
 from surgicai_vision.report.retention import looks, retentions
 
 FEW = 12
@@ -69,6 +70,8 @@ def numbers(
         "retentions": retentions(groups),
         "looks": looks(groups),
         "procedure": curves.procedure(groups),
+        "learned": learned(groups),
+        "learned_source": paper.LEARNED_SOURCE,
         "high_level": high_level_policies(collected.results),
         "subtasks": names.SUBTASKS,
         "paper_procedure": ", ".join(text.percent(rate) for rate in paper.HIERARCHICAL),

@@ -1,5 +1,6 @@
 """Tables: the page's numbers as Markdown, LaTeX (booktabs), CSV and Parquet.
 
+`algorithms.md`, where actors were evaluated, stands beside the paper's tables 1 and 4.
 `table.*` have one row a condition; `cells.parquet` one a cell (a training seed), those without a
 result too; `pairs.csv` one a comparison.
 """
@@ -21,6 +22,8 @@ from surgicai_vision.report.groups import MEASURES, Group, measured
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.paper_comparison import paper_rate
 from surgicai_vision.report.reader import REFERENCES, Result
+from surgicai_vision.report.reinforcement import learned
+from surgicai_vision.report.reinforcement import markdown as learned_markdown
 
 FOLDER = "tables"
 
@@ -36,6 +39,9 @@ def write_tables(folder: Path, groups: Sequence[Group], pairs: Sequence[Pair], t
         "cells.parquet": parquet_bytes(_filled(list(cell_records(groups)))),
         "pairs.csv": _csv([_pair_record(pair) for pair in pairs]),
     }
+    found = learned(groups)
+    if found:
+        contents["algorithms.md"] = learned_markdown(found).encode()
     for name, content in contents.items():
         write_changed(out / name, content)
     return out

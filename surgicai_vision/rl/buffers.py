@@ -76,7 +76,7 @@ class HindsightBuffer(Demonstrations, HerReplayBuffer):
         buffer_size: transitions it holds, of all envs.
         observation_space: that of obs_type "goal".
         action_space: (7,).
-        env: answers `compute_reward` and `compute_terminated`.
+        env: answers `compute_reward`, of the sparse reward.
         keeps_demand: a relabelled goal asks for what the task asks for.
         n_sampled_goal: relabelled transitions for each real one.
         device: of the batches.
@@ -133,14 +133,8 @@ class HindsightBuffer(Demonstrations, HerReplayBuffer):
         env: VecNormalize | None = None,
     ) -> DictReplayBufferSamples:
         samples = super()._get_virtual_samples(batch_indices, env_indices, env)
-        assert self.env is not None
-        (ended,) = self.env.env_method(
-            "compute_terminated",
-            self.next_observations["achieved_goal"][batch_indices, env_indices],
-            samples.observations["desired_goal"].cpu().numpy(),
-            indices=[0],
-        )
-        return samples._replace(dones=self.to_torch(ended.astype(np.float32)).reshape(-1, 1))
+        # The sparse reward is 0 where a goal is reached, which is `compute_terminated`.
+        return samples._replace(dones=(samples.rewards == 0).float())
 
 
 def demonstrations_of(
@@ -175,10 +169,3 @@ def _both(first: Any, second: Any) -> Observations:
     if isinstance(first, torch.Tensor):
         return torch.cat([first, second])
     return {key: torch.cat([part, second[key]]) for key, part in first.items()}
-
-
-def last_rows(observations: Any, count: int) -> Any:
-    """Return the last rows of a batch's observations, an array or a dict of arrays."""
-    if isinstance(observations, torch.Tensor):
-        return observations[-count:]
-    return {key: part[-count:] for key, part in observations.items()}

@@ -7,8 +7,12 @@
 
 The features are computed from the dict that the replay buffer hands out, so after relabelling. They
 hold no weights: `mean` and `std` are buffers of the module and are saved with a model.
+
+The library gives actor, critics and their targets an extractor each, and all are shown the same
+tensors of a batch in turn; with one `FeatureMemo` for all of them the features are computed once.
 """
 
+from collections import deque
 from collections.abc import Sequence
 from typing import cast, final
 
@@ -23,6 +27,37 @@ from surgicai_vision.envs.relative import relative_features
 from surgicai_vision.scene.kinematics import base_in_world
 
 RELATIVE = len(names.RELATIVE_NAMES)
+PARTS = ("observation", "achieved_goal", "desired_goal")
+"""Parts of a goal dict."""
+
+
+@final
+class FeatureMemo:
+    """The features of the last goal dicts, known by the identity of their tensors.
+
+    Tensors of a batch are never written to. What is kept is no part of a saved model.
+    """
+
+    KEPT = 2
+    """Observations and next observations of a batch."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[tuple[torch.Tensor, ...], torch.Tensor]] = deque(maxlen=self.KEPT)
+
+    def find(self, parts: tuple[torch.Tensor, ...]) -> torch.Tensor | None:
+        """Return the features of these very tensors, or None."""
+        for known, features in self._kept:
+            if all(one is other for one, other in zip(known, parts, strict=True)):
+                return features
+        return None
+
+    def keep(self, parts: tuple[torch.Tensor, ...], features: torch.Tensor) -> None:
+        """Keep the features of these tensors, and forget the oldest."""
+        self._kept.append((parts, features))
+
+    def __reduce__(self) -> tuple[type["FeatureMemo"], tuple[()]]:
+        """Return how to make an empty one."""
+        return FeatureMemo, ()
 
 
 class StandardExtractor(BaseFeaturesExtractor):
@@ -65,6 +100,7 @@ class RelativeExtractor(StandardExtractor):
         task: a subtask, whose arm acts.
         mean: as for `StandardExtractor`, (24,).
         std: the same.
+        memo: the same for all extractors of a model; None computes the features each time.
     """
 
     def __init__(
@@ -73,15 +109,21 @@ class RelativeExtractor(StandardExtractor):
         task: str,
         mean: Sequence[float] | None = None,
         std: Sequence[float] | None = None,
+        memo: FeatureMemo | None = None,
     ):
         super().__init__(observation_space, mean, std)
+        self._memo = memo
         arm = names.ACTIVE_ARM[check_name("subtask", task, names.SUBTASKS)]
         self._base = np.asarray(base_in_world(arm))[:3, :3]
 
     def forward(self, observations: torch.Tensor | dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the standardised features (B, 24) of goal dicts."""
         assert isinstance(observations, dict), "the relative features are those of a goal dict"
-        parts = ("observation", "achieved_goal", "desired_goal")
-        seen, achieved, desired = (observations[part].detach().cpu().numpy() for part in parts)
-        features = torch.from_numpy(relative_features(seen, achieved, desired, self._base))
+        parts = tuple(observations[part] for part in PARTS)
+        features = self._memo.find(parts) if self._memo else None
+        if features is None:
+            seen, achieved, desired = (part.detach().cpu().numpy() for part in parts)
+            features = torch.from_numpy(relative_features(seen, achieved, desired, self._base))
+            if self._memo:
+                self._memo.keep(parts, features)
         return super().forward(features.to(self.mean.device))

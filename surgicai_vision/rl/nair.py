@@ -20,7 +20,7 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
-from surgicai_vision.rl.buffers import Demonstrations, last_rows
+from surgicai_vision.rl.buffers import Demonstrations
 
 
 def cloning_loss(
@@ -118,9 +118,10 @@ class DemonstrationTD3(TD3):
         """
         chosen = self.actor(observations)
         values = self.critic.q1_forward(observations, chosen)
-        rows = last_rows(observations, demonstrated)
         with torch.no_grad():
-            known = self.critic.q1_forward(rows, actions[-demonstrated:])
+            seen = self.critic.extract_features(observations, self.critic.features_extractor)
+            rows = torch.cat([seen[-demonstrated:], actions[-demonstrated:]], dim=1)
+            known = self.critic.q_networks[0](rows)
         cloning, passed = cloning_loss(
             chosen[-demonstrated:],
             actions[-demonstrated:],

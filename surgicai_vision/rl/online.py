@@ -22,7 +22,7 @@ from torch import nn
 from policies.actor import Actor
 from policies.base import Policy
 from surgicai_vision.rl.buffers import HindsightBuffer, MixedBuffer, demonstrations_of
-from surgicai_vision.rl.extractor import RelativeExtractor, StandardExtractor
+from surgicai_vision.rl.extractor import FeatureMemo, RelativeExtractor, StandardExtractor
 from surgicai_vision.rl.learner import (
     Arrays,
     Learner,
@@ -105,7 +105,7 @@ class OnlineLearner(Learner):
             "features_extractor_kwargs": {
                 "mean": self.mean.tolist(),
                 "std": self.std.tolist(),
-                **({"task": request.env.task} if has_goal else {}),
+                **({"task": request.env.task, "memo": FeatureMemo()} if has_goal else {}),
             },
         }
         hidden = list(settings.hidden)

@@ -65,7 +65,8 @@ class Point:
     Attributes:
         env_steps: control steps taken in the env so far.
         updates: updates of the weights so far.
-        minutes: spent on learning so far, evaluations left out.
+        minutes: CPU time of learning so far in this process, evaluations left out; what worker
+            processes of envs take is not in it.
         successes: episodes that succeeded.
         episodes: episodes evaluated, from validation starts.
         distance_mm: median distance to the goal at their end.
@@ -249,9 +250,9 @@ def _run(
         progress(min(learner.done, request.total), request.total)
     while learner.done < request.total:
         target = min((learner.done // request.save_every + 1) * request.save_every, request.total)
-        began = time.monotonic()
+        began = time.process_time()
         losses = learner.advance(target)
-        minutes += (time.monotonic() - began) / 60.0
+        minutes += (time.process_time() - began) / 60.0
         curve.append(_evaluate(request, learner, minutes))
         log.draw(curve[-1], losses)
         write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])

@@ -170,7 +170,7 @@ class RunConfig:
             return f"{self.encoder}-{'+'.join(self.views)}"
         if self.privileged:
             return "state"
-        return "relative" if self.algo else "proprioception"
+        return "relative" if self.algo and self.policy != "hlp" else "proprioception"
 
     @property
     def recipe_label(self) -> str:

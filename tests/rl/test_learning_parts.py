@@ -1,5 +1,7 @@
 """What the libraries lack, against the papers' formulas."""
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -8,8 +10,9 @@ from stable_baselines3 import SAC, TD3
 from surgicai_vision import envs
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.store import list_demos
+from surgicai_vision.rl import extractor as extractors
 from surgicai_vision.rl.buffers import DEMAND, HindsightBuffer, MixedBuffer, demonstrations_of
-from surgicai_vision.rl.extractor import RelativeExtractor
+from surgicai_vision.rl.extractor import FeatureMemo, RelativeExtractor
 from surgicai_vision.rl.nair import DemonstrationTD3, cloning_loss
 from surgicai_vision.rl.rlpd import LayerNormPolicy
 from surgicai_vision.rl.transitions import of_demos
@@ -185,6 +188,35 @@ def test_the_extractor_gives_what_the_env_shows(goal_demos, demos):
     scaled = RelativeExtractor(space, "insert", mean=[1.0] * 24, std=[2.0] * 24)
     again = scaled({key: torch.from_numpy(part) for key, part in goals.observation.items()})
     assert np.allclose(again.numpy(), (shown - 1) / 2)
+
+
+def test_extractors_that_share_a_memo_compute_the_features_of_a_batch_once(goal_demos, monkeypatch):
+    calls = []
+    original = extractors.relative_features
+
+    def counted(*arrays):
+        calls.append(len(arrays[0]))
+        return original(*arrays)
+
+    space = envs.make(TaskConfig("grasp"), "goal").observation_space
+    parts = goal_demos["grasp"].observation
+    batches = [
+        {key: torch.from_numpy(part[start : start + 5].copy()) for key, part in parts.items()}
+        for start in (0, 5, 10)
+    ]
+    alone = RelativeExtractor(space, "grasp")
+    expected = [alone(batch) for batch in batches]
+    monkeypatch.setattr(extractors, "relative_features", counted)
+    memo = FeatureMemo()
+    several = [RelativeExtractor(space, "grasp", memo=memo) for _ in range(3)]
+    for extractor in several:
+        for batch, features in zip(batches[:2], expected, strict=False):
+            assert torch.equal(extractor(batch), features)
+    assert calls == [5, 5]
+    # A third batch drives the first out; another dict of equal numbers is another batch.
+    assert torch.equal(several[0](batches[2]), expected[2])
+    assert torch.equal(several[1](batches[0]), expected[0]) and calls == [5] * 4
+    assert pickle.loads(pickle.dumps(memo)).find(tuple(batches[0].values())) is None
 
 
 def test_the_critics_of_rlpd_have_layer_norm_and_its_actor_has_none():

@@ -37,6 +37,7 @@ from surgicai_vision.experiments.sweep.plan import (
     PROBE_FILE,
     REFERENCE_FILE,
     TO_DO,
+    TRAINING,
     Jobs,
     RunState,
     plan,
@@ -362,6 +363,8 @@ def _file(folder: Path, place: _Place, key: str) -> None:
     shutil.rmtree(place.folder, ignore_errors=True)
     os.rename(folder, place.folder)
     files.sync_folder(place.folder.parent)
+    # Filed, so what a killed training would have gone on from is no longer needed.
+    shutil.rmtree(folder.parent.parent / TRAINING / key, ignore_errors=True)
 
 
 def _collect(experiment: Experiment, out: Path) -> list[Row]:
@@ -390,7 +393,7 @@ def _about(run: RunConfig) -> Row:
         "encoder": run.encoder,
         "view": "+".join(run.views),
         "training_seed": run.seed,
-        "trained_by": run.policy,
+        "trained_by": run.algo or run.policy,
         "recipe": run.recipe,
         "demonstrations": run.demonstrations,
         "hierarchical": run.termination,

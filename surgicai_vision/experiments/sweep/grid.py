@@ -40,6 +40,7 @@ AXES: Mapping[str, Callable[[RunConfig], object]] = MappingProxyType(
         "view": lambda run: run.views,
         "recipe": lambda run: run.recipe,
         "policy": lambda run: run.policy,
+        "algo": lambda run: run.algo,
         "demonstrations": lambda run: run.demonstrations,
         "seed": lambda run: run.seed,
         "hierarchical": lambda run: run.termination,

@@ -71,7 +71,7 @@ def train_policy(
     train_run(_run(run), data, folder, silent_stage, weights, subtask=subtask)
 
 
-def train_and_evaluate(
+def train_andevaluate_as(
     folder: Path,
     run: Table,
     final: str,
@@ -102,7 +102,7 @@ def train_and_evaluate(
         spec = in_env(spec, env)
         about = {**spec.about, **about}
         with measured("evaluation", "steps"):
-            summary = _evaluate(folder / "evaluation", spec, what, about)
+            summary = evaluate_as(folder / "evaluation", spec, what, about)
     shutil.rmtree(folder / SCRATCH, ignore_errors=True)
     write_json(folder / RESULT_FILE, {"run": run, "summary": summary, "seconds": seconds})
 
@@ -116,7 +116,7 @@ def evaluate_reference(
     demonstrated = _dataset(dataset) if what.policy == "replay" else None
     spec = open_policy(what.policy, task=what.task, dataset=demonstrated)
     spec = dataclasses.replace(spec, run=dataclasses.replace(spec.run, env=what.env))
-    summary = _evaluate(folder, spec, what, {**spec.about, "command": command})
+    summary = evaluate_as(folder, spec, what, {**spec.about, "command": command})
     write_json(folder / REFERENCE_FILE, {"summary": summary})
 
 
@@ -155,7 +155,7 @@ def _trained(
     return open_policy(policy, task=run.task, weights=weights)
 
 
-def _evaluate(folder: Path, spec: PolicySpec, run: RunConfig, about: Table) -> dict[str, JSON]:
+def evaluate_as(folder: Path, spec: PolicySpec, run: RunConfig, about: Table) -> dict[str, JSON]:
     """Evaluate what is called and stored as `run`, in the env of `spec`."""
     assert run.starts is not None, "the experiment says where a run is evaluated"
     stored = dataclasses.replace(run, env=spec.config)

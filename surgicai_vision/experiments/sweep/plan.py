@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -11,18 +11,23 @@ from surgicai_vision.core.config import JSON, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, MissingWeights
 from surgicai_vision.core.executor import Job, register_job
 from surgicai_vision.core.files import read_json
+from surgicai_vision.demos.store import demos_digest, list_demos
 from surgicai_vision.evaluation.storage import GRID_FILE, RESULT_FILE, read_versioned
 from surgicai_vision.experiments.plan_config import plan_of
 from surgicai_vision.experiments.sweep.experiment import Experiment, Training
 from surgicai_vision.experiments.sweep.grid import Grid
+from surgicai_vision.experiments.sweep.rl_grid import RLGrid
 from surgicai_vision.experiments.sweep.selection import EVERYTHING, Choice, is_chosen
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import WeightsSource
+from surgicai_vision.rl.extra import check_extra
 from surgicai_vision.training import policies
 from surgicai_vision.training.run_config import LEROBOT_POLICIES, OWN, RunConfig
 
 REFERENCE_FILE = "reference.json"
 PROBE_FILE = "probe.json"
+TRAINING = "training"
+"""Folder of a sweep in which trainings work, one folder a job."""
 TO_DO: Final = "to do"
 CACHED: Final = "cached"
 NOT_RUN: Final = "not run"
@@ -41,7 +46,9 @@ LEARN = (
     "policies",
 )
 EVALUATE = (*LEARN, "evaluation")
+RL = ("scene", "envs", "demos", "training", "experiments", "policies", "evaluation", "rl")
 PACKAGES = ("mujoco", "numpy", "torch", "timm", "lerobot")
+RL_PACKAGES = ("mujoco", "numpy", "torch", "stable-baselines3", "sb3-contrib", "d3rlpy")
 """Sources and distributions that decide what a job of a sweep gives."""
 for name, function, stages in (
     ("sweep-features", "encode_features", LEARN),
@@ -52,6 +59,13 @@ for name, function, stages in (
 ):
     register_job(
         name, f"surgicai_vision.experiments.sweep.jobs:{function}", stages=stages, packages=PACKAGES
+    )
+for name, function in (("sweep-actor", "train_actor"), ("sweep-rl", "train_and_evaluate")):
+    register_job(
+        name,
+        f"surgicai_vision.experiments.sweep.rl_jobs:{function}",
+        stages=RL,
+        packages=RL_PACKAGES,
     )
 
 
@@ -91,6 +105,8 @@ def read_experiment_of(folder: Path) -> Experiment:
     stored = read_versioned(path)
     if "plan" in stored:
         return plan_of(stored["plan"], str(path))
+    if "rl_grid" in stored:
+        return from_mapping(RLGrid, stored["rl_grid"], str(path))
     return from_mapping(Grid, stored["grid"], str(path))
 
 
@@ -117,9 +133,11 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
         InputError: a recipe that is fed progress, which no sweep says, or a policy that chooses
             subtasks where one that acts is needed.
     """
+    if any(run.algo for run in experiment.runs):
+        check_extra("A sweep over algorithms", *LIBRARIES)
     for run in experiment.runs:
         for trained in trained_by(experiment, run):
-            if trained.policy not in LEROBOT_POLICIES:
+            if trained.policy not in LEROBOT_POLICIES and not trained.algo:
                 policies.check_progress_from(policies.recipe_of(trained), None)
         if not experiment.parts(run):
             _check_acts(run.policy)
@@ -203,14 +221,26 @@ class Jobs:
         """Return the digest of a dataset; None where it is not made yet."""
         if name not in self._digests:
             try:
-                meta = read_json(self.data_folder(name) / "dataset" / names.META_FILE)
-                self._digests[name] = str(meta["digest"])
+                self._digests[name] = self._digest_of(name)
             except BadFile:
                 self._digests[name] = None
         return self._digests[name]
 
+    def _digest_of(self, name: str) -> str:
+        """Return the digest of a dataset, or of demonstrations of which nothing is rendered.
+
+        Raises:
+            BadFile: it is not made yet.
+        """
+        folder = self.data_folder(name)
+        if not self.experiment.datasets[name].demonstrations.view:
+            return demos_digest(list_demos(folder / "demos"))
+        return str(read_json(folder / "dataset" / names.META_FILE)["digest"])
+
     def datasets_of(self, run: RunConfig) -> tuple[str, ...]:
         """Return the names of the datasets that a run's policies are trained on."""
+        if run.algo and not run.demonstrations:
+            return ()
         parts = self.experiment.parts(run).values()
         return tuple(dict.fromkeys(part.dataset for part in parts)) or (
             self.experiment.dataset_of(run),
@@ -226,6 +256,8 @@ class Jobs:
 
         It trains and evaluates, or evaluates policies made before.
         """
+        if run.algo:
+            return self._reinforcement(run)
         parts = self.experiment.parts(run)
         dataset = self.datasets_of(run)[0]
         inputs = [self.policy(part).key() for part in parts.values()] or self._inputs(run, dataset)
@@ -243,6 +275,8 @@ class Jobs:
 
     def policy(self, training: Training) -> Job:
         """Return the job that trains a policy that runs share."""
+        if training.run.algo:
+            return self._actor(training)
         arguments = {
             "run": to_mapping(training.run),
             "subtask": training.subtask,
@@ -251,6 +285,49 @@ class Jobs:
         }
         inputs = tuple(self._inputs(training.run, training.dataset))
         return Job("sweep-policy", arguments, inputs, label=LABELS)
+
+    def _actor(self, training: Training) -> Job:
+        """Return the job that trains an actor that whole procedures share."""
+        run = training.run
+        arguments = {"run": to_mapping(run), **self._learning(run)}
+        return self._with_scratch(Job("sweep-actor", arguments, self._demos(run), label=RL_LABELS))
+
+    def _reinforcement(self, run: RunConfig) -> Job:
+        """Return the job that trains an actor, or PPO over actors made before, and evaluates it."""
+        parts = self.experiment.parts(run)
+        inputs = tuple(self.policy(part).key() for part in parts.values()) or self._demos(run)
+        arguments = {
+            "run": to_mapping(run),
+            "final": str(run_folder(self.out, run_key(run)).absolute()),
+            "policies": {
+                name: str(self.policy_folder(part).absolute()) for name, part in parts.items()
+            },
+            **self._learning(run),
+        }
+        return self._with_scratch(Job("sweep-rl", arguments, inputs, label=RL_LABELS))
+
+    def _learning(self, run: RunConfig) -> dict[str, JSON]:
+        """Return the arguments that jobs of learning share."""
+        experiment = self.experiment
+        assert isinstance(experiment, RLGrid)
+        demos = self.data_folder(experiment.dataset_of(run)) / "demos"
+        learns_from_demos = run.demonstrations and not run.is_hierarchical
+        return {
+            "decisions": experiment.decisions if run.is_hierarchical else 0,
+            "validation": experiment.validation,
+            "save_every": experiment.save_every,
+            "demos": str(demos.absolute()) if learns_from_demos else "",
+            **self._where,
+        }
+
+    def _demos(self, run: RunConfig) -> tuple[str, ...]:
+        """Return the digests of the demonstrations that a run learns from."""
+        return tuple(self.dataset_digest(name) or "" for name in self.datasets_of(run))
+
+    def _with_scratch(self, job: Job) -> Job:
+        """Name the folder in which a killed training is gone on with: no other job's."""
+        scratch = str((self.out / TRAINING / job.key()).absolute())
+        return replace(job, arguments={**job.arguments, "scratch": scratch})
 
     def features(self, run: RunConfig) -> list[Job]:
         """Return the jobs that encode what a run sees, view by view, so that runs share them."""
@@ -324,6 +401,9 @@ class Jobs:
 
 LABELS = ("dataset", "accept_licence", "command", "environment")
 """Arguments that change where and how a job is done, and not its result."""
+RL_LABELS = (*LABELS, "final", "policies", "demos", "scratch")
+LIBRARIES = ("stable_baselines3", "sb3_contrib", "d3rlpy")
+"""What a sweep over algorithms imports."""
 
 
 @functools.cache

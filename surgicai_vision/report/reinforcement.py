@@ -1,0 +1,287 @@
+"""Reinforcement and offline learning: the tables 1 and 4 beside the paper's, and learning curves.
+
+`learned(groups)` is None where no evaluation is of an actor (`train --algo`). Its rows are one an
+algorithm with the same settings and number of demonstrations; its cells are pooled counts of all
+training seeds with their exact interval, beside the paper's number where its table has one that is
+known here. The interquartile mean and the probability of improvement (`aggregates`) are taken over
+runs, a task and training seed each. Learning curves are those of `curve.json` beside a policy:
+validation starts, not the held-out ones of the tables.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from surgicai_vision.core import files, names
+from surgicai_vision.core.errors import BadFile
+from surgicai_vision.evaluation import statistics
+from surgicai_vision.report import aggregates, charts, paper, text
+from surgicai_vision.report.charts import Point, Series
+from surgicai_vision.report.curves import MOST, Chart
+from surgicai_vision.report.groups import Group
+from surgicai_vision.report.reader import Result
+from surgicai_vision.rl.algorithms import ALGORITHMS
+
+CURVE = "curve.json"
+POLICY = "policy"
+"""Where a sweep keeps a run's policy, beside its evaluation."""
+MARK = 0.95
+"""The success whose first control steps a table names."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One algorithm, with its settings and demonstrations.
+
+    Attributes:
+        algo: its name.
+        label: the same with what is changed, and the demonstrations.
+        groups: task → its evaluations.
+    """
+
+    algo: str
+    label: str
+    groups: Mapping[str, Group]
+
+    def scores(self, tasks: Sequence[str]) -> list[list[float]]:
+        """Return the success rate of each training seed on each task."""
+        return [
+            [
+                float(np.mean([row["success"] for row in result.rows]))
+                for result in self.groups[task].results
+            ]
+            for task in tasks
+        ]
+
+    @cached_property
+    def aggregate(self) -> tuple[float, tuple[float, float], int, int]:
+        """Interquartile mean over its runs, the interval, and of how many runs and tasks."""
+        scores = self.scores(list(self.groups))
+        generator = np.random.default_rng(0)
+        bounds = aggregates.bootstrap(aggregates.interquartile_mean, [scores], generator)
+        runs = sum(map(len, scores))
+        return aggregates.interquartile_mean(scores), bounds, runs, len(scores)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a page says of learning.
+
+    Attributes:
+        tasks: columns of the table.
+        head: its head.
+        rows: its rows, as text.
+        better: rows of the probability that the best method beats another, as text.
+        best: that method.
+        curves: success on the way against control steps, and against minutes, task by task.
+    """
+
+    tasks: tuple[str, ...]
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    better: tuple[tuple[str, ...], ...]
+    best: str
+    curves: tuple[Chart, ...]
+
+
+def learned(groups: Sequence[Group]) -> Learned | None:
+    """Return the tables and curves of all evaluations of actors; None without any."""
+    rows = table(groups)
+    if not rows:
+        return None
+    tasks = tuple(task for task in names.SUBTASKS if any(task in row.groups for row in rows))
+    best = max(rows, key=lambda row: (len(row.groups), row.aggregate[0]))
+    return Learned(
+        tasks,
+        ("algorithm", *tasks, "interquartile mean"),
+        tuple(_cells(row, tasks) for row in rows),
+        tuple(_better(best, row) for row in rows if row is not best),
+        best.label,
+        tuple(_curves(rows, tasks)),
+    )
+
+
+def table(groups: Sequence[Group]) -> list[Row]:
+    """Return the algorithms in the order of SurgicAI's tables, those with results alone."""
+    found: dict[tuple[str, str], dict[str, Group]] = {}
+    for item in groups:
+        condition = item.condition
+        is_actor = condition.trained_by in ALGORITHMS and condition.plain
+        if item.episodes and is_actor and condition.task in names.SUBTASKS and not condition.place:
+            by_task = found.setdefault((condition.trained_by, _label(item)), {})
+            by_task[condition.task] = item
+    order = list(ALGORITHMS)
+    keys = sorted(found, key=lambda key: (order.index(key[0]), key[1]))
+    return [Row(algo, label, found[algo, label]) for algo, label in keys]
+
+
+def _label(item: Group) -> str:
+    """Return the algorithm with what is changed, what it sees and its demonstrations."""
+    condition = item.condition
+    parts = [condition.trained_by, *condition.changes]
+    parts += [condition.encoder] if condition.encoder != "relative" else []
+    parts += [f"{condition.demonstrations} demonstrations"] if condition.demonstrations else []
+    return ", ".join(parts)
+
+
+def _cells(row: Row, tasks: Sequence[str]) -> tuple[str, ...]:
+    """Return a row of the table as text."""
+    cells = []
+    for task in tasks:
+        theirs = paper.LEARNED.get(row.algo, {}).get(task)
+        beside = f"; paper {text.percent(theirs)}" if theirs is not None else ""
+        item = row.groups.get(task)
+        if item is None:
+            cells.append(text.ABSENT + beside)
+            continue
+        seeds = f", {text.plural(len(item.results), 'seed')}"
+        count = f"{item.successes}/{item.episodes}{seeds}"
+        cells.append(f"{count} ({text.interval(item.interval)}){beside}")
+    mean, bounds, runs, of_tasks = row.aggregate
+    middle = f"{mean:.2f} ({bounds[0]:.2f}–{bounds[1]:.2f}); {text.plural(runs, 'run')}"
+    return (row.label, *cells, f"{middle}, {text.plural(of_tasks, 'task')}")
+
+
+def _better(best: Row, other: Row) -> tuple[str, ...]:
+    """Return how probably the best method beats another on the tasks that both have."""
+    tasks = [task for task in best.groups if task in other.groups]
+    if not tasks:
+        return other.label, text.ABSENT, "no task in common"
+    scores = [best.scores(tasks), other.scores(tasks)]
+    value = aggregates.probability_of_improvement(*scores)
+    generator = np.random.default_rng(0)
+    low, high = aggregates.bootstrap(aggregates.probability_of_improvement, scores, generator)
+    return other.label, f"{value:.2f} ({low:.2f}–{high:.2f})", ", ".join(tasks)
+
+
+# -- learning curves -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """One evaluation on the way: `rl.train.Point` as far as it is drawn."""
+
+    env_steps: int
+    updates: int
+    minutes: float
+    successes: int
+    episodes: int
+
+
+def read_curve(result: Result) -> list[CurvePoint]:
+    """Return the evaluations on the way to a result's policy; empty where none was kept."""
+    places = [result.folder.parent / POLICY]
+    places += [Path(str(result.about["folder"]))] if result.about.get("folder") else []
+    for place in places:
+        if not (place / CURVE).is_file():
+            continue
+        try:
+            stored = files.read_json(place / CURVE)
+            fields = CurvePoint.__dataclass_fields__
+            points = [CurvePoint(**{name: row[name] for name in fields}) for row in stored]
+        except (BadFile, KeyError, TypeError):
+            continue
+        return [point for point in points if point.episodes]
+    return []
+
+
+def steps_to(mark: float, curve: Sequence[CurvePoint]) -> int | None:
+    """Return the control steps at the first evaluation with a success of `mark`, or None."""
+    for point in curve:
+        if point.successes >= mark * point.episodes:
+            return point.env_steps
+    return None
+
+
+def _curves(rows: Sequence[Row], tasks: Sequence[str]) -> list[Chart]:
+    """Return a chart against control steps and one against minutes for each task."""
+    axes: tuple[tuple[str, Callable[[CurvePoint], float]], ...] = (
+        ("control steps, thousands", lambda point: point.env_steps / 1000),
+        ("CPU minutes of learning", lambda point: round(point.minutes, 2)),
+    )
+    found = []
+    for task in tasks:
+        by_label = {
+            row.label: [read_curve(result) for result in row.groups[task].results]
+            for row in rows
+            if task in row.groups
+        }
+        for x_name, x in axes:
+            lines = [
+                Series(label, _points(curves, x))
+                for label, curves in by_label.items()
+                if any(len(curve) > 1 for curve in curves)
+            ]
+            lines = [line for line in lines if len({point.x for point in line.points}) > 1]
+            if lines:
+                found.append(_chart(f"{task}: {x_name}", lines, x_name, by_label))
+    return found
+
+
+def _points(
+    curves: Sequence[Sequence[CurvePoint]], x: Callable[[CurvePoint], float]
+) -> tuple[Point, ...]:
+    """Return the evaluations of all seeds, the n-th of each counted together."""
+    found = []
+    for index in range(max(map(len, curves))):
+        here = [curve[index] for curve in curves if index < len(curve)]
+        won = sum(point.successes for point in here)
+        of = sum(point.episodes for point in here)
+        bounds = statistics.clopper_pearson(won, of)
+        where = float(np.mean([x(point) for point in here]))
+        words = f"{won}/{of} ({text.interval(bounds)}) at {where:g}"
+        found.append(Point(where, won / of, *bounds, words))
+    return tuple(found)
+
+
+def _chart(
+    title: str,
+    lines: Sequence[Series],
+    x_name: str,
+    by_label: Mapping[str, Sequence[Sequence[CurvePoint]]],
+) -> Chart:
+    """Draw learning curves; beside them the control steps to `MARK` of each seed."""
+    drawn = lines[:MOST]
+    rows = []
+    for line in lines:
+        steps = [steps_to(MARK, curve) for curve in by_label[line.name]]
+        reached = ", ".join("never" if step is None else f"{step:,}" for step in steps)
+        rows.append((line.name, line.points[-1].text, reached))
+    more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
+    return Chart(
+        title,
+        charts.curves(drawn, x_name, label=f"{title}: success [%] on validation starts"),
+        charts.key([line.name for line in drawn]),
+        ("algorithm", "last evaluation", f"control steps to {text.percent(MARK)}"),
+        tuple(rows),
+        more,
+    )
+
+
+# -- Markdown --------------------------------------------------------------------------------------
+
+
+def markdown(found: Learned) -> str:
+    """Return the tables as Markdown, for a page of results."""
+    parts = [
+        f"Success from held-out starts: k/n over all training seeds (exact 95 % interval); paper: "
+        f"{paper.LEARNED_SOURCE}. Interquartile mean over runs with its bootstrap interval.",
+        "",
+        *_rows(found.head, found.rows),
+    ]
+    if found.better:
+        head = ("beside", "probability of improvement", "tasks")
+        parts += [f"How probably a run of {found.best} beats one of another:", ""]
+        parts += _rows(head, found.better)
+    for chart in found.curves:
+        parts += [f"{chart.title} (validation starts)", "", *_rows(chart.head, chart.rows)]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def _rows(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a Markdown table and an empty line."""
+    lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
+    return [lines[0], "|" + "---|" * len(head), *lines[1:], ""]

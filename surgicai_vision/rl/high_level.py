@@ -1,0 +1,407 @@
+"""PPO as high-level policy over fixed low-level ones: the hierarchy of SurgicAI's Table 3.
+
+`DecisionEnv` is the whole procedure with one decision a step: a subtask is chosen, its policy moves
+its arm until the subtask's measured success has held or its steps are over
+(`evaluation.hierarchical`, `termination: privileged`), and the next is chosen. What is observed is
+what a robot measures: pose and jaw of both arms, (14,). The reward is 0 for a decision that solved
+the subtask that was due and -1 for any other; the paper does not say its own.
+
+    train_high_level(HighLevelRequest(HierarchicalConfig(hlp="order", grasp="outputs/train/…", …,
+                                      termination="privileged")), out)
+
+leaves a checkpoint of the policy `hlp`, for the key `hlp:` of a hierarchical policy's file. Every
+training state begins new episodes, in a training that was killed as in one that was not, so that
+the same command gives the same result; the folder is that of `rl.train`.
+"""
+
+import dataclasses
+import functools
+import io
+import pickle
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast, final
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from torch import nn
+
+from policies.base import Policy, Recipe
+from surgicai_vision import __version__
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, to_mapping
+from surgicai_vision.core.errors import OutputExists, PhysicsError
+from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
+from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.envs.suture import Suture
+from surgicai_vision.evaluation.agent import Agent
+from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.evaluation.hierarchical import GRASP, HierarchicalAgent
+from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
+from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_policy
+from surgicai_vision.evaluation.rollout import run_share
+from surgicai_vision.evaluation.slot import env_of
+from surgicai_vision.rl.extractor import StandardExtractor
+from surgicai_vision.rl.high_level_config import HighLevelRequest
+from surgicai_vision.rl.learner import linear, random_state, set_random_state
+from surgicai_vision.rl.train import CURVE, EVALUATED_AT_ONCE, IMAGE_SIZE, REQUEST, STATE
+from surgicai_vision.training.checkpoint import (
+    CARD,
+    Checkpoint,
+    read_checkpoint,
+    write_checkpoint,
+)
+from surgicai_vision.training.policies import policy_plugin
+from surgicai_vision.training.run_config import RunConfig
+from surgicai_vision.training.threads import one_thread
+
+HLP = "hlp"
+ALGO = "ppo"
+SMALLEST_STD = 1e-3
+"""Inputs that vary less [m, rad] are divided by this."""
+PLAYED_EPISODES = 2
+"""Episodes in the subtasks' order that give the statistics of the inputs."""
+SEEDS_EACH = 1000
+"""Start seeds of one training: one for each training state."""
+
+Vector = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Point:
+    """One point of the learning curve.
+
+    Attributes:
+        decisions: decisions so far.
+        env_steps: control steps so far.
+        minutes: CPU time of learning so far, evaluations left out.
+        successes: whole procedures that succeeded.
+        episodes: whole procedures evaluated, from validation starts.
+        stages: subtasks solved in them, on average.
+    """
+
+    decisions: int
+    env_steps: int
+    minutes: float
+    successes: int
+    episodes: int
+    stages: float
+
+
+@final
+class DecisionEnv(gymnasium.Env[Vector, np.int64]):
+    """The whole procedure, one decision a step; see the module's docstring.
+
+    Args:
+        config: how many steps a subtask and decisions an episode may take.
+        task: the whole procedure's config.
+        low: the low-level policies' agents, in the order of the subtasks.
+    """
+
+    def __init__(self, config: HierarchicalConfig, task: TaskConfig, low: Sequence[Agent]):
+        self.config = config
+        self._low = list(low)
+        self._env = cast(Suture, env_of(self._low[0], task))
+        self._observation: Any = None
+        self._decisions = 0
+        self.control_steps = 0
+        size = len(names.BOTH_ARMS_NAMES)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.action_space = gymnasium.spaces.Discrete(len(names.SUBTASKS))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Vector, dict[str, Any]]:
+        """Begin a procedure; return the measured poses (14,)."""
+        super().reset(seed=seed)
+        start = int(self.np_random.integers(names.VALIDATION_SEED))
+        self._observation, _ = self._env.reset(seed=start)
+        self._decisions = 0
+        for agent in self._low:
+            agent.reset(0, self._env, start)
+        return self._env.both_arms(), {}
+
+    def step(self, action: np.int64) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Let the policy of subtask `action` act until the subtask ends."""
+        subtask = int(action)
+        env = self._env
+        agent = self._low[subtask]
+        self._decisions += 1
+        due = env.simulation.task_state.done
+        agent.restart(0)
+        env.enter(subtask)
+        terminated = truncated = False
+        info: dict[str, Any] = {}
+        for _ in range(self.config.steps):
+            move = agent.act([0], [env], [self._observation])[0]
+            if not np.isfinite(move).all():
+                truncated = True
+                break
+            try:
+                self._observation, _, terminated, truncated, info = env.step(move)
+            except PhysicsError:
+                truncated = True
+                break
+            self.control_steps += 1
+            if terminated or truncated or self._has_ended(subtask):
+                break
+        success = bool(info.get("is_success", False))
+        solved = success or env.simulation.task_state.done > due
+        truncated = truncated or self._decisions >= self.config.decisions
+        about = {"is_success": success, "progress": env.simulation.task_state.done}
+        return env.both_arms(), float(solved) - 1.0, terminated, truncated, about
+
+    def _has_ended(self, subtask: int) -> bool:
+        """Return True if the present subtask's success has held, as a privileged end has it."""
+        env = self._env
+        if subtask == env.phase == GRASP and env.dwell >= self.config.grasp_hold:
+            env.enter(GRASP + 1)
+        return env.phase != subtask
+
+    @property
+    def phase(self) -> int:
+        """The subtask that is on, an index in `names.SUBTASKS`."""
+        return self._env.phase
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._env.close()
+
+
+def train_high_level(
+    request: HighLevelRequest, out: Path, *, progress: Progress | None = None
+) -> Checkpoint:
+    """Train PPO over low-level policies, or go on where it was broken off.
+
+    Args:
+        request: what is trained.
+        out: the checkpoint folder; new, or one of the same request.
+        progress: called with (decisions done, in all).
+
+    Raises:
+        BadFile: a low-level policy that is no checkpoint.
+        InputError: policies of other subtasks, or of different scenes.
+        OutputExists: `out` holds something else.
+    """
+    check_output(out, may_resume=REQUEST)
+    spec = hierarchical_policy(request.low)
+    low = [open_policy(path, task=task) for task, path in request.low.low.items()]
+    acting = [one.about.get("checkpoint") or one.name for one in low]
+    wanted = {"code_version": __version__, "request": to_mapping(request), "low": acting}
+    if (out / REQUEST).exists() and read_json(out / REQUEST) != wanted:
+        raise OutputExists(
+            f"--out {out} holds another training; give a folder that does not exist yet."
+        )
+    if (out / CARD).exists():
+        return read_checkpoint(out)
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / REQUEST, wanted)
+    with torch.random.fork_rng(devices=[]), one_thread():
+        env = DecisionEnv(request.low, spec.config, [one.make_agent() for one in low])
+        try:
+            checkpoint = _run(request, spec.config, env, out, progress or silent)
+        finally:
+            env.close()
+    (out / STATE).unlink(missing_ok=True)
+    return checkpoint
+
+
+def _run(
+    request: HighLevelRequest, task: TaskConfig, env: DecisionEnv, out: Path, progress: Progress
+) -> Checkpoint:
+    """Learn to the end, with an evaluation and a training state every so often."""
+    mean, std = _statistics(env)
+    env.control_steps = 0
+    model = _model(request, env, mean, std)
+    curve = _resume(model, env, out)
+    minutes = curve[-1].minutes if curve else 0.0
+    while model.num_timesteps < request.decisions:
+        progress(model.num_timesteps, request.decisions)
+        began = time.process_time()
+        vector = model.get_env()
+        assert vector is not None
+        vector.seed(names.TRAIN_SEED + SEEDS_EACH * request.seed + len(curve))
+        model._last_obs = None  # new episodes begin, so that nothing of the env need be stored
+        chunk = min(request.save_every, request.decisions - model.num_timesteps)
+        model.learn(chunk, reset_num_timesteps=False)
+        minutes += (time.process_time() - began) / 60.0
+        curve.append(_evaluate(request, task, model, env, minutes))
+        write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
+        if model.num_timesteps < request.decisions:
+            _save(model, env, curve, out / STATE)
+    progress(request.decisions, request.decisions)
+    return _write(request, task, model, env, out)
+
+
+def _model(
+    request: HighLevelRequest, env: DecisionEnv, mean: Sequence[float], std: Sequence[float]
+) -> PPO:
+    """Return the untrained model."""
+    settings = request.settings
+    hidden = list(settings.hidden)
+    return PPO(
+        "MlpPolicy",
+        env,
+        learning_rate=settings.learning_rate,
+        gamma=settings.gamma,
+        n_steps=settings.rollout,
+        batch_size=settings.batch_size,
+        n_epochs=settings.epochs,
+        ent_coef=settings.entropy,
+        seed=request.seed,
+        device="cpu",
+        policy_kwargs={
+            "activation_fn": nn.ReLU,
+            "net_arch": {"pi": hidden, "vf": hidden},
+            "features_extractor_class": StandardExtractor,
+            "features_extractor_kwargs": {"mean": list(mean), "std": list(std)},
+        },
+    )
+
+
+def _statistics(env: DecisionEnv) -> tuple[list[float], list[float]]:
+    """Return mean and standard deviation of what procedures in the subtasks' order observe."""
+    rows = []
+    for episode in range(PLAYED_EPISODES):
+        seen, _ = env.reset(seed=names.TRAIN_SEED + episode)
+        rows.append(seen)
+        for _ in range(2 * len(names.SUBTASKS)):
+            seen, _, terminated, truncated, _ = env.step(np.int64(env.phase))
+            rows.append(seen)
+            if terminated or truncated:
+                break
+    values = np.stack(rows).astype(np.float64)
+    return values.mean(axis=0).tolist(), np.maximum(values.std(axis=0), SMALLEST_STD).tolist()
+
+
+# -- the state -------------------------------------------------------------------------------------
+
+
+def _save(model: PPO, env: DecisionEnv, curve: Sequence[Point], path: Path) -> None:
+    """Write the training state, whole."""
+    content = io.BytesIO()
+    state = {
+        "parameters": model.get_parameters(),
+        "decisions": model.num_timesteps,
+        "updates": model._n_updates,
+        "control_steps": env.control_steps,
+        "random": random_state(),
+        "curve": [dataclasses.asdict(point) for point in curve],
+    }
+    torch.save(state, content)
+    write_bytes(path, content.getvalue())
+
+
+def _resume(model: PPO, env: DecisionEnv, out: Path) -> list[Point]:
+    """Go on from the training state, if there is a whole one; return the curve so far."""
+    try:
+        state = torch.load(out / STATE, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
+        return []
+    model.set_parameters(state["parameters"], exact_match=True)
+    model.num_timesteps = state["decisions"]
+    model._n_updates = state["updates"]
+    env.control_steps = state["control_steps"]
+    set_random_state(state["random"])
+    return [Point(**point) for point in state["curve"]]
+
+
+# -- the policy ------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def _policy(request: HighLevelRequest, model: PPO) -> tuple[Policy, Recipe]:
+    """Return the actor as a policy `hlp`, and its recipe."""
+    plugin = policy_plugin(HLP)
+    recipe = plugin.recipe(
+        hidden=request.settings.hidden,
+        batch_norm=False,
+        learning_rate=request.settings.learning_rate,
+        batch_size=request.settings.batch_size,
+        validation=0.0,
+    )
+    policy = plugin.make(recipe, ())
+    actor = [*linear(model.policy.mlp_extractor.policy_net), *linear(model.policy.action_net)]
+    for own, given in zip(linear(policy), actor, strict=True):
+        own.weight.copy_(given.weight)
+        own.bias.copy_(given.bias)
+    extractor = cast(StandardExtractor, model.policy.features_extractor)
+    policy.input_mean.copy_(extractor.mean)
+    policy.input_std.copy_(extractor.std)
+    return policy.eval().requires_grad_(False), recipe
+
+
+def _evaluate(
+    request: HighLevelRequest, task: TaskConfig, model: PPO, env: DecisionEnv, minutes: float
+) -> Point:
+    """Count whole procedures from validation starts, by what is evaluated of the checkpoint too."""
+    successes = 0
+    stages = 0.0
+    if request.validation:
+        policy, _ = _policy(request, model)
+        high = functools.partial(
+            PolicyAgent, HLP, policy, None, (), IMAGE_SIZE, policy.inputs.vector
+        )
+        low = [
+            open_policy(path, task=subtask).make_agent for subtask, path in request.low.low.items()
+        ]
+        make = functools.partial(HierarchicalAgent, request.low, low, high)
+        seeds = range(names.VALIDATION_SEED, names.VALIDATION_SEED + request.validation)
+        episodes = run_share(make, task, seeds, EVALUATED_AT_ONCE, report=lambda _: None)
+        successes = sum(episode.row.success for episode in episodes)
+        stages = float(np.mean([episode.row.stages for episode in episodes]))
+    return Point(
+        decisions=model.num_timesteps,
+        env_steps=env.control_steps,
+        minutes=minutes,
+        successes=successes,
+        episodes=request.validation,
+        stages=stages,
+    )
+
+
+def run_of(request: HighLevelRequest, task: TaskConfig, env_steps: int | None = None) -> RunConfig:
+    """Return the run that a request is.
+
+    Args:
+        request: what is trained.
+        task: any task of the procedure's scene.
+        env_steps: control steps that it took; None before it has.
+    """
+    return RunConfig(
+        env=dataclasses.replace(task, task=names.SUTURE, max_steps=0, advance="success"),
+        policy=HLP,
+        recipe="rl",
+        updates=request.decisions,
+        seed=request.seed,
+        algo=ALGO,
+        env_steps=env_steps,
+    )
+
+
+def _write(
+    request: HighLevelRequest, task: TaskConfig, model: PPO, env: DecisionEnv, out: Path
+) -> Checkpoint:
+    """Write the trained high-level policy."""
+    policy, recipe = _policy(request, model)
+    checkpoint = Checkpoint(
+        run=run_of(request, task, env.control_steps),
+        recipe=to_mapping(recipe),
+        image_size=IMAGE_SIZE,
+        encoder=None,
+        proprioception=True,
+        epoch=0,
+        dataset="",
+        frames=model.num_timesteps,
+        validation_episodes=(),
+        train_losses=(),
+        validation_losses=(),
+        device="cpu",
+        code_version=__version__,
+    )
+    return write_checkpoint(out, checkpoint, policy.state_dict())

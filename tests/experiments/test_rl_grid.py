@@ -1,0 +1,107 @@
+"""Sweeps over algorithms: the runs of the shipped files, and one sweep from demonstrations on."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from surgicai_vision.commands.sweep import grid_file, read_experiment
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.core.executor import RunContext
+from surgicai_vision.evaluation.storage import read_evaluation
+from surgicai_vision.experiments.sweep.driver import run_sweep
+from surgicai_vision.experiments.sweep.plan import CACHED, Jobs, plan, read_experiment_of, run_key
+from surgicai_vision.experiments.sweep.rl_grid import RLGrid
+from surgicai_vision.rl.algorithms import ALGORITHMS
+
+SHIPPED = {
+    "rl-online": 8 * 2 * 3,
+    "rl-demonstrations": 3 * 5 * 3,
+    "rl-offline": 5 * 5 * 3,
+    "rl-ten-demonstrations": 4 * 2 * 3,
+    "rl-hierarchy": 5 * 3 + 3,
+}
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_shipped_files_stand_for_so_many_runs(name, tmp_path):
+    grid = read_experiment(grid_file(name))
+    assert isinstance(grid, RLGrid) and len(plan(grid, tmp_path)) == SHIPPED[name]
+    for run in grid.runs:
+        assert bool(run.demonstrations) == ALGORITHMS[run.algo].needs_demos
+        assert bool(run.env_steps) == ALGORITHMS[run.algo].is_online
+        assert run.starts.first_seed == names.TEST_SEED
+
+
+def test_together_they_have_every_row_of_the_paper():
+    found = {run.algo for name in SHIPPED for run in read_experiment(grid_file(name)).runs}
+    assert found == set(ALGORITHMS)
+
+
+def test_a_whole_procedure_shares_the_actors_of_its_seed(tmp_path):
+    grid = read_experiment(grid_file("rl-hierarchy"))
+    *actors, last = grid.runs
+    parts = grid.parts(last)
+    assert tuple(parts) == names.SUBTASKS and last.task == names.SUTURE
+    for task, part in parts.items():
+        (same,) = [run for run in actors if (run.task, run.seed) == (task, last.seed)]
+        assert part.run == replace(same, starts=None)
+    jobs = Jobs(grid, tmp_path)
+    keys = {jobs.policy(part).key() for part in parts.values()}
+    assert len(keys) == 5 and set(jobs.run(last).inputs) == keys
+
+
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        ({"algo": ("td4",)}, UnknownName),
+        ({"task": ("suture",)}, UnknownName),
+        ({"change": {"bc": ["goals=3"]}}, UnknownName),
+        ({"change": {"bc": "hidden=3"}}, InputError),
+        ({"hierarchical": True}, InputError),
+        ({"env_steps": 0}, InputError),
+        ({"noise": 2.0}, InputError),
+    ],
+)
+def test_what_cannot_be_run_is_refused_at_once(changes, error):
+    with pytest.raises(error):
+        RLGrid(**{"task": ("grasp",), "algo": ("bc",), **changes})
+
+
+def test_tasks_algorithms_and_seeds_may_be_added_later():
+    small = RLGrid(("grasp",), ("bc",))
+    larger = replace(small, seed=(0, 1), algo=("iql", "bc"), task=("grasp", "insert"))
+    assert larger.extends(small.table()) and not small.extends(larger.table())
+    assert not replace(larger, updates=5).extends(small.table())
+
+
+def test_a_sweep_trains_counts_and_is_not_done_twice(tmp_path):
+    grid = RLGrid(
+        ("grasp",),
+        ("bc", "sac"),
+        demonstrations=(2,),
+        change={
+            "bc": ["batch_size=16"],
+            "sac": ["batch_size=16", "learning_starts=10"],
+        },
+        env={"max_steps": 120},
+        env_steps=24,
+        updates=8,
+        validation=1,
+        save_every=12,
+        episodes=2,
+    )
+    out = tmp_path / "sweep"
+    result = run_sweep(grid, out, RunContext(0))
+    assert (result["done"], result["failed"]) == (2, 0), result["problems"]
+    assert {state.state for state in plan(read_experiment_of(out), out)} == {CACHED}
+    assert not list((out / "training").iterdir())
+    for run in grid.runs:
+        folder = out / "runs" / run_key(run)
+        stored = read_evaluation(folder / "evaluation")
+        assert stored.run == run and stored.summary["episodes"] == 2
+        curve = json.loads((folder / "policy" / "curve.json").read_text())
+        assert [point["episodes"] for point in curve] == [1] * (2 if run.algo == "sac" else 1)
+    again = run_sweep(grid, out, RunContext(0))
+    assert (again["done"], again["cached"], again["digest"]) == (0, 2, result["digest"])

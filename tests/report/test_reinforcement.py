@@ -1,0 +1,156 @@
+"""Algorithms in the report: rliable's aggregates, the table beside the paper's, learning curves."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.stats import mannwhitneyu, trim_mean
+from sweep_results import CHECKPOINT, evaluation
+from test_report import assert_stands_alone, painted_stage
+
+from surgicai_vision import report
+from surgicai_vision.core import files
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.envs import contact_sheet
+from surgicai_vision.evaluation import statistics
+from surgicai_vision.report.aggregates import (
+    bootstrap,
+    interquartile_mean,
+    probability_of_improvement,
+)
+from surgicai_vision.report.groups import group
+from surgicai_vision.report.reader import collect
+from surgicai_vision.report.reinforcement import learned, read_curve, steps_to, table
+from surgicai_vision.training.run_config import RunConfig
+
+RATES = {"td3": 0.1, "td3-her-bc": 0.9, "bc": 0.6}
+
+
+def run_of(algo, task, seed):
+    online = algo != "bc"
+    return RunConfig(
+        TaskConfig(task),
+        policy="actor",
+        recipe="rl",
+        demonstrations=None if algo == "td3" else 100,
+        updates=None if online else 5000,
+        seed=seed,
+        algo=algo,
+        env_steps=2000 if online else 0,
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Three algorithms on two tasks with three seeds; one has no result on the second task."""
+    out = tmp_path_factory.mktemp("learned")
+    generator = np.random.default_rng(3)
+    for algo, task, seed in itertools.product(RATES, ("grasp", "insert"), (0, 1, 2)):
+        if (algo, task) == ("bc", "insert"):
+            continue
+        place = out / "runs" / f"{algo}-{task}-{seed}"
+        about = {"checkpoint": CHECKPOINT}
+        evaluation(place / "evaluation", run_of(algo, task, seed), RATES[algo], generator, about)
+        if algo != "bc":
+            points = [
+                {"env_steps": 1000 * n, "updates": 500 * n, "minutes": 0.5 * n + 0.01 * seed,
+                 "successes": min(10 * n, int(20 * RATES[algo]) + 2), "episodes": 20,
+                 "distance_mm": 1.0} for n in (1, 2)
+            ]  # fmt: skip
+            (place / "policy").mkdir()
+            files.write_json(place / "policy" / "curve.json", points)
+    return out
+
+
+# -- aggregates ------------------------------------------------------------------------------------
+
+
+def test_the_interquartile_mean_is_rliables():
+    generator = np.random.default_rng(0)
+    for tasks, seeds in ((5, 3), (1, 4), (2, 7), (1, 1)):
+        scores = generator.uniform(size=(tasks, seeds))
+        assert interquartile_mean(scores) == pytest.approx(trim_mean(scores, 0.25, axis=None))
+
+
+def test_the_probability_of_improvement_is_mann_whitneys_u_over_the_pairs():
+    generator = np.random.default_rng(1)
+    first = generator.integers(0, 4, (3, 4)) / 4
+    second = generator.integers(0, 4, (3, 5)) / 4
+    expected = [
+        mannwhitneyu(one, other).statistic / 20 for one, other in zip(first, second, strict=True)
+    ]
+    found = probability_of_improvement(first, second)
+    assert found == pytest.approx(np.mean(expected))
+    assert probability_of_improvement(second, first) == pytest.approx(1 - found)
+    with pytest.raises(InputError):
+        probability_of_improvement(first, second[:2])
+
+
+def test_the_bootstrap_covers_and_knows_when_there_is_no_spread():
+    generator = np.random.default_rng(2)
+    assert bootstrap(interquartile_mean, [[[0.5, 0.5], [0.5]]], generator) == (0.5, 0.5)
+    scores = generator.uniform(size=(5, 6))
+    low, high = bootstrap(interquartile_mean, [scores], generator)
+    assert 0 <= low < interquartile_mean(scores) < high <= 1 and high - low < 0.6
+
+
+# -- the page --------------------------------------------------------------------------------------
+
+
+def test_the_table_counts_all_seeds_beside_the_papers_number(folder):
+    groups = group(collect(folder))
+    rows = table(groups)
+    assert [row.algo for row in rows] == ["td3", "td3-her-bc", "bc"]
+    found = learned(groups)
+    assert found.tasks == ("grasp", "insert")
+    cells = {row[0]: row[1:] for row in found.rows}
+    won = {
+        (item.condition.trained_by, item.condition.task): (item.successes, item.interval)
+        for item in groups
+    }
+    count, bounds = won["td3-her-bc", "grasp"]
+    low, high = statistics.clopper_pearson(count, 60)
+    assert bounds == (low, high)
+    assert cells["td3-her-bc, 100 demonstrations"][0] == (
+        f"{count}/60, 3 seeds ({100 * low:.0f}–{100 * high:.0f} %); paper 96 %"
+    )
+    assert cells["bc, 100 demonstrations"][1] == "–; paper 97 %"
+    assert cells["td3"][2].endswith("6 runs, 2 tasks")
+    assert found.best == "td3-her-bc, 100 demonstrations"
+    better = {row[0]: row[1:] for row in found.better}
+    assert better["td3"][0].startswith("1.00") and better["td3"][1] == "grasp, insert"
+    assert better["bc, 100 demonstrations"][1] == "grasp"
+
+
+def test_learning_curves_are_read_beside_the_policy(folder):
+    groups = group(collect(folder))
+    (result, *_) = next(i for i in groups if i.condition.trained_by == "td3-her-bc").results
+    curve = read_curve(result)
+    assert [(point.env_steps, point.successes) for point in curve] == [(1000, 10), (2000, 20)]
+    assert steps_to(0.95, curve) == 2000 and steps_to(0.4, curve) == 1000
+    assert steps_to(0.95, curve[:1]) is None
+    found = learned(groups)
+    assert [chart.title for chart in found.curves] == [
+        f"{task}: {axis}"
+        for task in ("grasp", "insert")
+        for axis in ("control steps, thousands", "CPU minutes of learning")
+    ]
+    rows = {row[0]: row for row in found.curves[0].rows}
+    assert rows["td3-her-bc, 100 demonstrations"][2] == "2,000, 2,000, 2,000"
+    assert rows["td3"][2] == "never, never, never"
+
+
+def test_the_page_and_its_tables_have_them(folder, monkeypatch):
+    monkeypatch.setattr(contact_sheet, "state_renderer", painted_stage)
+    page = report.write_report(folder, strips=0)
+    assert_stands_alone(page.read_text())
+    text = (page.parent / "tables" / "algorithms.md").read_text()
+    assert "td3-her-bc, 100 demonstrations" in text and "probability of improvement" in text
+    assert 'id="learned"' in page.read_text()
+
+
+def test_without_actors_there_is_no_such_section(tmp_path):
+    run = RunConfig(TaskConfig("grasp"), "imagenet", ("back",), demonstrations=50)
+    evaluation(tmp_path / "one", run, 0.5, np.random.default_rng(0), {"checkpoint": CHECKPOINT})
+    assert learned(group(collect(tmp_path))) is None

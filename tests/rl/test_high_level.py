@@ -1,0 +1,106 @@
+"""PPO over low-level policies: the env is the hierarchical policy's, the checkpoint its HLP."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError, OutputExists
+from surgicai_vision.evaluation.agents import BASELINES
+from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
+from surgicai_vision.evaluation.policy_spec import hierarchical_policy
+from surgicai_vision.evaluation.rollout import run_share
+from surgicai_vision.rl import high_level
+from surgicai_vision.rl.high_level import DecisionEnv, train_high_level
+from surgicai_vision.rl.high_level_config import HighLevelRequest, HighLevelSettings
+from surgicai_vision.training.policies import load_policy
+
+EXPERTS = HierarchicalConfig(
+    hlp="order", **dict.fromkeys(names.SUBTASKS, "expert"), termination="privileged"
+)
+
+
+def test_decisions_in_order_are_the_hierarchical_policy_that_takes_them_in_order():
+    spec = hierarchical_policy(EXPERTS)
+    env = DecisionEnv(EXPERTS, spec.config, [BASELINES["expert"]() for _ in names.SUBTASKS])
+    seen, _ = env.reset(seed=4)
+    start = int(np.random.default_rng(4).integers(names.VALIDATION_SEED))
+    assert env.observation_space.contains(seen)
+    for subtask in range(len(names.SUBTASKS)):
+        assert env.phase == subtask
+        seen, reward, terminated, truncated, info = env.step(np.int64(subtask))
+        assert reward == 0 and not truncated and env.observation_space.contains(seen)
+        assert info["progress"] == subtask + 1
+    assert terminated and info["is_success"]
+    steps = env.control_steps
+    env.close()
+    (episode,) = run_share(spec.make_agent, spec.config, [start], 1, report=lambda _: None)
+    assert episode.row.success and episode.row.steps == steps
+
+
+def test_a_decision_that_solves_nothing_costs_one_and_takes_its_steps():
+    short = dataclasses.replace(EXPERTS, steps=5, decisions=3)
+    task = TaskConfig(names.SUTURE, max_steps=2000)
+    env = DecisionEnv(short, task, [BASELINES["zero"]() for _ in names.SUBTASKS])
+    env.reset(seed=0)
+    ends = []
+    for subtask in (2, 0, 4):
+        _, reward, terminated, truncated, _ = env.step(np.int64(subtask))
+        assert reward == -1 and not terminated
+        ends.append(truncated)
+    assert ends == [False, False, True] and env.control_steps == 15
+    env.close()
+
+
+def request_of(**changes):
+    low = HierarchicalConfig(
+        hlp="order", **dict.fromkeys(names.SUBTASKS, "zero"), termination="privileged", steps=4,
+        decisions=6, max_steps=60,
+    )  # fmt: skip
+    settings = HighLevelSettings(hidden=(8,), rollout=8, batch_size=8, epochs=2)
+    return HighLevelRequest(low, 16, settings, validation=0, save_every=8, **changes)
+
+
+def test_the_checkpoint_names_what_ppo_names(tmp_path, monkeypatch):
+    kept = []
+    original = high_level._write
+
+    def write(request, task, model, env, out):
+        kept.append(model)
+        return original(request, task, model, env, out)
+
+    monkeypatch.setattr(high_level, "_write", write)
+    checkpoint = train_high_level(request_of(), tmp_path / "hlp")
+    assert checkpoint.run.name == "ppo-proprioception" and checkpoint.run.task == names.SUTURE
+    policy = load_policy(tmp_path / "hlp")
+    poses = np.random.default_rng(0).normal(size=(20, 14)).astype(np.float32) / 10
+    theirs, _ = kept[0].predict(poses, deterministic=True)
+    assert np.array_equal(policy.act(None, poses).argmax(axis=1), theirs)
+    whole = dataclasses.replace(request_of().low, hlp=str(tmp_path / "hlp"))
+    assert hierarchical_policy(whole).config.task == names.SUTURE
+    with pytest.raises(OutputExists):
+        train_high_level(request_of(seed=1), tmp_path / "hlp")
+
+
+def test_a_kill_changes_no_result(tmp_path, monkeypatch):
+    whole = train_high_level(request_of(), tmp_path / "whole")
+    original = high_level._save
+
+    def die(*arguments):
+        original(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(high_level, "_save", die)
+    with pytest.raises(KeyboardInterrupt):
+        train_high_level(request_of(), tmp_path / "killed")
+    monkeypatch.setattr(high_level, "_save", original)
+    resumed = train_high_level(request_of(), tmp_path / "killed")
+    assert resumed.policy_sha256 == whole.policy_sha256
+
+
+def test_a_learned_termination_is_refused():
+    learned = dataclasses.replace(EXPERTS, hlp="outputs/train/hlp", termination="learned")
+    with pytest.raises(InputError, match="hlp: order"):
+        HighLevelRequest(learned)
