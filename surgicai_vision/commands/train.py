@@ -21,13 +21,12 @@ from surgicai_vision.commands.options import (
     VIEWS,
     WEIGHTS,
     default_text,
-    read_yaml,
     task_config,
 )
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig, from_mapping, read_changes
+from surgicai_vision.core.config import TaskConfig, read_changes
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
+from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.features import encoders
 from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.rl.high_level_config import DECISIONS, SAVE_EVERY, HighLevelRequest
@@ -313,7 +312,7 @@ def _high_level(options: Options, low: Path, console: Console) -> dict[str, obje
     if options.out and options.seeds > 1:
         raise InputError("--out names one folder; leave it out where --seeds trains several.")
     check_extra("--low", "stable_baselines3")
-    config = from_mapping(HierarchicalConfig, read_yaml(low), str(low))
+    config = read_hierarchical(low)
     requests = [
         HighLevelRequest(
             config,
