@@ -9,14 +9,14 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    ACCEPT_LICENCE,
     DIRECTORY,
     ENCODER,
     POOL,
     TASK,
     VIEWS,
-    WEIGHTS,
-    default_text,
+    AcceptLicence,
+    DatasetFolder,
+    WeightFiles,
 )
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import check_output
@@ -45,11 +45,11 @@ class Options:
     """
 
     task: Annotated[str, TASK] = "grasp"
-    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    dataset: DatasetFolder = None
     encoder: Annotated[str, ENCODER] = "imagenet-lite"
     view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
-    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
-    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    weights: WeightFiles = ()
+    accept_licence: AcceptLicence = False
     pool: Annotated[str, POOL] = "global"
     export: Annotated[Path | None, DIRECTORY] = None
 

@@ -9,14 +9,17 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    ACCEPT_LICENCE,
     COUNT,
     DIRECTORY,
-    FILE_ONLY,
     NOT_NEGATIVE,
-    TASK,
     VIEWS,
-    WEIGHTS,
+    AcceptLicence,
+    DatasetFolder,
+    EnvFields,
+    EvaluationWorkers,
+    PolicyName,
+    PolicyTask,
+    WeightFiles,
     default_text,
     within,
 )
@@ -48,8 +51,6 @@ class Options:
     """Options of `evaluate`.
 
     Attributes:
-        policy: A checkpoint folder, a hierarchical.yaml, released:NAME (see `policies`),
-            module:factory, or expert, replay, random or zero.
         task: The task.
         episodes: Number of episodes.
         seed: Seed of the first start; each episode takes the next.
@@ -68,16 +69,14 @@ class Options:
         video_size: Height and width of each view in a video [px], even.
     """
 
-    policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
-    task: Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")] = None
+    policy: PolicyName = field(kw_only=False)
+    task: PolicyTask = None
     episodes: Annotated[int, COUNT] = 20
     seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
-    workers: Annotated[
-        int | None, COUNT, default_text("one a core, at most one for four episodes")
-    ] = None
-    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
-    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
-    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    workers: EvaluationWorkers = None
+    dataset: DatasetFolder = None
+    weights: WeightFiles = ()
+    accept_licence: AcceptLicence = False
     expert_swap: Annotated[
         str | None, Parameter(choices=(*names.SUBTASKS, ALL), metavar="SUBTASK")
     ] = None
@@ -91,7 +90,7 @@ class Options:
     video_of: Annotated[str, Parameter(metavar="WHICH")] = "all"
     video_view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
     video_size: Annotated[int, within(64, 960), Parameter(metavar="PX")] = 384
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import COUNT, DIRECTORY, FILE_ONLY, TASK, default_text
+from surgicai_vision.commands.options import COUNT, DIRECTORY, TASK, EnvFields, default_text
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError
 
@@ -42,7 +42,7 @@ class Options:
     obs_type: Annotated[str, Parameter(choices=OBS_TYPES)] = "relative"
     format: Annotated[str, Parameter(choices=FORMATS)] = "npz"
     episodes: Annotated[int | None, COUNT, default_text("all")] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
     out: Annotated[
         Path | None,
         DIRECTORY,

@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.options import DIRECTORY, FILE_ONLY, SUBTASK, default_text
+from surgicai_vision.commands.options import DIRECTORY, FILE_ONLY, SUBTASK, EnvFields, default_text
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.demos.imports.rosbag.config import (
@@ -68,7 +68,7 @@ class Options:
         str | None, Parameter(choices=tuple(SEGMENTATIONS)), default_text("auto")
     ] = None
     bag: Annotated[BagConfig | None, FILE_ONLY] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

@@ -7,12 +7,17 @@ have in common. It stands in the annotation beside the type, and may be combined
     episodes: Annotated[int, COUNT] = 20
     view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
 
+What is one option in several commands is a whole type, with its help and its default's text:
+
+    weights: WeightFiles = ()
+
 A value is taken from the command line, else from the `--config` file, else from the dataclass.
 """
 
 import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Annotated
 
 from cyclopts import App, Parameter, Token, validators
 from cyclopts.argument import Argument, ArgumentCollection
@@ -97,14 +102,6 @@ ENCODERS = Parameter(
     metavar="NAME[,NAME]",
 )
 POOL = Parameter(choices=encoders.POOLS)
-WEIGHTS = Parameter(
-    help="File with the encoder's pretrained weights; NAME=FILE for the encoder NAME alone; "
-    "repeat it for another encoder.",
-    metavar="[NAME=]FILE",
-    show_default=False,
-)
-"""Given again for another encoder; `encoders.WeightsSource.parse` reads them."""
-ACCEPT_LICENCE = Parameter(help="Accept weights under a non-commercial licence.")
 EXECUTOR = Parameter(
     help="What runs the jobs: local, ray or slurm, with its options, such as ray,address=HOST:PORT "
     "or slurm,partition=cpu,minutes=60.",
@@ -118,6 +115,35 @@ FILE_ONLY = Parameter(accepts_keys=False, converter=_refuse_text, show=False)
 def default_text(text: str) -> Parameter:
     """Return a trait that says what an option without a value of its own defaults to."""
     return Parameter(show_default=text)
+
+
+PolicyName = Annotated[
+    str,
+    Parameter(
+        help="A checkpoint folder, a hierarchical.yaml, released:NAME (see `policies`), "
+        "module:factory, or expert, replay, random or zero.",
+        metavar="POLICY",
+    ),
+]
+"""What `evaluation.policy_spec.open_policy` takes."""
+PolicyTask = Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")]
+EvaluationWorkers = Annotated[
+    int | None, COUNT, default_text("one a core, at most one for four episodes")
+]
+DatasetFolder = Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")]
+WeightFiles = Annotated[
+    tuple[str, ...],
+    Parameter(
+        help="File with the encoder's pretrained weights; NAME=FILE for the encoder NAME alone; "
+        "repeat it for another encoder.",
+        metavar="[NAME=]FILE",
+        show_default=False,
+    ),
+]
+"""`encoders.WeightsSource.parse` reads them, with the next."""
+AcceptLicence = Annotated[bool, Parameter(help="Accept weights under a non-commercial licence.")]
+EnvFields = Annotated[dict[str, object] | None, FILE_ONLY]
+"""Fields of `TaskConfig` that differ; `task_config` or `open_policy` reads them."""
 
 
 def task_config(task: str, env: dict[str, object] | None) -> TaskConfig:

@@ -9,14 +9,15 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    ACCEPT_LICENCE,
     DIRECTORY,
     ENCODERS,
     NOT_NEGATIVE,
     POOL,
     TASK,
     VIEWS,
-    WEIGHTS,
+    AcceptLicence,
+    DatasetFolder,
+    WeightFiles,
     default_text,
 )
 from surgicai_vision.core.files import check_output, write_json
@@ -50,11 +51,11 @@ class Options:
     """
 
     task: Annotated[str, TASK] = "grasp"
-    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    dataset: DatasetFolder = None
     encoder: Annotated[tuple[str, ...], ENCODERS] = ("imagenet-lite",)
     view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
-    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
-    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    weights: WeightFiles = ()
+    accept_licence: AcceptLicence = False
     pool: Annotated[str, POOL] = "global"
     seed: Annotated[int, NOT_NEGATIVE] = 0
     out: Annotated[

@@ -12,10 +12,10 @@ from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
     EXECUTOR,
-    FILE_ONLY,
     FRACTION,
     NOT_NEGATIVE,
     TASK,
+    EnvFields,
     default_text,
     task_config,
 )
@@ -80,7 +80,7 @@ class Options:
     workers: Annotated[int, COUNT] = folders.CORES
     executor: Annotated[str, EXECUTOR] = "local"
     out: Annotated[Path | None, DIRECTORY, default_text("outputs/demos/<task>")] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

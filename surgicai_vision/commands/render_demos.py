@@ -14,12 +14,12 @@ from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
     EXECUTOR,
-    FILE_ONLY,
     IMAGE_SIZE,
     NOT_NEGATIVE,
     TASK,
     VIDEO,
     VIEWS,
+    EnvFields,
     default_text,
     within,
 )
@@ -81,7 +81,7 @@ class Options:
     workers: Annotated[int, COUNT] = folders.CORES
     executor: Annotated[str, EXECUTOR] = "local"
     out: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

@@ -10,15 +10,18 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.evaluate import open_given
 from surgicai_vision.commands.options import (
-    ACCEPT_LICENCE,
     COUNT,
     DIRECTORY,
-    FILE_ONLY,
     LIST,
     NOT_NEGATIVE,
-    TASK,
     UNIQUE,
-    WEIGHTS,
+    AcceptLicence,
+    DatasetFolder,
+    EnvFields,
+    EvaluationWorkers,
+    PolicyName,
+    PolicyTask,
+    WeightFiles,
     default_text,
 )
 from surgicai_vision.core import names
@@ -40,8 +43,6 @@ class Options:
     """Options of `robustness`.
 
     Attributes:
-        policy: A checkpoint folder, a hierarchical.yaml, released:NAME (see `policies`),
-            module:factory, or expert, replay, random or zero.
         task: The task.
         axis: What shifts.
         strength: How much, from 0 (not at all) to 1, increasing.
@@ -52,8 +53,8 @@ class Options:
         out: Folder to make or to continue.
     """
 
-    policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
-    task: Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")] = None
+    policy: PolicyName = field(kw_only=False)
+    task: PolicyTask = None
     axis: Annotated[
         tuple[str, ...],
         UNIQUE,
@@ -63,18 +64,16 @@ class Options:
     strength: Annotated[tuple[float, ...], LIST, Parameter(metavar="NUMBER[,NUMBER]")] = STRENGTHS
     episodes: Annotated[int, COUNT] = 20
     seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
-    workers: Annotated[
-        int | None, COUNT, default_text("one a core, at most one for four episodes")
-    ] = None
-    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
-    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
-    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    workers: EvaluationWorkers = None
+    dataset: DatasetFolder = None
+    weights: WeightFiles = ()
+    accept_licence: AcceptLicence = False
     out: Annotated[
         Path | None,
         DIRECTORY,
         default_text("outputs/robustness/<task>-<policy>-starts<seed>+<episodes>"),
     ] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

@@ -10,13 +10,12 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.evaluate import open_given
 from surgicai_vision.commands.options import (
-    ACCEPT_LICENCE,
-    FILE_ONLY,
     NOT_NEGATIVE,
-    TASK,
     UNIQUE,
-    WEIGHTS,
-    default_text,
+    AcceptLicence,
+    EnvFields,
+    PolicyTask,
+    WeightFiles,
     within,
 )
 from surgicai_vision.core import names
@@ -47,14 +46,14 @@ class Options:
     """
 
     policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
-    task: Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")] = None
+    task: PolicyTask = None
     seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
     step: Annotated[tuple[int, ...], UNIQUE, Parameter(metavar="N[,N]")] = (0, 20, 40, 60)
     patch: Annotated[int, within(2, 960), Parameter(metavar="PX")] = 32
-    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
-    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    weights: WeightFiles = ()
+    accept_licence: AcceptLicence = False
     out: Annotated[Path, Parameter(metavar="FILE")] = Path("saliency.png")
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

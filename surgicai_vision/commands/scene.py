@@ -11,12 +11,12 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
     COUNT,
-    FILE_ONLY,
     IMAGE_SIZE,
     NOT_NEGATIVE,
     TASK,
     UNIQUE,
     VIEWS,
+    EnvFields,
     default_text,
     task_config,
     within,
@@ -89,7 +89,7 @@ class Options:
     distractors: Annotated[int, AT_MOST_FIVE] = 0
     needles: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
     placements: Annotated[Path | None, Parameter(metavar="FILE.png")] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

@@ -12,10 +12,10 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
-    FILE_ONLY,
     NOT_NEGATIVE,
     TASK,
     VIEWS,
+    EnvFields,
     default_text,
     task_config,
     within,
@@ -82,7 +82,7 @@ class Options:
     keep_failures: bool = False
     skip_idle: bool = False
     out: Annotated[Path | None, DIRECTORY, default_text("outputs/teleoperation/<task>")] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

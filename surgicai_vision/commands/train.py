@@ -10,16 +10,17 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.logs import LOGS, open_log
 from surgicai_vision.commands.options import (
-    ACCEPT_LICENCE,
     COUNT,
     DIRECTORY,
-    FILE_ONLY,
     NOT_NEGATIVE,
     POOL,
     SUBTASK,
     TASK,
     VIEWS,
-    WEIGHTS,
+    AcceptLicence,
+    DatasetFolder,
+    EnvFields,
+    WeightFiles,
     default_text,
     task_config,
 )
@@ -97,7 +98,7 @@ class Options:
     """
 
     task: Annotated[str, TASK] = "grasp"
-    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    dataset: DatasetFolder = None
     subtask: Annotated[str | None, SUBTASK, Parameter(metavar="SUBTASK")] = None
     encoder: Annotated[
         str,
@@ -109,8 +110,8 @@ class Options:
         ),
     ] = "imagenet-lite"
     view: Annotated[tuple[str, ...] | None, VIEWS, default_text("front,back")] = None
-    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
-    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    weights: WeightFiles = ()
+    accept_licence: AcceptLicence = False
     pool: Annotated[str, POOL] = "global"
     policy: Annotated[str, Parameter(choices=policies.policy_names())] = "bc"
     recipe: Annotated[
@@ -143,7 +144,7 @@ class Options:
     low: Annotated[Path | None, Parameter(metavar="FILE.yaml")] = None
     decisions: Annotated[int, COUNT] = DECISIONS
     workers: Annotated[int, NOT_NEGATIVE] = 0
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

@@ -1,7 +1,6 @@
 """`watch`: look at a policy while it acts."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
@@ -9,14 +8,15 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.evaluate import open_given
 from surgicai_vision.commands.options import (
-    ACCEPT_LICENCE,
     COUNT,
-    DIRECTORY,
-    FILE_ONLY,
     NOT_NEGATIVE,
-    TASK,
     VIEWS,
-    WEIGHTS,
+    AcceptLicence,
+    DatasetFolder,
+    EnvFields,
+    PolicyName,
+    PolicyTask,
+    WeightFiles,
     default_text,
     within,
 )
@@ -45,8 +45,6 @@ class Options:
     """Options of `watch`.
 
     Attributes:
-        policy: A checkpoint folder, a hierarchical.yaml, released:NAME (see `policies`),
-            module:factory, or expert, replay, random or zero.
         task: The task.
         seed: Seed of the first start; the next ones follow.
         episodes: End after so many episodes.
@@ -60,8 +58,8 @@ class Options:
         expert_swap: For a hierarchical policy, the subtask that the expert does.
     """
 
-    policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
-    task: Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")] = None
+    policy: PolicyName = field(kw_only=False)
+    task: PolicyTask = None
     seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
     episodes: Annotated[int | None, COUNT, default_text("go on until Esc")] = None
     go_on: bool = False
@@ -70,11 +68,11 @@ class Options:
     port: Annotated[int, within(0, 65535)] = WEB_PORT
     view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
     size: Annotated[int, within(64, 960), Parameter(metavar="PX")] = 448
-    dataset: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
-    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
-    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    dataset: DatasetFolder = None
+    weights: WeightFiles = ()
+    accept_licence: AcceptLicence = False
     expert_swap: Annotated[str | None, Parameter(choices=names.SUBTASKS, metavar="SUBTASK")] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

@@ -9,13 +9,14 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
-    ACCEPT_LICENCE,
     COUNT,
     DIRECTORY,
-    FILE_ONLY,
     NOT_NEGATIVE,
     UNIQUE,
-    WEIGHTS,
+    AcceptLicence,
+    EnvFields,
+    EvaluationWorkers,
+    WeightFiles,
     default_text,
 )
 from surgicai_vision.core import names
@@ -53,15 +54,13 @@ class Options:
     patience: Annotated[tuple[int, ...], UNIQUE, Parameter(metavar="N[,N]")] = (1, 2, 3)
     episodes: Annotated[int, COUNT] = 20
     seed: Annotated[int, NOT_NEGATIVE] = names.VALIDATION_SEED
-    workers: Annotated[
-        int | None, COUNT, default_text("one a core, at most one for four episodes")
-    ] = None
-    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
-    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    workers: EvaluationWorkers = None
+    weights: WeightFiles = ()
+    accept_licence: AcceptLicence = False
     out: Annotated[
         Path | None, DIRECTORY, default_text("outputs/ends/<file>-starts<seed>+<episodes>")
     ] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
 
 
 @app.default

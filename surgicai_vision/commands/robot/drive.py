@@ -12,13 +12,14 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.evaluate import open_given
 from surgicai_vision.commands.options import (
-    ACCEPT_LICENCE,
     COUNT,
     DIRECTORY,
     FILE_ONLY,
     NOT_NEGATIVE,
-    TASK,
-    WEIGHTS,
+    AcceptLicence,
+    EnvFields,
+    PolicyTask,
+    WeightFiles,
     default_text,
 )
 from surgicai_vision.commands.robot.network import (
@@ -79,7 +80,7 @@ class Options:
     """
 
     policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
-    task: Annotated[str | None, TASK, default_text("the checkpoint's, else grasp")] = None
+    task: PolicyTask = None
     send: bool = False
     simulated: bool = False
     clock: Annotated[str, Parameter(choices=("real", "stepped"))] = "real"
@@ -97,10 +98,10 @@ class Options:
     transport: Annotated[str, TRANSPORT] = "cyclonedds"
     interface: Annotated[str, INTERFACE] = "lo"
     domain: Domain = None
-    weights: Annotated[tuple[str, ...], WEIGHTS] = ()
-    accept_licence: Annotated[bool, ACCEPT_LICENCE] = False
+    weights: WeightFiles = ()
+    accept_licence: AcceptLicence = False
     out: Annotated[Path | None, DIRECTORY, default_text("outputs/drive/<task>-<policy>")] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
     guards: Annotated[dict[str, object] | None, FILE_ONLY] = None
     topics: Annotated[dict[str, object] | None, FILE_ONLY] = None
     frames: Annotated[dict[str, object] | None, FILE_ONLY] = None

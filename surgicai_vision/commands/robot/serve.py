@@ -17,6 +17,7 @@ from surgicai_vision.commands.options import (
     NOT_NEGATIVE,
     TASK,
     VIEWS,
+    EnvFields,
     default_text,
     task_config,
 )
@@ -85,7 +86,7 @@ class Options:
     seconds: Annotated[
         float | None, Parameter(validator=validators.Number(gt=0)), default_text("until Ctrl-C")
     ] = None
-    env: Annotated[dict[str, object] | None, FILE_ONLY] = None
+    env: EnvFields = None
     topics: Annotated[dict[str, object] | None, FILE_ONLY] = None
 
 
