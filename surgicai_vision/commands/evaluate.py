@@ -24,7 +24,7 @@ from surgicai_vision.commands.options import (
     within,
 )
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON
+from surgicai_vision.core.config import JSON, TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.features.encoders import WeightsSource
 
@@ -36,7 +36,10 @@ app = App(
     name="evaluate",
     help_epilogue="""\
 example:
-  surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json""",
+  surgicai-vision evaluate expert --task grasp --episodes 50 --seed 900000 --json
+
+A policy is evaluated in the world it was trained in, also one that varies; a --config file with
+`env: {randomisation: …}` gives another, and with `env: {randomisation: {}}` the standing one.""",
 )
 
 ALL = "all"
@@ -126,12 +129,28 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     with console.stage(f"evaluating {spec.name} on {spec.config.task}", "steps") as progress:
         result = evaluate_into(out, spec, seeds, options.workers, progress, filming)
     console.say(summary_line(result))
+    say_world(spec.config, console)
     console.say(f"episodes: {out}")
+    result |= {"randomisation": varied(spec.config), "out": str(out)}
     if filming is None:
-        return {**result, "out": str(out)}
+        return result
     videos = [str(filming.folder / name) for name in filming.videos()]
     console.say(f"videos: {filming.folder} ({len(videos)})")
-    return {**result, "out": str(out), "videos": videos}
+    return {**result, "videos": videos}
+
+
+def varied(config: TaskConfig) -> dict[str, object]:
+    """Return the axes along which the world varies from episode to episode, with their values."""
+    return {axis: vars(config.randomisation)[axis] for axis in config.randomisation.on}
+
+
+def say_world(config: TaskConfig, console: Console) -> None:
+    """Print how the world varies, where it does."""
+    if config.randomisation.on:
+        console.say(
+            f"world: varies ({config.randomisation.text}); `env: {{randomisation: {{}}}}` in a "
+            "--config file evaluates in the standing one"
+        )
 
 
 def _filming(options: Options) -> "Filming | None":
@@ -203,6 +222,7 @@ def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:
         console.say(
             f"{who:<18} " + ", ".join(f"{row['subtask']} {row['k']}/{row['n']}" for row in mine)
         )
+    say_world(plain.config, console)
     console.say(f"expert swaps: {out / CURVES}")
     return {"policy": plain.name, "task": plain.config.task, "expert_swap": rows, "out": str(out)}
 

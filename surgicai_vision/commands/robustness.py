@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.evaluate import open_given
+from surgicai_vision.commands.evaluate import open_given, say_world
 from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
@@ -97,6 +97,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     )
     for axis in dict.fromkeys(row["axis"] for row in rows):
         console.say(curve_line([row for row in rows if row["axis"] == axis]))
+    say_world(spec.config, console)
     console.say(f"curves: {out / CURVES}")
     return {"policy": spec.name, "task": spec.config.task, "curves": rows, "out": str(out)}
 

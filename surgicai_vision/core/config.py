@@ -193,6 +193,11 @@ class RandomisationConfig:
         return tuple(axis for axis in axes if getattr(self, axis))
 
     @property
+    def text(self) -> str:
+        """What varies, in words: each axis that is on, with its value; empty where none is."""
+        return ", ".join(f"{axis} {vars(self)[axis]}" for axis in self.on)
+
+    @property
     def shows_heldout(self) -> bool:
         """Return True if episodes may look as one of the held-out families."""
         return bool(

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from checkpoints import checkpoint
 
+from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.policy_spec import open_policy
@@ -46,6 +47,24 @@ def test_a_checkpoint_acts_in_the_env_it_was_trained_in(tmp_path: Path) -> None:
     assert (spec.name, spec.config) == ("proprioception", TaskConfig("grasp"))
     assert spec.run.demonstrations == 1
     assert open_policy(tmp_path / "grasp", env={"max_steps": 7}).config.max_steps == 7
+
+
+def test_evaluate_says_in_which_world_it_counts(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    varied = RandomisationConfig(phantom_shift=3.0, needle_arc="any")
+    checkpoint(Path("varied"), "grasp", env=TaskConfig("grasp", max_steps=2, randomisation=varied))
+    command = ["evaluate", "varied", "--episodes", "1", "--workers", "1"]
+    assert main(command) == 0
+    assert "world: varies (phantom_shift 3.0, needle_arc any)" in capsys.readouterr().out
+    Path("standing.yaml").write_text("env: {randomisation: {}, max_steps: 2}\n")
+    for more, expected in (
+        ([], {"phantom_shift": 3.0, "needle_arc": "any"}),
+        (["--config", "standing.yaml"], {}),
+    ):
+        assert main([*command, "--json", *more]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert json.loads(lines[-1])["randomisation"] == expected
+        assert any("world: varies" in line for line in lines) == bool(expected)
 
 
 def test_a_factory_elsewhere_makes_the_agent(tmp_path: Path) -> None:

@@ -395,10 +395,9 @@ class Grid:
         """What is done, in words."""
         counts = ", ".join(map(str, self.demonstrations))
         manner = self._dataset(self.task[0]).demonstrations.manner
-        randomised = [
-            f"{axis} up to {size}" for axis, size in vars(self.randomisation).items() if size
-        ]
-        data = ", ".join([f"{counts} demonstrations of each task {manner}", *randomised])
+        world = self.randomisation.text
+        varies = f", in a world that varies ({world})" if world else ""
+        data = f"{counts} demonstrations of each task {manner}{varies}"
         seen = (
             f"{', '.join(self.views)} at {self.size} × {self.size}" if self.views else "no images"
         )
