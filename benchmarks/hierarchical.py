@@ -70,7 +70,7 @@ def make_agent(encoder: str, size: int, decide_every: int) -> Agent:
     loaded = load_encoder(encoder)
     config = HierarchicalConfig("hlp", *names.SUBTASKS, steps=20, decide_every=decide_every)
     low = [functools.partial(PolicyAgent, "low", Head(7), loaded, views, size) for views in LOW]
-    high = PolicyAgent("high", Head(5), loaded, (*PSM1, *PSM2), size, names.BOTH_ARMS)
+    high = PolicyAgent("high", Head(5), loaded, (*PSM1, *PSM2), size, (names.BOTH_ARMS,))
     return HierarchicalAgent(config, low, lambda: high)
 
 

@@ -60,7 +60,7 @@ class Actor(Policy):
 
     def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
         assert isinstance(recipe, ActorRecipe)
-        super().__init__(Inputs(visual, VECTORS[recipe.observation]))
+        super().__init__(Inputs(visual, (VECTORS[recipe.observation],)))
         self.network = FeatureMLP(recipe, self.inputs, ACTIONS)
         self.squash = recipe.squash
 
@@ -108,7 +108,7 @@ class BatchConstrained(Policy):
 
     def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
         assert isinstance(recipe, ActorRecipe)
-        super().__init__(Inputs(visual, VECTORS[recipe.observation]))
+        super().__init__(Inputs(visual, (VECTORS[recipe.observation],)))
         size = self.inputs.dim
         self.decoder = _mlp(size + LATENT, recipe.hidden, ACTIONS)
         self.shift = _mlp(size + ACTIONS, recipe.hidden, ACTIONS)

@@ -36,14 +36,15 @@ ACTIONS = len(names.ACTION_NAMES)
 VECTORS: Mapping[str, int] = MappingProxyType(
     {
         names.STATE: len(names.STATE_NAMES),
-        names.CLOCKED_STATE: len(names.STATE_NAMES) + CLOCK_SIZE,
-        names.PROGRESSED_STATE: len(names.STATE_NAMES) + 1,
+        names.SETPOINT: len(names.SETPOINT_NAMES),
+        names.CLOCK: CLOCK_SIZE,
+        names.PROGRESS: 1,
         names.BOTH_ARMS: len(names.BOTH_ARMS_NAMES),
         names.PRIVILEGED_STATE: len(names.PRIVILEGED_NAMES),
         names.RELATIVE_STATE: len(names.RELATIVE_NAMES),
     }
 )
-"""What may be fed beside features: dataset key → length."""
+"""What may be fed beside features: key → length."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,8 @@ class Recipe:
         validation: share of the episodes (or transitions) held out of training.
         proprioception: feed tip pose and jaw too: the active arm's, for a high-level policy both
             arms'.
+        setpoint: feed how far the set point lies from the measured pose as well (needs
+            proprioception): an action moves the set point, and the tool lags behind it.
         clock: feed the time since the subtask began as well (needs proprioception), for
             demonstrators that act by it.
         progress_input: feed how far the subtask is, as a high-level policy with `progress` says it,
@@ -91,6 +94,7 @@ class Recipe:
     split: str = "episode"
     validation: float = 0.1
     proprioception: bool = True
+    setpoint: bool = False
     clock: bool = False
     progress_input: bool = False
     map_head: str = "softmax"
@@ -116,6 +120,8 @@ class Recipe:
             )
         if not self.learning_rate > 0:
             raise InputError(f"learning_rate is {self.learning_rate}; it must be above 0.")
+        if self.setpoint and (self.privileged or not self.proprioception):
+            raise InputError("setpoint goes with proprioception; switch it on, and privileged off.")
         if self.clock and (self.privileged or not self.proprioception):
             raise InputError("clock goes with proprioception; switch it on, and privileged off.")
         if self.progress_input and (self.clock or self.privileged or not self.proprioception):
@@ -145,21 +151,32 @@ class Inputs:
     Attributes:
         visual: shape of each view's feature, in the order of the views: (dim,), (C, h, w) or (N,
             C); rows are flattened; empty without images.
-        vector: key of `VECTORS`, what is fed beside the features; None for the features alone.
+        vector: keys of `VECTORS`, what is fed beside the features, one after the other; empty for
+            the features alone.
     """
 
     visual: tuple[tuple[int, ...], ...]
-    vector: str | None = names.STATE
+    vector: tuple[str, ...] = (names.STATE,)
 
     def __post_init__(self) -> None:
         if not self.visual and not self.vector:
             raise InputError(
                 "A policy needs at least one view or proprioception; this one would be blind."
             )
-        if self.visual and self.vector in names.STATES_WITH_GOAL:
+        if self.visual and self.knows_goal:
             raise InputError(
                 "A policy with images may not see the privileged state; give one or the other."
             )
+
+    @property
+    def knows_goal(self) -> bool:
+        """Whether it is fed a state with the goal, which no robot tells."""
+        return not set(self.vector).isdisjoint(names.STATES_WITH_GOAL)
+
+    @property
+    def width(self) -> int:
+        """Length of what is fed beside the features."""
+        return sum(VECTORS[key] for key in self.vector)
 
     @property
     def features(self) -> int:
@@ -169,7 +186,7 @@ class Inputs:
     @property
     def dim(self) -> int:
         """Length of the concatenated input."""
-        return self.features + (VECTORS[self.vector] if self.vector else 0)
+        return self.features + self.width
 
 
 def visual_shapes(recipe: Recipe, visual: Sequence[tuple[int, ...]]) -> tuple[tuple[int, ...], ...]:
@@ -300,10 +317,11 @@ class Policy(nn.Module, abc.ABC):
             raise InputError(
                 f"The policy was trained on features of {self.inputs.visual}, got {width}."
             )
-        key = self.inputs.vector or names.STATE
-        if agent_pos.shape[1:] != (VECTORS[key],) or (parts and len(parts[0]) != len(agent_pos)):
+        keys = self.inputs.vector or (names.STATE,)
+        wide = sum(VECTORS[key] for key in keys)
+        if agent_pos.shape[1:] != (wide,) or (parts and len(parts[0]) != len(agent_pos)):
             raise InputError(
-                f"{key} must be (batch, {VECTORS[key]}) with one row an image, "
+                f"{' + '.join(keys)} must be (batch, {wide}) with one row an image, "
                 f"got {agent_pos.shape}."
             )
         if self.inputs.vector:

@@ -34,15 +34,17 @@ class BCPolicy(Policy):
         return nn.functional.mse_loss(self(observed), target)
 
 
-def _vector(recipe: Recipe) -> str | None:
+def _vector(recipe: Recipe) -> tuple[str, ...]:
     """Return what is fed beside the features."""
     if recipe.privileged:
-        return names.PRIVILEGED_STATE
-    if recipe.clock:
-        return names.CLOCKED_STATE
-    if recipe.progress_input:
-        return names.PROGRESSED_STATE
-    return names.STATE if recipe.proprioception else None
+        return (names.PRIVILEGED_STATE,)
+    fed = {
+        names.STATE: recipe.proprioception,
+        names.SETPOINT: recipe.setpoint,
+        names.CLOCK: recipe.clock,
+        names.PROGRESS: recipe.progress_input,
+    }
+    return tuple(key for key, is_fed in fed.items() if is_fed)
 
 
 BC = Plugin("bc", Recipe, BCPolicy)

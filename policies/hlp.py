@@ -65,7 +65,7 @@ class HighLevelPolicy(Policy):
     temperature: torch.Tensor
 
     def __init__(self, recipe: HLPRecipe, visual: tuple[tuple[int, ...], ...]):
-        super().__init__(Inputs(visual, names.BOTH_ARMS if recipe.proprioception else None))
+        super().__init__(Inputs(visual, (names.BOTH_ARMS,) if recipe.proprioception else ()))
         self.network = FeatureMLP(recipe, self.inputs, CLASSES + bool(recipe.progress))
         self.weight = recipe.progress
         self.register_buffer("temperature", torch.ones(()))

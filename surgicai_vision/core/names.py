@@ -81,6 +81,7 @@ LAYOUTS = ("simple", "3dmed", "3dmed_straight")
 ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "jaw")
 STATE_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "jaw")
 BOTH_ARMS_NAMES = tuple(f"{arm}_{name}" for arm in ARMS for name in STATE_NAMES)
+SETPOINT_NAMES = ("x", "y", "z", "rx", "ry", "rz", "jaw")
 PRIVILEGED_NAMES = tuple(
     f"{part}_{name}" for part in ("now", "goal", "error") for name in STATE_NAMES
 )
@@ -108,6 +109,8 @@ CONTACT = "contact"
 NEEDLE_POSE = "needle_pose"
 BOTH_ARMS = "both_arms"
 """Measured tip pose and jaw of psm1, then of psm2, each in its own base."""
+SETPOINT = "setpoint"
+"""How far the active arm's set point lies from its measured tip pose and jaw."""
 PRIVILEGED_STATE = "privileged_state"
 """The 21 values of obs_type "state" with the goal; no LeRobot key, lest a policy be fed it."""
 
@@ -117,12 +120,10 @@ RELATIVE_STATE = "relative_state"
 STATES_WITH_GOAL = (PRIVILEGED_STATE, RELATIVE_STATE)
 """What no policy with images may be fed."""
 
-CLOCKED_STATE = "clocked_state"
-"""STATE and, last, the time since the subtask began as `config.clock` tells it."""
-PROGRESSED_STATE = "progressed_state"
-"""STATE and, last, the progress of the subtask as another policy says it
-(`training.progress_input`).
-"""
+CLOCK = "clock"
+"""The time since the subtask began as `config.clock` tells it; computed, in no dataset."""
+PROGRESS = "progress"
+"""The progress of the subtask as another policy says it (`training.progress_input`)."""
 STAGE = "stage"
 """The subtask that is due and the progress within the present one (`training.visits.stages`)."""
 

@@ -37,6 +37,7 @@ MEASURED: Mapping[str, Callable[[envs.SuturingEnv], NDArray[np.float32]]] = {
     names.STATE: lambda env: env.agent_pos(),
     names.NEEDLE_POSE: lambda env: env.needle_pose(),
     names.BOTH_ARMS: lambda env: env.both_arms(),
+    names.SETPOINT: lambda env: env.setpoint(),
     names.PRIVILEGED_STATE: lambda env: env.state_vector(),
 }
 """Column → what the env measures in the state that was set."""

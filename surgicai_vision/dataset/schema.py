@@ -18,8 +18,8 @@ from surgicai_vision.core import names
 Table = Mapping[str, Any]
 """A JSON object, as it is read from a file."""
 
-FORMAT = 2
-"""Version of `meta/surgicai.json`; surgicai-vision 0.1 wrote none."""
+FORMAT = 3
+"""Version of `meta/surgicai.json`; surgicai-vision 0.1 wrote none, 2 had no set points."""
 
 VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -27,6 +27,7 @@ VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         names.ACTION: names.ACTION_NAMES,
         names.NEEDLE_POSE: ("x", "y", "z", "qw", "qx", "qy", "qz"),
         names.BOTH_ARMS: names.BOTH_ARMS_NAMES,
+        names.SETPOINT: names.SETPOINT_NAMES,
         names.PRIVILEGED_STATE: names.PRIVILEGED_NAMES,
     }
 )

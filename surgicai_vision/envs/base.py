@@ -410,6 +410,19 @@ class SuturingEnv(gymnasium.Env):
         ]
         return np.array(sevens, dtype=np.float32).ravel()
 
+    def setpoint(self) -> NDArray[np.float32]:
+        """Return how far the active arm's set point lies from its measured tip, (7,) [m, rad].
+
+        x y z and the rotation vector of the turn in the arm's base, and the jaw. Tissue and load
+        hold the tool back, and it lags; a dVRK tells both poses (`setpoint_cp`, `measured_cp`).
+        """
+        simulation = self.simulation
+        arm = self.subtask.arm
+        told = simulation.pending(arm, self._step_size)
+        return observation.setpoint(
+            simulation.tip_in_base(arm), simulation.jaw(arm), told.pose, told.jaw
+        )
+
     def state_vector(self) -> NDArray[np.float32]:
         """Return the observation of obs_type "state", goal included, (21,)."""
         return self._state_vector(self._target())

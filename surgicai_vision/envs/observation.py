@@ -134,6 +134,20 @@ def seven(arm: str, pose: Pose, jaw: float, scale: float = 1.0) -> list[float]:
     return [x * scale, y * scale, z * scale, roll, pitch, yaw, jaw]
 
 
+def setpoint(now: Pose, jaw: float, told: Pose, told_jaw: float) -> NDArray[np.float32]:
+    """Return how far a set point lies from what is measured, (7,) [m, rad].
+
+    Args:
+        now: measured tip pose in the arm's base.
+        jaw: measured jaw angle [rad].
+        told: the tip pose that it is told to take.
+        told_jaw: the jaw angle that it is told to take [rad].
+    """
+    shift = [b - a for a, b in zip(poses.position(now), poses.position(told), strict=True)]
+    turn = multiply_flat(poses.rotation(told), transpose_flat(poses.rotation(now)))
+    return np.array([*shift, *matrix_to_rotvec_flat(turn), told_jaw - jaw], dtype=np.float32)
+
+
 def state_vector(arm: str, now: Pose, goal: Pose, jaw: float) -> NDArray[np.float32]:
     """Return the 21 values of obs_type "state"; poses in the arm's base."""
     current = seven(arm, now, jaw, 100.0)

@@ -34,6 +34,12 @@ class Robot(Protocol):
     def both_arms(self) -> NDArray[np.float32]:
         """Return both arms' `agent_pos`, psm1 first, (14,)."""
 
+    def setpoint(self) -> NDArray[np.float32]:
+        """Return how far the active arm's set point lies from its measured tip, (7,).
+
+        x y z [m] and the rotation vector [rad] in its base, and the jaw [rad].
+        """
+
     def enter(self, phase: int) -> None:
         """Make a subtask, an index in `names.SUBTASKS`, the present one: its arm is active now."""
 

@@ -153,14 +153,16 @@ def mean_demonstration(
 VECTORS: Mapping[str, Callable[[Robot], NDArray[np.float32]]] = MappingProxyType(
     {
         names.STATE: lambda robot: robot.agent_pos(),
-        names.CLOCKED_STATE: lambda robot: robot.agent_pos(),  # the agent itself adds the clock
-        names.PROGRESSED_STATE: lambda robot: robot.agent_pos(),  # the agent adds the progress
+        names.SETPOINT: lambda robot: robot.setpoint(),
         names.BOTH_ARMS: lambda robot: robot.both_arms(),
         names.PRIVILEGED_STATE: lambda robot: simulated(robot).state_vector(),
         names.RELATIVE_STATE: lambda robot: simulated(robot).relative_state(),
     }
 )
-"""What a policy may be fed beside features: dataset key → how the robot says it."""
+"""What a robot tells of what a policy may be fed beside features.
+
+The clock and the progress the agent knows itself; they stand last.
+"""
 
 BASELINES: Mapping[str, Callable[[], Agent]] = MappingProxyType(
     {
@@ -183,8 +185,8 @@ class PolicyAgent(Agent):
         encoder: frames (B, H, W, 3) → features (B, dim), or None for a policy without images.
         views: the policy's views, in the order of its features.
         image_size: height and width the policy was trained on [px].
-        vector: what it is fed beside its features, a key of `VECTORS`.
-        progress: says the progress that the policy is fed with `names.PROGRESSED_STATE`.
+        vector: what it is fed beside its features, keys of `policies.base.VECTORS`.
+        progress: says the progress that the policy is fed with `names.PROGRESS`.
     """
 
     def __init__(
@@ -194,7 +196,7 @@ class PolicyAgent(Agent):
         encoder: "Encoder | None",
         views: tuple[str, ...],
         image_size: int,
-        vector: str = names.STATE,
+        vector: tuple[str, ...] = (names.STATE,),
         progress: "PolicyAgent | None" = None,
     ):
         self.name = name
@@ -203,11 +205,11 @@ class PolicyAgent(Agent):
         seen = (*views, *(progress.views if progress else ()))
         self.cameras = tuple(dict.fromkeys(map(names.camera_of, seen)))
         self.depth = any(map(names.is_depth_view, seen))
-        self.privileged = vector in names.STATES_WITH_GOAL
+        self.privileged = not set(vector).isdisjoint(names.STATES_WITH_GOAL)
         self._policy = policy
         self._encoder = encoder
-        self._vector = VECTORS[vector]
-        self._clocked = vector == names.CLOCKED_STATE
+        self._told = tuple(VECTORS[key] for key in vector if key in VECTORS)
+        self._clocked = names.CLOCK in vector
         self._progress = progress
         self._ticks: dict[int, int] = {}
         self._shared: FeatureTable | None = None
@@ -248,7 +250,9 @@ class PolicyAgent(Agent):
             ticks: control steps since each robot's subtask began, for a policy with a clock.
         """
         with one_thread():
-            vectors = np.stack([self._vector(robot) for robot in robots])
+            vectors = np.stack(
+                [np.concatenate([told(robot) for told in self._told]) for robot in robots]
+            )
             if self._clocked and ticks is not None:
                 clocks = clock(np.array(ticks))
                 vectors = np.concatenate([vectors, clocks], axis=1, dtype=np.float32)

@@ -295,7 +295,7 @@ def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent
         encoder,
         checkpoint.views,
         checkpoint.image_size,
-        policy.inputs.vector or names.STATE,
+        policy.inputs.vector or (names.STATE,),
         policy_agent(progress, weights) if progress else None,
     )
 

@@ -344,7 +344,7 @@ def _evaluate(
     stages = 0.0
     if request.validation:
         policy, _ = _policy(request, model)
-        high = functools.partial(PolicyAgent, HLP, policy, None, (), IMAGE_SIZE, names.BOTH_ARMS)
+        high = functools.partial(PolicyAgent, HLP, policy, None, (), IMAGE_SIZE, (names.BOTH_ARMS,))
         low = [
             open_policy(path, task=subtask).make_agent for subtask, path in request.low.low.items()
         ]

@@ -352,7 +352,7 @@ def _evaluate(request: Request, learner: Learner, minutes: float) -> Point:
         None,
         (),
         IMAGE_SIZE,
-        VECTORS[request.observation],
+        (VECTORS[request.observation],),
     )
     seeds = range(names.VALIDATION_SEED, names.VALIDATION_SEED + request.validation)
     episodes = run_share(make, request.env, seeds, EVALUATED_AT_ONCE, report=lambda _: None)

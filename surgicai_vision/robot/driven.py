@@ -117,6 +117,12 @@ class DrivenRobot:
         """Return both arms' `agent_pos`, psm1 first, (14,)."""
         return np.array([self._seven(arm.upper()) for arm in names.ARMS], np.float32).ravel()
 
+    def setpoint(self) -> NDArray[np.float32]:
+        """Return how far the active arm's set point lies from its measured tip, (7,)."""
+        told = self.told(self.active)
+        jaw = self._angle(f"/{self.active}/jaw/measured_js")
+        return observation.setpoint(self.measured(self.active), jaw, told.pose, told.jaw)
+
     def enter(self, phase: int) -> None:
         """Make a subtask the present one: its arm is active now."""
         if not 0 <= phase < len(names.SUBTASKS):

@@ -2,7 +2,7 @@
 
 * `with_noise(observed, inputs, deviation)`: Gaussian noise on the measured poses (the recipe's
   `proprioception_noise`), so that a policy does not trust the joints further than they can be
-  trusted. The clock and the progress are not measured and stay as they are.
+  trusted. What stands beside them (`EXACT`) stays as it is.
 * `with_shift(observed, shapes, places)`: feature maps moved by whole places (the recipe's
   `map_shift`), as where a crop lies beside the jaws; DrQ moves images so (Kostrikov et al., Image
   augmentation is all you need, ICLR 2021).
@@ -11,19 +11,15 @@ Both draw from torch's own random state, which `train` seeds, stores and restore
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 
 import torch
 
 from policies.base import VECTORS, Inputs
 from surgicai_vision.core import names
-from surgicai_vision.core.config import CLOCK_SIZE
 
-NOT_MEASURED: Mapping[str, int] = MappingProxyType(
-    {names.CLOCKED_STATE: CLOCK_SIZE, names.PROGRESSED_STATE: 1}
-)
-"""What is fed beside features → how many of its last values are no measured pose."""
+EXACT = (names.SETPOINT, names.CLOCK, names.PROGRESS)
+"""What is fed beside features and is not off where the joints are."""
 
 
 def with_noise(observed: torch.Tensor, inputs: Inputs, deviation: float) -> torch.Tensor:
@@ -34,12 +30,13 @@ def with_noise(observed: torch.Tensor, inputs: Inputs, deviation: float) -> torc
         inputs: what they are.
         deviation: standard deviation of the noise, in standard deviations of each value.
     """
-    if inputs.vector is None:
-        return observed
-    measured = VECTORS[inputs.vector] - NOT_MEASURED.get(inputs.vector, 0)
     noise = torch.zeros_like(observed)
-    drawn = deviation * torch.randn(len(observed), measured)
-    noise[:, inputs.features : inputs.features + measured] = drawn.to(noise.device)
+    at = inputs.features
+    for key in inputs.vector:
+        end = at + VECTORS[key]
+        if key not in EXACT:
+            noise[:, at:end] = deviation * torch.randn(len(observed), VECTORS[key]).to(noise.device)
+        at = end
     return observed + noise
 
 

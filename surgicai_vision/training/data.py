@@ -34,14 +34,14 @@ def column(dataset: Dataset, key: str) -> NDArray[np.generic]:
     return columns[check_name("column", key, columns)]
 
 
-def _clocked_state(columns: Columns, episode_index: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Return `names.CLOCKED_STATE`, (N, 10) float32."""
+def _clock(columns: Columns, episode_index: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return `names.CLOCK`, (N, 3) float32."""
     steps = np.rint(np.asarray(columns["timestamp"]) * names.FPS)
-    return np.concatenate([columns[names.STATE], clock(steps)], axis=1, dtype=np.float32)
+    return clock(steps).astype(np.float32)
 
 
 COMPUTED: Mapping[str, Callable[[Columns, NDArray[np.int64]], NDArray[np.generic]]] = (
-    MappingProxyType({names.CLOCKED_STATE: _clocked_state, names.STAGE: stages})
+    MappingProxyType({names.CLOCK: _clock, names.STAGE: stages})
 )
 """Column that no dataset holds → (its columns, (N,) episode of every frame) → (N, n) values."""
 

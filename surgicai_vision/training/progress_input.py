@@ -10,7 +10,7 @@ Interface:
 
 * `check_progress_policy(checkpoint, dataset)`: refuse what says no progress of this dataset's task.
 * `with_progress(dataset, policy, features) -> Dataset`: the dataset with the column
-  `names.PROGRESSED_STATE`.
+  `names.PROGRESS`.
 * `copy_progress_policy(checkpoint, folder)`, `progress_policy_folder(checkpoint)`.
 """
 
@@ -65,7 +65,7 @@ def check_progress_policy(checkpoint: Checkpoint, dataset: Dataset) -> None:
 def with_progress(
     dataset: Dataset, policy: "Policy", features: Sequence[Features]
 ) -> DatasetSubset:
-    """Return the dataset with `names.PROGRESSED_STATE`: its state and the predicted progress.
+    """Return the dataset with the column `names.PROGRESS`, the predicted progress.
 
     Args:
         dataset: any dataset.
@@ -79,12 +79,11 @@ def with_progress(
         seen = [np.asarray(entry.rows[rows], np.float32) for entry in features]
         answers = policy.act(np.concatenate(seen, axis=1) if seen else None, arms[rows])
         said.append(answers[:, PROGRESS_AT:])
-    state = np.asarray(dataset.columns()[names.STATE], np.float32)
     return DatasetSubset(
         dataset,
         np.arange(dataset.length),
         {"progress": policy.checkpoint.policy_sha256},
-        added={names.PROGRESSED_STATE: np.concatenate([state, np.concatenate(said)], axis=1)},
+        added={names.PROGRESS: np.concatenate(said)},
     )
 
 

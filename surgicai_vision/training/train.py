@@ -180,7 +180,7 @@ class _Task:
         """What it is fed beside features (else the state), and what it learns, by their names."""
         with torch.random.fork_rng(devices=[]):
             vector = self.untrained().inputs.vector
-        keys = (vector or names.STATE, self.policy.target)
+        keys = (*(vector or (names.STATE,)), self.policy.target)
         return {key: column(self.dataset, key) for key in keys}
 
     def untrained(self) -> Policy:
@@ -247,8 +247,8 @@ class _Training:
             )
         torch.manual_seed(task.seed)
         self.policy = task.untrained()
-        vector = self.policy.inputs.vector
-        self.vector = np.asarray(task.columns[vector], np.float32) if vector else None
+        fed = [np.asarray(task.columns[key], np.float32) for key in self.policy.inputs.vector]
+        self.vector = np.concatenate(fed, axis=1) if fed else None
         target = task.columns[task.policy.target]
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
         self.target = torch.from_numpy(target.astype(kind))
@@ -454,8 +454,7 @@ class _Training:
             recipe=to_mapping(task.recipe),
             image_size=dataset.image_size,
             encoder=_record(task.features[0]) if task.features else None,
-            proprioception=self.vector is not None
-            and self.policy.inputs.vector not in names.STATES_WITH_GOAL,
+            proprioception=self.vector is not None and not self.policy.inputs.knows_goal,
             epoch=len(self.losses),
             dataset=dataset.fingerprint,
             frames=len(self.rows),

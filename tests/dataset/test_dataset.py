@@ -82,6 +82,7 @@ def test_every_frame_is_the_image_of_its_state(tmp_path, fake, demos):
                 np.testing.assert_array_equal(parts, observation[f"{view}_segmentation"])
             np.testing.assert_array_equal(columns[names.STATE][frame], env.agent_pos())
             np.testing.assert_array_equal(columns[names.BOTH_ARMS][frame], env.both_arms())
+            np.testing.assert_array_equal(columns[names.SETPOINT][frame], env.setpoint())
             np.testing.assert_array_equal(
                 columns[names.PRIVILEGED_STATE][frame], env.state_vector()
             )
@@ -374,7 +375,7 @@ def test_a_dataset_of_another_format_is_refused_in_one_line(tmp_path, fake, demo
     content = json.loads(meta.read_text())
     del content["format"]  # as surgicai-vision 0.1 wrote it
     meta.write_text(json.dumps(content))
-    with pytest.raises(BadFile, match=r"another version .*format 1; this version reads 2.*render"):
+    with pytest.raises(BadFile, match=r"another version .*format 1; this version reads 3.*render"):
         open_dataset(tmp_path / "set")
 
 

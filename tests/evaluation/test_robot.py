@@ -20,13 +20,14 @@ class OnlyRobot:
     """An env of which nothing is left but what `evaluation.agent.Robot` has."""
 
     def __init__(self, env):
-        self.agent_pos, self.both_arms, self.enter = env.agent_pos, env.both_arms, env.enter
+        self.agent_pos, self.both_arms = env.agent_pos, env.both_arms
+        self.setpoint, self.enter = env.setpoint, env.enter
 
     def __getattr__(self, name):
         raise AssertionError(f"an agent asked its robot for '{name}'")
 
 
-def policy(answers: np.ndarray, vector: str) -> PolicyAgent:
+def policy(answers: np.ndarray, vector: tuple[str, ...]) -> PolicyAgent:
     """Return a policy without images that gives these answers in turn."""
     given = iter(answers)
 
@@ -37,7 +38,9 @@ def policy(answers: np.ndarray, vector: str) -> PolicyAgent:
     return PolicyAgent("played", SimpleNamespace(act=act), None, (), 32, vector)
 
 
-def hierarchy(vector: str = names.STATE, **ends: object) -> HierarchicalAgent:
+def hierarchy(
+    vector: tuple[str, ...] = (names.STATE, names.SETPOINT), **ends: object
+) -> HierarchicalAgent:
     """Return policies that play what the expert did, and say when it went on."""
     played = expert_procedure(SEED)
     phases = np.array(played.phases)
@@ -47,7 +50,7 @@ def hierarchy(vector: str = names.STATE, **ends: object) -> HierarchicalAgent:
     ]
     logits = 9.0 * np.eye(len(names.SUBTASKS), dtype=np.float32)[phases]
     config = HierarchicalConfig("hlp", *names.SUBTASKS, **ends)
-    return HierarchicalAgent(config, low, lambda: policy(logits, names.BOTH_ARMS))
+    return HierarchicalAgent(config, low, lambda: policy(logits, (names.BOTH_ARMS,)))
 
 
 def sew(agent: HierarchicalAgent) -> dict[str, object]:
@@ -75,7 +78,7 @@ def test_a_whole_procedure_with_learned_ends_asks_a_robot_for_nothing_else() -> 
     ("asked", "made"),
     [
         ("phase", {"termination": "privileged"}),
-        ("state_vector", {"vector": names.PRIVILEGED_STATE, "patience": 1, "decide_every": 1}),
+        ("state_vector", {"vector": (names.PRIVILEGED_STATE,), "patience": 1, "decide_every": 1}),
     ],
 )
 def test_what_is_privileged_says_so_and_has_no_robot(asked: str, made: dict[str, object]) -> None:

@@ -78,6 +78,9 @@ class FakeEnv:
     def both_arms(self):
         return np.concatenate([self.agent_pos(), self.agent_pos() + np.float32(1)])
 
+    def setpoint(self):
+        return np.full(7, self.state[1] / 10, np.float32)
+
     def state_vector(self):
         return np.full(21, self.state[0] - self.state[1], np.float32)
 

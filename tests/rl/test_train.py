@@ -73,7 +73,7 @@ def test_every_algorithm_leaves_a_policy_that_acts_as_the_librarys(algo, demos, 
         patch.setattr(training, "_write", write)
         checkpoint = train(request, paths, tmp_path / "out", tensorboard=False)
     policy = load_policy(tmp_path / "out")
-    assert policy.inputs.vector == VECTORS["relative"]
+    assert policy.inputs.vector == (VECTORS["relative"],)
     ours = policy.act(None, np.stack([relative for _, relative in seen]))
     assert np.abs(ours).max() <= 1
     assert np.allclose(ours, kept[0], atol=2e-5)

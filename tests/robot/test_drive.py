@@ -188,7 +188,7 @@ def test_a_robot_with_frames_of_its_own_is_driven_the_same():
     other = OtherFrames(
         served, {"PSM1": pose(given.psm1), "PSM2": pose(given.psm2)}, pose(given.tip)
     )
-    episode, lines, _, _ = drive(
+    episode, _, _, _ = drive(
         RandomAgent(), "grasp", 30, transport=served, through=other, frames=given
     )
     assert episode.held == 0
@@ -231,6 +231,7 @@ def test_an_agent_reads_the_same_poses_as_in_process():
     env = served.robot.env
     assert np.allclose(robot.agent_pos(), env.agent_pos(), atol=1e-6)
     assert np.allclose(robot.both_arms(), env.both_arms(), atol=1e-6)
+    assert np.allclose(robot.setpoint(), env.setpoint(), atol=1e-6)
     robot.enter(3)
     env.enter(3)
     assert robot.active == "PSM1"

@@ -23,19 +23,19 @@ MAP = [3, 2, 2]
 
 def test_noise_is_on_the_measured_pose_alone() -> None:
     torch.manual_seed(0)
-    inputs = Inputs(((3, 4, 4),), names.CLOCKED_STATE)
+    inputs = Inputs(((3, 4, 4),), (names.STATE, names.SETPOINT, names.CLOCK, names.PROGRESS))
     observed = torch.zeros(4000, inputs.dim)
     noise = with_noise(observed, inputs, 0.5)
     pose = slice(inputs.features, inputs.features + 7)
     np.testing.assert_allclose(noise[:, pose].std(0), 0.5, rtol=0.1)
     noise[:, pose] = 0
-    assert not noise.any() and not observed.any(), "features, clock or the inputs were changed"
-    alone = Inputs(((3, 4, 4),), None)
+    assert not noise.any() and not observed.any(), "what is exact, or the inputs, were changed"
+    alone = Inputs(((3, 4, 4),), ())
     assert not with_noise(torch.zeros(2, alone.dim), alone, 0.5).any()
 
 
 def test_noise_is_on_both_arms_of_a_high_level_policy() -> None:
-    inputs = Inputs((), names.BOTH_ARMS)
+    inputs = Inputs((), (names.BOTH_ARMS,))
     assert (with_noise(torch.zeros(9, 14), inputs, 1.0) != 0).all()
 
 

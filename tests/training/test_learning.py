@@ -168,7 +168,9 @@ def test_controls_are_named_by_what_they_see(capsys: pytest.CaptureFixture[str])
     ]
     assert state.startswith("outputs/train/suture-state")
     policy = policies.load_policy(state)
-    assert policy.inputs.vector == names.PRIVILEGED_STATE and not policy.checkpoint.proprioception
+    assert (
+        policy.inputs.vector == (names.PRIVILEGED_STATE,) and not policy.checkpoint.proprioception
+    )
     assert policy.act(None, np.zeros((2, 21), np.float32)).shape == (2, 7)
     with pytest.raises(InputError, match="21"):
         policy.act(None, np.zeros((2, 7), np.float32))

@@ -53,12 +53,11 @@ def test_it_is_trained_on_predictions_and_not_on_labels(says: Path) -> None:
     told = with_progress(dataset, policy, [])
     columns = told.columns()
     expected = policy.act(None, dataset.columns()[names.BOTH_ARMS])[:, 5]
-    np.testing.assert_array_equal(columns[names.PROGRESSED_STATE][:, 7], expected)
-    np.testing.assert_array_equal(columns[names.PROGRESSED_STATE][:, :7], columns[names.STATE])
+    np.testing.assert_array_equal(columns[names.PROGRESS][:, 0], expected)
     assert told.fingerprint != dataset.fingerprint and told.length == dataset.length
     part = of_subtask(told, "insert")
     rows = np.flatnonzero(dataset.columns()[names.PHASE] == 2)
-    np.testing.assert_array_equal(part.columns()[names.PROGRESSED_STATE][:, 7], expected[rows])
+    np.testing.assert_array_equal(part.columns()[names.PROGRESS][:, 0], expected[rows])
 
 
 def test_a_policy_of_progress_sees_its_own_views(says: Path, tmp_path: Path) -> None:
@@ -66,11 +65,11 @@ def test_a_policy_of_progress_sees_its_own_views(says: Path, tmp_path: Path) -> 
     seen = [features_of(dataset, view) for view in ("front", "back")]
     train(dataset, seen, HLP, QUICK, out=tmp_path / "a")
     policy = load_policy(tmp_path / "a")
-    told = with_progress(dataset, policy, seen).columns()[names.PROGRESSED_STATE]
+    told = with_progress(dataset, policy, seen).columns()[names.PROGRESS]
     rows = np.tile(dataset.rows[:50].astype(np.float32), 2)
     assert rows.shape[1] == 2 * DIM
     expected = policy.act(rows, dataset.columns()[names.BOTH_ARMS][:50])[:, 5]
-    np.testing.assert_array_equal(told[:50, 7], expected)
+    np.testing.assert_array_equal(told[:50, 0], expected)
 
 
 def test_when_it_acts_it_is_fed_the_same(says: Path, fed: Path) -> None:
@@ -109,8 +108,8 @@ def test_its_checkpoint_has_the_policy_that_says_it(says: Path, fed: Path, tmp_p
 
 
 def test_the_cameras_are_those_of_both() -> None:
-    inner = PolicyAgent("hlp", None, None, ("front",), 32, names.BOTH_ARMS)
-    outer = PolicyAgent("bc", None, None, ("back",), 32, names.PROGRESSED_STATE, inner)
+    inner = PolicyAgent("hlp", None, None, ("front",), 32, (names.BOTH_ARMS,))
+    outer = PolicyAgent("bc", None, None, ("back",), 32, (names.STATE, names.PROGRESS), inner)
     assert outer.cameras == ("back", "front") and outer.views == ("back",)
     table: dict = {}
     outer.share(table)
