@@ -137,13 +137,15 @@ install_packages() {
     say "installing $(grep -c '==' requirements.lock) locked packages in .venv (about 6 GB on disk, once)"
     "$uv" pip install --quiet --python "$venv/bin/python" --no-deps --require-hashes -r requirements.lock
     "$uv" pip install --quiet --python "$venv/bin/python" --no-deps --no-build-isolation \
-        --editable . --editable ./lerobot_env_surgicai --editable ./lerobot_salvage
+        --editable . --editable ./lerobot_env_surgicai --editable ./lerobot_robot_dvrk \
+        --editable ./lerobot_salvage
 }
 
 command -v python3 >/dev/null 2>&1 || stop "python3 is missing; any version does. Run: sudo apt-get install --yes python3"
 check_gl
 
-wanted=$({ cat requirements.lock pyproject.toml lerobot_env_surgicai/pyproject.toml lerobot_salvage/pyproject.toml scripts/setup.sh; printf '%s\n' "$root"; } | sha256sum | cut -d' ' -f1)
+wanted=$({ cat requirements.lock pyproject.toml lerobot_env_surgicai/pyproject.toml lerobot_robot_dvrk/pyproject.toml \
+    lerobot_salvage/pyproject.toml scripts/setup.sh; printf '%s\n' "$root"; } | sha256sum | cut -d' ' -f1)
 if [ "$(cat "$stamp" 2>/dev/null)" = "$wanted" ] && python_works "$venv/bin/python"; then
     exit 0
 fi

@@ -10,11 +10,13 @@ The topics are a dVRK's (`robot.topics`); a `RenamedTransport` renames them wher
 What is sent has its own stamp; what is received is as old as its arrival here, since clocks differ.
 """
 
+import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
+from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.robot import topics
 from surgicai_vision.robot.messages import Header, Message, String, StringStamped
@@ -180,6 +182,14 @@ class Client:
     def tell_subtask(self, subtask: str) -> None:
         """Tell a served simulation's judge which subtask is on, and do not wait."""
         self.send(topics.ENTER.name, StringStamped(Header(self.stamp()), subtask))
+
+    def judgement(self) -> Mapping[str, JSON]:
+        """Return how a served simulation judges the episode; nothing at a robot."""
+        heard = self.newest(topics.JUDGEMENT.name)
+        if heard is None or not isinstance(heard.message, StringStamped):
+            return {}
+        judged: dict[str, JSON] = json.loads(heard.message.text)
+        return judged
 
     def _ask(self, topic: Topic, text: str, stamp: int) -> int:
         self.send(topic.name, StringStamped(Header(stamp), text))

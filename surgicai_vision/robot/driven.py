@@ -140,6 +140,10 @@ class DrivenRobot:
         """Return the measured T_base_tip of an arm."""
         return self._ours(arm, read_pose(self._pose(f"/{arm}/local/measured_cp")))
 
+    def finger(self, arm: str) -> float:
+        """Return one finger's measured angle of an arm [rad]."""
+        return self._angle(f"/{arm}/jaw/measured_js")
+
     def told(self, arm: str) -> Command:
         """Return an arm's set points as the robot publishes them."""
         pose = self._ours(arm, read_pose(self._pose(f"/{arm}/local/setpoint_cp")))
@@ -190,12 +194,14 @@ class DrivenRobot:
         """Return the images, view → (height, width, 3), and the active arm's pose."""
         if not self.views:
             return np.zeros(0, np.float32)
-        seen: dict[str, NDArray[np.uint8]] = {view: self._image(view) for view in self.views}
-        return {**seen, "agent_pos": self.agent_pos()}
+        return {**self.images(), "agent_pos": self.agent_pos()}
+
+    def images(self) -> dict[str, NDArray[np.uint8]]:
+        """Return view → (height, width, 3)."""
+        return {view: self._image(view) for view in self.views}
 
     def _seven(self, arm: str) -> list[float]:
-        finger = self._angle(f"/{arm}/jaw/measured_js")
-        return observation.seven(arm.lower(), self.measured(arm), finger)
+        return observation.seven(arm.lower(), self.measured(arm), self.finger(arm))
 
     def _pose(self, topic: str) -> PoseStamped:
         heard = self.client.newest(topic)

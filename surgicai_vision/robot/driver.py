@@ -20,16 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON, TaskConfig
+from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.control import StepSize
 from surgicai_vision.evaluation.agent import Agent
-from surgicai_vision.robot import topics
 from surgicai_vision.robot.driven import Command, DrivenRobot
 from surgicai_vision.robot.frames import WORLD
 from surgicai_vision.robot.guards import GuardConfig
-from surgicai_vision.robot.messages import StringStamped
 from surgicai_vision.robot.operating_state import DISABLED, FAULT
 from surgicai_vision.robot.setpoints import Setpoints
 
@@ -181,7 +179,7 @@ class Driver:
             if not self._config.is_stepped:
                 due = max(due + CONTROL_S, time.monotonic() - CONTROL_S)
                 self._sleep_until(due)
-        judged = self._judged()
+        judged = self._client.judgement()
         return DrivenEpisode(
             seed,
             steps,
@@ -194,7 +192,7 @@ class Driver:
 
     def _check_judge(self) -> None:
         """Refuse a served simulation that goes on to the next subtask in another way."""
-        served = self._judged().get("advance")
+        served = self._client.judgement().get("advance")
         if self._task.task == names.SUTURE and served != self._task.advance:
             raise InputError(
                 f"the simulation is served with --advance {served}; this policy needs "
@@ -211,18 +209,10 @@ class Driver:
             state, _ = self._robot.operating(arm.upper())
             if state in STOPS:
                 return f"{arm.upper()} is {state}: the robot was stopped"
-        judged = self._judged()
+        judged = self._client.judgement()
         if judged and judged["physics_error"]:
             return "the physics diverged"
         return "the judge sees success" if judged and judged["is_success"] else ""
-
-    def _judged(self) -> Mapping[str, JSON]:
-        """Return how a served simulation judges the episode; nothing at a robot."""
-        heard = self._client.newest(topics.JUDGEMENT.name)
-        if heard is None or not isinstance(heard.message, StringStamped):
-            return {}
-        judged: dict[str, JSON] = json.loads(heard.message.text)
-        return judged
 
     def _sleep_until(self, due: float) -> None:
         """Take what comes until the next control step is due."""

@@ -13,7 +13,7 @@ back along its axis.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import final
 
 import numpy as np
@@ -33,6 +33,13 @@ from surgicai_vision.robot.guards import (
     problem_of_inputs,
 )
 from surgicai_vision.robot.messages import Header, JointState
+from surgicai_vision.scene.kinematics import Pose
+from surgicai_vision.scene.rotations import (
+    matrix_to_rotvec_flat,
+    multiply_flat,
+    rotvec_to_matrix_flat,
+    transpose_flat,
+)
 
 RELEASE_OPEN = 0.5
 """Finger's angle to which PSM2 opens when it lets go [rad] (`Simulation._let_go`)."""
@@ -78,13 +85,18 @@ class Setpoints:
         self._guard.forget()
         self._sent.clear()
 
-    def problem_of_inputs(self) -> str:
-        """Return why nothing may be sent now, or ""."""
+    def problem_of_inputs(self, arms: Iterable[str] | None = None) -> str:
+        """Return why nothing may be sent now, or "".
+
+        Args:
+            arms: arms to be moved; None: the active one, and one that lets go.
+        """
         limits = self._limits
         states, images = self._robot.input_topics()
         inputs = [Input(topic, self._age(topic), limits.max_age) for topic in states]
         inputs += [Input(topic, self._age(topic), limits.max_image_age) for topic in images]
-        operating = {arm: self._robot.operating(arm) for arm in self._robot.arms}
+        moved_arms = self._robot.arms if arms is None else arms
+        operating = {arm: self._robot.operating(arm) for arm in moved_arms}
         return problem_of_inputs(inputs, operating, self._dead_man())
 
     def _age(self, topic: str) -> float:
@@ -107,13 +119,50 @@ class Setpoints:
             now: of the control step [s].
         """
         robot = self._robot
-        values = np.asarray(action, np.float64).tolist()
-        if len(values) != 7 or not all(map(math.isfinite, values)):
-            return {}, "the policy's action is not seven finite numbers"
-        values = [min(max(value, -1.0), 1.0) for value in values]
-        commands = {robot.active: self._moved(robot.told(robot.active), values)}
+        return self.of_moves({robot.active: np.asarray(action, np.float64).tolist()}, now)
+
+    def of_moves(
+        self, moves: Mapping[str, Sequence[float]], now: float
+    ) -> tuple[Mapping[str, Command], str]:
+        """Return what would be sent at `now` [s] for increments of several arms, as `of_action`.
+
+        Args:
+            moves: arm → seven increments in [-1, 1].
+            now: of the control step [s].
+        """
+        robot = self._robot
+        commands: dict[str, Command] = {}
+        for arm, values in moves.items():
+            if len(values) != 7 or not all(map(math.isfinite, values)):
+                return {}, "the policy's action is not seven finite numbers"
+            clipped = [min(max(value, -1.0), 1.0) for value in values]
+            told = robot.told(arm) if arm == robot.active else self._present(arm)
+            commands[arm] = self._moved(told, clipped)
         if robot.release_steps:
             commands[RELEASED] = self._released()
+        return self.guarded(commands, now)
+
+    def of_targets(
+        self, targets: Mapping[str, Command], now: float
+    ) -> tuple[Mapping[str, Command], str]:
+        """Return what would be sent at `now` [s] on the way to set points, as `of_action`.
+
+        A set point further away than one step is approached by one step a call.
+
+        Args:
+            targets: arm → where it should be told to be.
+            now: of the control step [s].
+        """
+        commands: dict[str, Command] = {}
+        for arm, target in targets.items():
+            if not all(map(math.isfinite, (*target.pose, target.jaw))):
+                return {}, "the policy's set points are not finite"
+            told = self._present(arm)
+            pose = _toward(told.pose, target.pose, self._step_size)
+            jaw = min(max(target.jaw, 0.0), JAW_OPEN)
+            limit = self._step_size.jaw
+            jaw = min(max(jaw, told.jaw - limit), told.jaw + limit)
+            commands[arm] = Command(pose, jaw)
         return self.guarded(commands, now)
 
     def guarded(
@@ -181,3 +230,20 @@ class Setpoints:
             self._robot.release_steps -= 1
         if self._is_stepped:
             self._client.step(sent, stamp)
+
+
+def _toward(start: Pose, goal: Pose, step: StepSize) -> Pose:
+    """Return `goal`, or where one step from `start` towards it ends."""
+    far = poses.distance(start, goal) / step.translation
+    turn = matrix_to_rotvec_flat(
+        multiply_flat(poses.rotation(goal), transpose_flat(poses.rotation(start)))
+    )
+    share = max(far, math.hypot(*turn) / step.rotation)
+    if share <= 1.0:
+        return goal
+    x, y, z = (
+        a + (b - a) / share
+        for a, b in zip(poses.position(start), poses.position(goal), strict=True)
+    )
+    u, v, w = (angle / share for angle in turn)
+    return (x, y, z, *multiply_flat(rotvec_to_matrix_flat(u, v, w), poses.rotation(start)))

@@ -1,7 +1,6 @@
 """A policy at a served simulation, over a transport within this process, and its guards."""
 
 import dataclasses
-import functools
 import io
 import json
 import math
@@ -11,6 +10,7 @@ import pty
 import numpy as np
 import pytest
 from memory_transport import MemoryTransport
+from stepped_server import SEED, Served, env_of
 
 from surgicai_vision import envs
 from surgicai_vision.core import names
@@ -37,37 +37,13 @@ from surgicai_vision.robot.guards import (
     problem_of_inputs,
 )
 from surgicai_vision.robot.messages import Header, Joy, PoseStamped, StringStamped
-from surgicai_vision.robot.recorder import Recorder
 from surgicai_vision.robot.server import ServeConfig, Server
-from surgicai_vision.robot.simulated import SimulatedRobot
 from surgicai_vision.robot.transport import RenamedTransport
 from surgicai_vision.scene import kinematics
 from surgicai_vision.teleoperation.recordings import open_recordings
 
-SEED = 900_003
 SIMULATED = DriveConfig(GuardConfig(), sends=True, is_simulated=True, is_stepped=True)
 STEP = StepSize.of("paper")
-
-
-@functools.cache
-def env_of(task):
-    return envs.make(TaskConfig(task))
-
-
-class Served(MemoryTransport):
-    """A transport at whose other end a stepped server is asked whenever the client waits."""
-
-    def __init__(self, task, views=(), recordings=None, tell=None):
-        super().__init__()
-        self.robot = SimulatedRobot(env_of(task))
-        self.robot.reset(SEED)
-        config = ServeConfig("stepped", views=views, size=(64, 64))
-        recorder = Recorder(self.robot, recordings, tell) if recordings else None
-        self.server = Server(self.robot, self, config, recorder)
-        self.server.__enter__()
-
-    def wait(self, seconds):
-        self.server.poll()
 
 
 class Script(Agent):

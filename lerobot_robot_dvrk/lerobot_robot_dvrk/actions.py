@@ -1,0 +1,265 @@
+"""Actions: what the values of a LeRobot action mean, and where they tell the arms to go.
+
+* increments: dx.vel … dyaw.vel, jaw.vel, steps of the active arm's set point in its base: what our
+  policies, our datasets and `surgicai_page` speak.
+* delta: delta_x, delta_y, delta_z and gripper, of which 0 closes, 1 stays, 2 opens: `gamepad` and
+  `keyboard_ee`.
+* leader: the leader's joints, JOINT.pos: `so101_leader`, `koch_leader` and any other arm.
+* absolute: both arms' poses and jaws, 16 values: policies of the field's data.
+
+Where a person leads (delta, leader) the axes are those of the endoscope's view: right, up and away
+from the viewer. LeRobot's own delta_x, delta_y and delta_z are forward, left and up: away, left and
+up. What a leader's joint has moved since the last action is added to the set point, however long
+that takes; a joint's "-right" turns its sign, and "PSM1:right" is for that arm alone.
+
+Values end in `.pos` or `.vel`, since `lerobot-rollout` feeds a policy no others.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Protocol, final
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.control import JAW_OPEN, StepSize
+from surgicai_vision.robot.driven import Command, DrivenRobot
+from surgicai_vision.robot.simulated import PSM_NAMES
+from surgicai_vision.scene import kinematics
+from surgicai_vision.scene.kinematics import Pose
+from surgicai_vision.scene.rotations import matrix_to_quaternion_flat, quaternion_to_matrix_flat
+
+INCREMENTS = "increments"
+ABSOLUTE = "absolute"
+LEADER = MappingProxyType(
+    {
+        "shoulder_pan": "right",
+        "shoulder_lift": "away",
+        "elbow_flex": "-up",
+        "wrist_flex": "tilt",
+        "wrist_roll": "roll",
+        "gripper": "jaw",
+    }
+)
+"""Joint of LeRobot's six-joint leaders → which way it moves the tip."""
+WAYS: Mapping[str, tuple[int, float, float]] = MappingProxyType(
+    {
+        "right": (0, -1.0, 5e-4),
+        "up": (1, 1.0, 5e-4),
+        "away": (2, 1.0, 5e-4),
+        "tilt": (3, -1.0, math.radians(0.9)),
+        "swing": (4, -1.0, math.radians(0.9)),
+        "roll": (5, 1.0, math.radians(0.9)),
+        "jaw": (6, 1.0, JAW_OPEN / 100.0),
+    }
+)
+"""Way → its place among the seven increments, its sign in the view's axes (x left, y up, z away),
+and what one unit of a joint moves [m, rad]: leaders' joints go from -100 to 100, grippers from 0 to
+100, so that a whole turn of a joint is 100 mm, or 180°."""
+MOST_WAITING = 25.0
+"""Steps that a leader may be ahead of the tip; what is more is left out."""
+_POSE = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
+POSITIONS = tuple(
+    f"{name}.pos"
+    for arm in names.ARMS
+    for name in (*(f"{arm}_pose.{part}" for part in _POSE), f"{arm}_jaw")
+)
+"""What is observed where the action is "absolute": both arms' tips in the frame of their
+`measured_cp`, quaternion x y z w, and the angle between the fingers."""
+TARGETS = tuple(
+    f"{name}.pos"
+    for arm in names.ARMS
+    for name in (*(f"{arm}_sp.{part}" for part in _POSE), f"{arm}_jaw_sp")
+)
+"""The same of the set points: an absolute action."""
+
+Values = Mapping[str, float]
+
+
+class Reader(Protocol):
+    """Reads actions."""
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Return the names of an action's values."""
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Return the arms it may move; () is the active one."""
+
+    def moves(self, action: Values, robot: DrivenRobot) -> Mapping[str, Sequence[float]]:
+        """Return arm → seven increments in [-1, 1], of an action; none for `targets`."""
+
+    def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
+        """Return arm → its set point, of an action; none for `moves`."""
+
+
+@final
+class Increments:
+    """Our own: seven increments of the active arm."""
+
+    features = tuple(f"{name}.vel" for name in names.ACTION_NAMES)
+    arms = ()
+
+    def __init__(self, step: StepSize, leader: Mapping[str, str]):
+        pass
+
+    def moves(self, action: Values, robot: DrivenRobot) -> Mapping[str, Sequence[float]]:
+        """Return the increments; values that are missing are 0."""
+        return {robot.active: [float(action.get(name, 0.0)) for name in self.features]}
+
+    def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
+        """Return nothing."""
+        return {}
+
+
+@final
+class Delta:
+    """LeRobot's gamepad and keyboard: three translations and a gripper."""
+
+    features = ("delta_x", "delta_y", "delta_z", "gripper")
+    arms = ()
+
+    def __init__(self, step: StepSize, leader: Mapping[str, str]):
+        pass
+
+    def moves(self, action: Values, robot: DrivenRobot) -> Mapping[str, Sequence[float]]:
+        """Return the increments."""
+        forward, left, up = (float(action.get(name, 0.0)) for name in self.features[:3])
+        jaw = float(action.get("gripper", 1.0)) - 1.0
+        arm = robot.active
+        return {arm: _in_base(robot, arm, [left, up, forward, 0.0, 0.0, 0.0, jaw])}
+
+    def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
+        """Return nothing."""
+        return {}
+
+
+@final
+class Leader:
+    """A leader arm: what its joints move is added to the set points.
+
+    Args:
+        step: the largest step of one action.
+        leader: joint → way, see the module's docstring.
+
+    Raises:
+        InputError: no such way or arm.
+    """
+
+    def __init__(self, step: StepSize, leader: Mapping[str, str]):
+        if not leader:
+            raise InputError("leader is empty; give it a joint and the way it moves the tip.")
+        sizes = (step.translation,) * 3 + (step.rotation,) * 3 + (step.jaw,)
+        self._ways: dict[str, tuple[str, int, float]] = {}
+        for joint, said in leader.items():
+            arm, _, way = said.rpartition(":")
+            if arm:
+                check_name(f"arm of {joint}", arm, PSM_NAMES)
+            check_name(f"way of {joint}", way.lstrip("-"), WAYS)
+            place, sign, gain = WAYS[way.lstrip("-")]
+            turned = -1.0 if way.startswith("-") else 1.0
+            self._ways[f"{joint}.pos"] = (arm, place, turned * sign * gain / sizes[place])
+        self.features = tuple(self._ways)
+        self.arms = tuple(sorted({arm for arm, _, _ in self._ways.values() if arm}))
+        self._last: dict[str, float] = {}
+        self._waiting: dict[str, list[float]] = {}
+
+    def moves(self, action: Values, robot: DrivenRobot) -> Mapping[str, Sequence[float]]:
+        """Return the increments of what the joints have moved since the last action."""
+        for name, (said, place, steps) in self._ways.items():
+            value = float(action.get(name, math.nan))
+            if not math.isfinite(value):
+                continue
+            waiting = self._waiting.setdefault(said or robot.active, [0.0] * 7)
+            waiting[place] += (value - self._last.get(name, value)) * steps
+            waiting[place] = min(max(waiting[place], -MOST_WAITING), MOST_WAITING)
+            self._last[name] = value
+        moves: dict[str, Sequence[float]] = {}
+        for arm, waiting in self._waiting.items():
+            if arm not in self.arms and arm != robot.active:
+                waiting[:] = [0.0] * 7
+                continue
+            now = [min(max(value, -1.0), 1.0) for value in waiting]
+            waiting[:] = [value - part for value, part in zip(waiting, now, strict=True)]
+            moves[arm] = _in_base(robot, arm, now)
+        return moves
+
+    def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
+        """Return nothing."""
+        return {}
+
+
+@final
+class Absolute:
+    """Set points of both arms, called as what is observed or as in the field's datasets."""
+
+    features = TARGETS
+    arms = tuple(PSM_NAMES)
+
+    def __init__(self, step: StepSize, leader: Mapping[str, str]):
+        pass
+
+    def moves(self, action: Values, robot: DrivenRobot) -> Mapping[str, Sequence[float]]:
+        """Return nothing."""
+        return {}
+
+    def targets(self, action: Values, robot: DrivenRobot) -> Mapping[str, Command]:
+        """Return both arms' set points.
+
+        Raises:
+            InputError: a value is missing or a quaternion is zero.
+        """
+        keys = TARGETS if TARGETS[0] in action else POSITIONS
+        missing = [key for key in keys if key not in action]
+        if missing:
+            raise InputError(f"the action lacks {', '.join(missing[:3])}.")
+        found = {}
+        for index, arm in enumerate(PSM_NAMES):
+            values = [float(action[key]) for key in keys[8 * index : 8 * (index + 1)]]
+            x, y, z, qx, qy, qz, qw, jaw = values
+            length = math.hypot(qx, qy, qz, qw)
+            if not length > 1e-6:
+                raise InputError(f"the quaternion of {arm} is zero.")
+            turn = quaternion_to_matrix_flat(qw / length, qx / length, qy / length, qz / length)
+            _, base = robot.frame(arm)
+            pose = poses.compose(poses.invert(base), (x, y, z, *turn))
+            found[arm] = Command(pose, jaw * robot.jaw_scale)
+        return found
+
+
+ACTIONS: Mapping[str, Callable[[StepSize, Mapping[str, str]], Reader]] = MappingProxyType(
+    {INCREMENTS: Increments, "delta": Delta, "leader": Leader, ABSOLUTE: Absolute}
+)
+"""What an action's values are → what reads them."""
+
+
+def observed(robot: DrivenRobot) -> dict[str, float]:
+    """Return `POSITIONS` of both arms as measured now.
+
+    Of a quaternion's two signs it is the one nearer to the arm's start.
+    """
+    values: list[float] = []
+    for arm in PSM_NAMES:
+        _, base = robot.frame(arm)
+        pose: Pose = poses.compose(base, robot.measured(arm))
+        turn = matrix_to_quaternion_flat(poses.rotation(pose))
+        start = poses.compose(base, poses.flat(kinematics.start_in_base(arm.lower())))
+        home = matrix_to_quaternion_flat(poses.rotation(start))
+        sign = -1.0 if sum(a * b for a, b in zip(turn, home, strict=True)) < 0.0 else 1.0
+        w, x, y, z = (sign * value for value in turn)
+        jaw = robot.finger(arm) / robot.jaw_scale
+        values += [*poses.position(pose), x, y, z, w, jaw]
+    return dict(zip(POSITIONS, values, strict=True))
+
+
+def _in_base(robot: DrivenRobot, arm: str, values: list[float]) -> list[float]:
+    """Return increments in the view's axes as those in an arm's base."""
+    _, base = robot.frame(arm)
+    turn = poses.rotation(poses.invert(base))
+    a, b, c, d, e, f, jaw = values
+    nowhere = (0.0, 0.0, 0.0)
+    moved = poses.transform((*nowhere, *turn), (a, b, c))
+    turned = poses.transform((*nowhere, *turn), (d, e, f))
+    return [*moved, *turned, jaw]

@@ -1,0 +1,34 @@
+"""A served simulation in this process, stepped by whoever waits for it."""
+
+import functools
+
+from memory_transport import MemoryTransport
+
+from surgicai_vision import envs
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.robot.recorder import Recorder
+from surgicai_vision.robot.server import ServeConfig, Server
+from surgicai_vision.robot.simulated import SimulatedRobot
+
+SEED = 900_003
+
+
+@functools.cache
+def env_of(task):
+    return envs.make(TaskConfig(task))
+
+
+class Served(MemoryTransport):
+    """A transport at whose other end a stepped server is asked whenever the client waits."""
+
+    def __init__(self, task, views=(), recordings=None, tell=None):
+        super().__init__()
+        self.robot = SimulatedRobot(env_of(task))
+        self.robot.reset(SEED)
+        config = ServeConfig("stepped", views=views, size=(64, 64))
+        recorder = Recorder(self.robot, recordings, tell) if recordings else None
+        self.server = Server(self.robot, self, config, recorder)
+        self.server.__enter__()
+
+    def wait(self, seconds):
+        self.server.poll()
