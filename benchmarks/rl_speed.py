@@ -25,8 +25,8 @@ from surgicai_vision.envs.observation import ObservationConfig
 from surgicai_vision.rl.online import OnlineLearner
 from surgicai_vision.rl.settings import Request, settings_of
 
-WARM_UP = 420
-"""Control steps before the clock is started: two episodes."""
+WARM_UP = 230
+"""Control steps before the clock is started: an episode, which hindsight needs, and updates."""
 
 
 class Trivial(gymnasium.Env):

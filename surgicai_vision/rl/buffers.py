@@ -19,7 +19,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -137,18 +137,15 @@ class HindsightBuffer(Demonstrations, HerReplayBuffer):
         return samples._replace(dones=(samples.rewards == 0).float())
 
 
-def demonstrations_of(
-    transitions: Transitions, env: VecEnv, keeps_demand: bool, goals: int
-) -> ReplayBuffer:
-    """Return a buffer that holds demonstrations and no more."""
+def demonstrations_of(transitions: Transitions) -> ReplayBuffer:
+    """Return a buffer that holds demonstrations and no more, with the goals they reached.
+
+    They are not relabelled: they are the examples of success at the goals that the task asks for,
+    and with four of five relabelled a batch hardly had one.
+    """
     space = space_of(transitions)
-    buffer: ReplayBuffer
-    if isinstance(space, spaces.Dict):
-        buffer = HindsightBuffer(
-            len(transitions), space, ACTIONS, env, keeps_demand, goals, device="cpu"
-        )
-    else:
-        buffer = MixedBuffer(len(transitions), space, ACTIONS, device="cpu")
+    kind = DictReplayBuffer if isinstance(space, spaces.Dict) else ReplayBuffer
+    buffer = kind(len(transitions), space, ACTIONS, device="cpu")
     fill(buffer, transitions)
     return buffer
 

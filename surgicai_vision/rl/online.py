@@ -79,8 +79,7 @@ class OnlineLearner(Learner):
         if transitions is not None:
             buffer = self._buffer
             assert isinstance(buffer, MixedBuffer | HindsightBuffer)
-            source = demonstrations_of(transitions, self.env, request.keeps_demand, settings.goals)
-            buffer.mix(source, settings.demo_share)
+            buffer.mix(demonstrations_of(transitions), settings.demo_share)
         self.squash = "clip" if isinstance(self.model, PPO) else "tanh"
 
     # -- the model ---------------------------------------------------------------------------------

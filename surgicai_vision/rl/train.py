@@ -53,6 +53,9 @@ IMAGE_SIZE = 224
 SMALLEST_STD = 0.1
 """Inputs that vary less (cm, rad or a share) are divided by this: exploration leaves the narrow way
 of the demonstrations, and would see inputs of many standard deviations."""
+CONSTANT_STD = 1e-6
+"""Inputs that vary less are constant and divided by 1: the goals of demonstrations ask for contact
+or holes, those that hindsight relabels mostly do not, and would lie ten deviations away."""
 RANDOM_EPISODES = 5
 """Episodes of random actions that give the statistics of the inputs without demonstrations."""
 EVALUATED_AT_ONCE = 10
@@ -215,7 +218,9 @@ def _statistics(
     else:
         rows = transitions.vector
     values = rows.astype(np.float64)
-    return values.mean(axis=0), np.maximum(values.std(axis=0), SMALLEST_STD)
+    spread = values.std(axis=0)
+    std = np.where(spread < CONSTANT_STD, 1.0, np.maximum(spread, SMALLEST_STD))
+    return values.mean(axis=0), std
 
 
 def _random_play(request: Request) -> NDArray[np.float32]:

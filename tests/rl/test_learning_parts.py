@@ -12,6 +12,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.store import list_demos
 from surgicai_vision.rl import extractor as extractors
 from surgicai_vision.rl.buffers import DEMAND, HindsightBuffer, MixedBuffer, demonstrations_of
+from surgicai_vision.rl.export import fill
 from surgicai_vision.rl.extractor import FeatureMemo, RelativeExtractor
 from surgicai_vision.rl.nair import DemonstrationTD3, cloning_loss
 from surgicai_vision.rl.rlpd import LayerNormPolicy
@@ -140,7 +141,10 @@ def _silent():
 def test_a_relabelled_success_ends_the_episode(goal_demos, task, keeps):
     env = SuturingVecEnv(task, obs_type="goal")
     np.random.seed(0)  # noqa: NPY002
-    buffer = demonstrations_of(goal_demos[task], env, keeps, 4)
+    demos = goal_demos[task]
+    space = env.observation_space
+    buffer = HindsightBuffer(len(demos), space, env.action_space, env, keeps, device="cpu")
+    fill(buffer, demos)
     batch = buffer.sample(400)
     achieved = batch.next_observations["achieved_goal"].numpy()
     desired = batch.observations["desired_goal"].numpy()
@@ -160,7 +164,7 @@ def test_a_relabelled_success_ends_the_episode(goal_demos, task, keeps):
 
 def test_a_share_of_every_batch_is_demonstrations(goal_demos):
     env = SuturingVecEnv("grasp", obs_type="goal")
-    source = demonstrations_of(goal_demos["grasp"], env, False, 4)
+    source = demonstrations_of(goal_demos["grasp"])
     own = HindsightBuffer(50, env.observation_space, env.action_space, env, device="cpu")
     zeros = {key: space.sample()[None] * 0 for key, space in env.observation_space.items()}
     for index in range(10):
@@ -172,6 +176,8 @@ def test_a_share_of_every_batch_is_demonstrations(goal_demos):
     assert own.rows(100) == 30 and is_own.tolist() == [True] * 70 + [False] * 30
     shown = set(map(tuple, goal_demos["grasp"].action.tolist()))
     assert all(tuple(row) in shown for row in batch.actions[70:].tolist())
+    # Demonstrations keep the goals they reached.
+    assert (batch.observations["desired_goal"][70:, DEMAND] == 1).all()
     env.close()
 
 
