@@ -289,6 +289,11 @@ class Encoder:
             return features
         return features.flatten(2).transpose(1, 2) if features.ndim == 4 else features
 
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return self._device
+
     def _identity(self) -> dict[str, object]:
         """Return everything a feature depends on, as plain data."""
         card = asdict(self.card)
@@ -309,3 +314,8 @@ class Encoder:
             "compute": f"{self._device.type} {self._dtype}",
             **{key: card[key] for key in keys},
         }
+
+
+def open_encoder(card: EncoderCard, network: nn.Module, pool: str, device: str) -> Encoder:
+    """Return the encoder of a network on a device, "cpu" or "cuda"."""
+    return Encoder(card, network, pool, torch.device(device))

@@ -211,6 +211,19 @@ def visual_shapes(recipe: Recipe, visual: Sequence[tuple[int, ...]]) -> tuple[tu
     return ((sum(shape[0] for shape in visual), *visual[0][1:]),)
 
 
+def fed_vector(recipe: Recipe) -> tuple[str, ...]:
+    """Return what a recipe feeds beside the features, keys of `VECTORS`."""
+    if recipe.privileged:
+        return (names.PRIVILEGED_STATE,)
+    fed = {
+        names.STATE: recipe.proprioception,
+        names.SETPOINT: recipe.setpoint,
+        names.CLOCK: recipe.clock,
+        names.PROGRESS: recipe.progress_input,
+    }
+    return tuple(key for key, is_fed in fed.items() if is_fed)
+
+
 @dataclass(frozen=True)
 class Plugin:
     """A member of the family.
@@ -219,13 +232,17 @@ class Plugin:
         name: the name users give.
         recipe: frozen dataclass of its settings.
         make: (recipe, shape of each view's feature) → untrained policy.
-        target: what it learns: a dataset's column, or `names.STAGE`, which is computed of columns.
+        target: what it learns: a dataset's column, or one that is computed of columns:
+            `names.STAGE`, `names.ACTION_CHUNK`.
+        offsets: recipe → which actions a chunk holds, in control steps from the present one; None
+            for a policy that learns no chunks.
     """
 
     name: str
     recipe: type[Recipe]
     make: Callable[[Recipe, tuple[tuple[int, ...], ...]], "Policy"]
     target: str = names.ACTION
+    offsets: Callable[[Recipe], range] | None = None
 
 
 class Policy(nn.Module, abc.ABC):
@@ -236,8 +253,15 @@ class Policy(nn.Module, abc.ABC):
         input_mean: mean of each input over the training frames, (inputs.dim,).
         input_std: standard deviation of each, 1 where an input is constant.
         checkpoint: what a policy that was loaded was restored from.
+        history: observations that it sees, the present one last.
+        averaging: largest decay of the moving average of its weights in training, which is what
+            is kept; 0 keeps the weights themselves.
+        clip: largest norm of a gradient in training; 0 clips none.
     """
 
+    history: int = 1
+    averaging: float = 0.0
+    clip: float = 0.0
     checkpoint: "Checkpoint"
     input_mean: torch.Tensor
     input_std: torch.Tensor
@@ -256,6 +280,13 @@ class Policy(nn.Module, abc.ABC):
     @abc.abstractmethod
     def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the loss (scalar) for normalised inputs and demonstrated answers (B, …)."""
+
+    def measure(self, target: torch.Tensor) -> None:
+        """Fit before the first epoch what gradients of the loss do not; nothing by default.
+
+        Args:
+            target: what is demonstrated in the training frames, (N, …).
+        """
 
     def calibrate(self, answers: torch.Tensor, target: torch.Tensor) -> None:
         """Fit after the last epoch what gradients do not; nothing by default.
@@ -292,12 +323,16 @@ class Policy(nn.Module, abc.ABC):
         observed = self._observed(features, agent_pos)
         exact = self._exact
         if exact is None:
-            exact = copy.deepcopy(self).double().eval().requires_grad_(False)
+            exact = self._copy_to_act().eval().requires_grad_(False)
             # Not a submodule: it must not enter the state dict.
             object.__setattr__(self, "_exact", exact)
         with torch.inference_mode():
             answers: torch.Tensor = exact(exact.normalise(torch.from_numpy(observed)))
         return np.asarray(answers.float().numpy(), np.float32)
+
+    def _copy_to_act(self) -> "Policy":
+        """Return the copy that acts, on the CPU."""
+        return copy.deepcopy(self).cpu().double()
 
     @final
     def train(self, mode: bool = True) -> "Policy":

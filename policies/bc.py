@@ -11,9 +11,8 @@ from typing import final
 import torch
 from torch import nn
 
-from policies.base import ACTIONS, Inputs, Plugin, Policy, Recipe
+from policies.base import ACTIONS, Inputs, Plugin, Policy, Recipe, fed_vector
 from policies.layers import FeatureMLP
-from surgicai_vision.core import names
 
 
 @final
@@ -21,7 +20,7 @@ class BCPolicy(Policy):
     """The MLP of behaviour cloning."""
 
     def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
-        super().__init__(Inputs(visual, _vector(recipe)))
+        super().__init__(Inputs(visual, fed_vector(recipe)))
         self.network = FeatureMLP(recipe, self.inputs, ACTIONS)
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
@@ -32,19 +31,6 @@ class BCPolicy(Policy):
     def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the mean squared error of the actions (B, 7)."""
         return nn.functional.mse_loss(self(observed), target)
-
-
-def _vector(recipe: Recipe) -> tuple[str, ...]:
-    """Return what is fed beside the features."""
-    if recipe.privileged:
-        return (names.PRIVILEGED_STATE,)
-    fed = {
-        names.STATE: recipe.proprioception,
-        names.SETPOINT: recipe.setpoint,
-        names.CLOCK: recipe.clock,
-        names.PROGRESS: recipe.progress_input,
-    }
-    return tuple(key for key, is_fed in fed.items() if is_fed)
 
 
 BC = Plugin("bc", Recipe, BCPolicy)

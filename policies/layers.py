@@ -132,6 +132,34 @@ def _head(shape: tuple[int, ...], map_head: str) -> Head:
 
 
 @final
+class FeatureHeads(nn.Module):
+    """The head of each feature alone: what policies with a network of their own put before it.
+
+    Attributes:
+        dim: length of what the heads leave, 0 without images.
+    """
+
+    def __init__(self, recipe: Recipe, inputs: Inputs):
+        super().__init__()
+        self.inputs = inputs
+        self.shapes = visual_shapes(recipe, inputs.visual)
+        heads = [_head(shape, recipe.map_head) for shape in self.shapes]
+        self.heads = nn.ModuleList(heads)
+        self.dim = sum(head.dim for head in heads)
+
+    def forward(self, observed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return what the heads leave, (B, dim), and the vector beside the features, (B, n).
+
+        Args:
+            observed: normalised inputs (B, inputs.dim).
+        """
+        sizes = [math.prod(shape) for shape in self.shapes]
+        *rows, vector = observed.split([*sizes, self.inputs.dim - self.inputs.features], dim=1)
+        seen = [head(row) for head, row in zip(self.heads, rows, strict=True)]
+        return torch.cat(seen, dim=1) if seen else vector[:, :0], vector
+
+
+@final
 class FeatureMLP(nn.Module):
     """The paper's network on features beside a vector: layers with BatchNorm before each."""
 

@@ -5,11 +5,15 @@
 What a policy sees: `observation.images.<view>` and `observation.state` as in our datasets, never
 depth (ACT and Diffusion take three channels only). With `encoder` it sees
 `observation.environment_state`, the frozen features of the views, in place of the images.
+
+All five tasks in one call, counted one by one and together:
+
+    lerobot-eval --env.type=surgicai --env.tasks='[grasp,place,insert,handoff,pullout]' …
 """
 
 import dataclasses
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +32,15 @@ from lerobot_env_surgicai.encode_views import EncodeViews
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import check_camera
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig, to_mapping
-from surgicai_vision.core.tasks import env_id
+from surgicai_vision.core.errors import check_name
+from surgicai_vision.core.instructions import INSTRUCTION_BANKS, STANDARD, draw_instruction
+from surgicai_vision.core.tasks import env_id, task_names
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.features import encoders
 
 AGENT_POS = "agent_pos"
 FEATURES = "environment_state"
+SUBTASKS = names.SUBTASKS
 TASK_FIELDS = tuple(field.name for field in dataclasses.fields(TaskConfig))
 
 
@@ -64,6 +71,10 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
         encoder: show this encoder's features of the views in place of images.
         encoder_weights: file with the encoder's pretrained weights.
         encoder_sha256: hash of the weights it must have; empty for any.
+        tasks: several tasks, each a group of its own in LeRobot's results, in the place of `task`;
+            each has its own step limit, whatever `max_steps` says; all else is the same.
+        instructions: which sentences tell the task (`core.instructions`): "standard", or one drawn
+            anew in every episode: "train", "heldout".
     """
 
     task: str | None = None
@@ -84,8 +95,15 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
     encoder: str | None = None
     encoder_weights: str | None = None
     encoder_sha256: str = ""
+    tasks: list[str] = field(default_factory=list)
+    instructions: str = STANDARD
 
     def __post_init__(self) -> None:
+        check_name("bank of instructions", self.instructions, INSTRUCTION_BANKS)
+        for task in self.tasks:
+            check_name("task", task, task_names())
+        if self.tasks:
+            self.task = self.task or self.tasks[0]
         config = TaskConfig(self.task) if self.task else TaskConfig()
         self._fill(config, ["front", "back"], 224)
         for camera in self.views:
@@ -163,7 +181,24 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
         A finished env waits for the others (`FreezeAfterEpisodeEnd`): its next episode would leak a
         step of reward into this one's, and cost its rendering.
         """
-        make = functools.partial(make_one, self.gym_id, self.disable_env_checker, self.gym_kwargs)
+        if self.tasks:
+            parts = {
+                task: dataclasses.replace(
+                    self, task=task, tasks=[], max_steps=TaskConfig(task).max_steps
+                )
+                for task in self.tasks
+            }
+            return {
+                task: dict(enumerate(part.create_envs(n_envs, use_async_envs)[self.type].values()))
+                for task, part in parts.items()
+            }
+        make = functools.partial(
+            make_one,
+            self.gym_id,
+            self.disable_env_checker,
+            self.gym_kwargs,
+            (self.task_config().task, self.instructions),
+        )
         if use_async_envs and n_envs > 1:
             # LeRobot's choice: a fork would copy the GL context and torch's threads.
             vector: VectorEnv = AsyncVectorEnv(
@@ -183,14 +218,46 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
         return PolicyProcessorPipeline(steps=steps), PolicyProcessorPipeline(steps=[])
 
 
-def make_one(gym_id: str, disable_env_checker: bool, arguments: dict[str, Any]) -> gymnasium.Env:
-    """Make one env.
+def make_one(
+    gym_id: str,
+    disable_env_checker: bool,
+    arguments: dict[str, Any],
+    told: tuple[str, str] | None = None,
+) -> gymnasium.Env:
+    """Make one env; `told` is its task and the bank of its instructions.
 
     A function of this module, so that a worker process that unpickles it registers the ids.
     """
     env = gymnasium.make(gym_id, disable_env_checker=disable_env_checker, **arguments)
+    if told is not None and told[1] != STANDARD:
+        env = Instructed(env, *told)
     frozen: gymnasium.Env = FreezeAfterEpisodeEnd(NestImages(env))
     return frozen
+
+
+class Instructed(gymnasium.Wrapper):
+    """Tell the task in a sentence that each episode draws by its seed.
+
+    Attributes:
+        task_description: the sentence of the present episode.
+    """
+
+    def __init__(self, env: gymnasium.Env, task: str, bank: str):
+        super().__init__(env)
+        self._task = task
+        self._bank = bank
+        self._episodes = 0
+        self.task_description = draw_instruction(task, bank, 0)
+
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode, by its seed, or by its number where it is given none."""
+        seed = arguments.get("seed")
+        self._episodes += 1
+        self.task_description = draw_instruction(
+            self._task, self._bank, self._episodes if seed is None else int(seed)
+        )
+        result: tuple[Any, dict[str, Any]] = self.env.reset(**arguments)
+        return result
 
 
 class NestImages(gymnasium.ObservationWrapper):

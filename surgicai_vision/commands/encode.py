@@ -9,6 +9,7 @@ from cyclopts import App, Parameter
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
+    DEVICE,
     DIRECTORY,
     ENCODER,
     POOL,
@@ -20,7 +21,7 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import check_output
-from surgicai_vision.features import encoders
+from surgicai_vision.features import devices, encoders
 
 app = App(
     name="encode",
@@ -41,6 +42,7 @@ class Options:
         encoder: Encoder.
         view: Views to encode.
         pool: What is taken from the encoder.
+        device: Where it is computed; auto is a GPU where there is one.
         export: Also write a dataset with the features in place of images, for LeRobot's policies.
     """
 
@@ -51,6 +53,7 @@ class Options:
     weights: WeightFiles = ()
     accept_licence: AcceptLicence = False
     pool: Annotated[str, POOL] = "global"
+    device: Annotated[str, DEVICE] = devices.AUTO
     export: Annotated[Path | None, DIRECTORY] = None
 
 
@@ -67,7 +70,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         check_output(options.export)
     from surgicai_vision.features.cache import encode
 
-    encoder = encoders.load_encoder(options.encoder, options.pool, weights)
+    encoder = encoders.load_encoder(options.encoder, options.pool, weights, options.device)
     entries = []
     rows = []
     for view in options.view:

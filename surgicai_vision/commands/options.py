@@ -28,7 +28,7 @@ from surgicai_vision.core.config import TaskConfig, convert, from_mapping
 from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.core.files import read_yaml
 from surgicai_vision.core.tasks import task_names
-from surgicai_vision.features import encoders
+from surgicai_vision.features import devices, encoders
 
 Source = Callable[[App, tuple[str, ...], ArgumentCollection], None]
 """What cyclopts calls between reading the command line and converting the texts to values."""
@@ -102,6 +102,7 @@ ENCODERS = Parameter(
     metavar="NAME[,NAME]",
 )
 POOL = Parameter(choices=encoders.POOLS)
+DEVICE = Parameter(choices=devices.DEVICES)
 EXECUTOR = Parameter(
     help="What runs the jobs: local, ray or slurm, with its options, such as ray,address=HOST:PORT "
     "or slurm,partition=cpu,minutes=60.",

@@ -10,6 +10,7 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
     COUNT,
+    DEVICE,
     DIRECTORY,
     EXECUTOR,
     IMAGE_SIZE,
@@ -21,6 +22,7 @@ from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.experiments.plan_config import plan_of
 from surgicai_vision.experiments.sweep.grid import AXES, Grid
 from surgicai_vision.experiments.sweep.rl_grid import RLGrid
+from surgicai_vision.features.devices import find_device
 
 if TYPE_CHECKING:
     from surgicai_vision.experiments.sweep.experiment import Experiment
@@ -57,6 +59,7 @@ class Options:
         dry_run: List the runs, what is there already and about how long the rest takes; no work.
         workers: Runs at a time; the results do not depend on it.
         attempts: How often a run is started whose process is killed.
+        device: Where to encode and train; auto is a GPU where there is one.
     """
 
     grid: Annotated[str, Parameter(metavar="GRID.yaml")] = field(kw_only=False)
@@ -72,6 +75,9 @@ class Options:
     workers: Annotated[int, COUNT] = folders.CORES
     attempts: Annotated[int, COUNT] = 3
     executor: Annotated[str, EXECUTOR] = "local"
+    device: Annotated[
+        str | None, DEVICE, default_text("encode on a GPU where there is one, train on the CPU")
+    ] = None
 
 
 @app.default
@@ -81,6 +87,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     from surgicai_vision.experiments.sweep.driver import run_sweep
     from surgicai_vision.experiments.sweep.selection import read_choice
 
+    if options.device is not None:
+        find_device(options.device)
     path = grid_file(options.grid)
     whole = read_experiment(path)
     grid = whole.smaller(
@@ -95,7 +103,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     context = RunContext(options.workers, open_engine(options.executor), console.stage)
     if options.dry_run:
         return _list(grid, out, choice, options.workers, console)
-    result = run_sweep(grid, out, context, options.attempts, choice)
+    result = run_sweep(grid, out, context, options.attempts, choice, options.device)
     for line in result.pop("problems"):
         console.say(line)
     told = ", ".join(f"{result[name]} {name.replace('_', ' ')}" for name in COUNTS)

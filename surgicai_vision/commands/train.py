@@ -4,13 +4,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import App, Parameter, validators
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.logs import LOGS, open_log
 from surgicai_vision.commands.options import (
     COUNT,
+    DEVICE,
     DIRECTORY,
     NOT_NEGATIVE,
     POOL,
@@ -29,11 +30,12 @@ from surgicai_vision.core.config import TaskConfig, read_changes
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.features import encoders
+from surgicai_vision.features.devices import find_device
 from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.rl.high_level_config import DECISIONS, SAVE_EVERY, HighLevelRequest
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import Checkpoint, read_checkpoint
-from surgicai_vision.training.run_config import RunConfig, with_epochs
+from surgicai_vision.training.run_config import RunConfig, with_budget
 
 if TYPE_CHECKING:
     from surgicai_vision.dataset import Dataset
@@ -43,6 +45,9 @@ app = App(
     help_epilogue="""\
 example:
   surgicai-vision train --encoder random --view back
+LeRobot's ACT on feature maps, for ten minutes of a core:
+  surgicai-vision train --task handoff --policy act --encoder imagenet-lite-early --pool spatial \
+    --view front_psm1 --minutes 10
 by reinforcement:
   surgicai-vision train --algo td3-her-bc --env-steps 25000
 a high-level policy over policies of the subtasks:
@@ -74,6 +79,9 @@ class Options:
         policy: The kind of policy.
         change: Replace values of the recipe, such as clock=false,map_head=softmax.
         epochs: Passes over the frames.
+        minutes: In their place: as many as fit into so many minutes of one core, for policies that
+            plan chunks.
+        device: Where to encode and train; auto is a GPU where there is one.
         start: Checkpoint, or released:NAME, to start from, with the same inputs (fine-tuning).
         progress_from: Checkpoint, or released:NAME, of a high-level policy whose progress a recipe
             with progress_input=true feeds.
@@ -83,7 +91,8 @@ class Options:
         out: Checkpoint folder to make or to continue.
         algo: Train an actor on the state by this algorithm of reinforcement or offline learning
             (docs/rl.md); --change then changes its settings.
-        demos: Folder of the demonstrations that it learns from.
+        demos: Folder of the demonstrations that it learns from; without --algo those of the
+            dataset, for a policy that plans chunks of a dataset with few frames.
         demonstrations: Take the first N of them.
         observation: What the actor sees of the state.
         env_steps: Control steps in the env; offline algorithms take none.
@@ -115,16 +124,23 @@ class Options:
     pool: Annotated[str, POOL] = "global"
     policy: Annotated[str, Parameter(choices=policies.policy_names())] = "bc"
     recipe: Annotated[
-        str,
+        str | None,
         Parameter(
             help=f"Recipe of the policy: {', '.join(policies.recipe_names())}, or FILE.yaml.",
             metavar="NAME",
         ),
-    ] = "paper"
+        default_text("the policy's name where a recipe has it, else paper"),
+    ] = None
     change: Annotated[
         tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]"), default_text("none")
     ] = ()
     epochs: Annotated[int | None, COUNT, default_text("the recipe's")] = None
+    minutes: Annotated[
+        float | None, Parameter(validator=validators.Number(gt=0)), default_text("the recipe's")
+    ] = None
+    device: Annotated[
+        str | None, DEVICE, default_text("encode on a GPU where there is one, train on the CPU")
+    ] = None
     start: Annotated[Path | None, DIRECTORY] = None
     progress_from: Annotated[Path | None, DIRECTORY] = None
     save_every: Annotated[int, NOT_NEGATIVE] = 0
@@ -154,6 +170,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         return _high_level(options, options.low, console)
     if options.algo:
         return _reinforce(options, options.algo, console)
+    if options.device is not None:
+        find_device(options.device)
     weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     encoder = None if options.encoder in (NO_ENCODER, STATE) else options.encoder
     if encoder:
@@ -173,8 +191,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         policy=options.policy,
         pool=options.pool if encoder else "global",
         privileged=options.encoder == STATE,
-        recipe=options.recipe,
-        changes=with_epochs(options.change, options.epochs),
+        recipe=options.recipe or policies.default_recipe(options.policy),
+        changes=with_budget(options.change, options.epochs, options.minutes),
         seed=options.seed,
     )
     # Refuses a recipe that does not exist before any work.
@@ -197,12 +215,14 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             weights,
             start=options.start,
             progress_from=options.progress_from,
+            demos=options.demos,
             save_every=options.save_every,
+            device=options.device,
             log=log,
         )
     console.say(f"checkpoint: {out}")
     _tell_errors(read_checkpoint(out), console)
-    if run.policy == "bc":
+    if policies.policy_plugin(run.policy).target != names.STAGE:
         console.say(f"next: surgicai-vision evaluate {out}")
     return {"checkpoint": str(out)}
 
@@ -230,7 +250,7 @@ def _views(options: Options, encoder: str | None) -> tuple[str, ...]:
     return ("front", "back") if options.view is None else options.view
 
 
-IMITATION = ("dataset", "subtask", "view", "start", "epochs")
+IMITATION = ("dataset", "subtask", "view", "start", "epochs", "minutes", "device")
 """Options that only imitation from a dataset reads."""
 
 

@@ -126,6 +126,8 @@ PROGRESS = "progress"
 """The progress of the subtask as another policy says it (`training.progress_input`)."""
 STAGE = "stage"
 """The subtask that is due and the progress within the present one (`training.visits.stages`)."""
+ACTION_CHUNK = "action_chunk"
+"""The actions of a run of control steps around the present one (`training.chunks`)."""
 
 META_FILE = "meta/surgicai.json"
 """Our own sidecar inside a LeRobot dataset: cameras, units, renderer, hashes, versions."""

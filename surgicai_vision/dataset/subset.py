@@ -118,6 +118,7 @@ class DatasetSubset:
     """Some frames of a dataset; a `Dataset` itself.
 
     Attributes:
+        whole: the dataset it is selected from.
         rows: which frames of the whole it holds, (N,) int64, rising.
         path, views, policy_views, image_size: those of the whole.
         config: configuration of the task.
@@ -149,7 +150,7 @@ class DatasetSubset:
                 rows of one episode.
             added: columns that the whole does not have, (N,) or (N, n); `selection` says which.
         """
-        self._whole = whole
+        self.whole = whole
         self._selection = dict(selection)
         self._restart_time = restart_time
         self._added = dict(added or {})
@@ -166,17 +167,17 @@ class DatasetSubset:
     @functools.cached_property
     def fingerprint(self) -> str:
         """Hash (hex) of the whole's fingerprint and the selection."""
-        return digest({"dataset": self._whole.fingerprint, **self._selection})
+        return digest({"dataset": self.whole.fingerprint, **self._selection})
 
     @functools.cached_property
     def episode_index(self) -> NDArray[np.int64]:
         """Episode of every frame, (N,) int64."""
-        return np.asarray(self._whole.episode_index)[self.rows]
+        return np.asarray(self.whole.episode_index)[self.rows]
 
     @functools.cached_property
     def demonstration_index(self) -> NDArray[np.int64]:
         """Demonstration of every frame, (N,) int64."""
-        return np.asarray(self._whole.demonstration_index)[self.rows]
+        return np.asarray(self.whole.demonstration_index)[self.rows]
 
     def bounds(self) -> list[tuple[int, int]]:
         """Return (first frame, frame after the last) of every episode."""
@@ -184,7 +185,7 @@ class DatasetSubset:
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
         """Return every column that is no image, (N,) or (N, n), by its key."""
-        columns = {key: values[self.rows] for key, values in self._whole.columns().items()}
+        columns = {key: values[self.rows] for key, values in self.whole.columns().items()}
         if self._restart_time:
             first = first_of_visit(self.rows, self.episode_index)
             for key in ("frame_index", "timestamp"):
@@ -203,7 +204,5 @@ class DatasetSubset:
         rows = self.rows[start:stop]
         # Neighbouring frames are read at once, in order.
         runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
-        parts = [
-            self._whole.frames(view, int(run[0]), int(run[-1]) + 1) for run in runs if len(run)
-        ]
-        return np.concatenate(parts) if parts else self._whole.frames(view, 0, 0)
+        parts = [self.whole.frames(view, int(run[0]), int(run[-1]) + 1) for run in runs if len(run)]
+        return np.concatenate(parts) if parts else self.whole.frames(view, 0, 0)

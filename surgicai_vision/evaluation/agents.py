@@ -206,7 +206,7 @@ class PolicyAgent(Agent):
         self.cameras = tuple(dict.fromkeys(map(names.camera_of, seen)))
         self.depth = any(map(names.is_depth_view, seen))
         self.privileged = not set(vector).isdisjoint(names.STATES_WITH_GOAL)
-        self._policy = policy
+        self.policy = policy
         self._encoder = encoder
         self._told = tuple(VECTORS[key] for key in vector if key in VECTORS)
         self._clocked = names.CLOCK in vector
@@ -250,18 +250,28 @@ class PolicyAgent(Agent):
             ticks: control steps since each robot's subtask began, for a policy with a clock.
         """
         with one_thread():
-            vectors = np.stack(
-                [np.concatenate([told(robot) for told in self._told]) for robot in robots]
-            )
-            if self._clocked and ticks is not None:
-                clocks = clock(np.array(ticks))
-                vectors = np.concatenate([vectors, clocks], axis=1, dtype=np.float32)
-            if self._progress is not None:
-                said = self._progress.answer(robots, observations)[:, PROGRESS_AT:]
-                vectors = np.concatenate([vectors, said], axis=1, dtype=np.float32)
-            return np.asarray(self._policy.act(self._features(observations), vectors), np.float32)
+            vectors = self.vectors(robots, observations, ticks)
+            return np.asarray(self.policy.act(self.features(observations), vectors), np.float32)
 
-    def _features(self, observations: Sequence[Observation]) -> NDArray[np.float32] | None:
+    def vectors(
+        self,
+        robots: Sequence[Robot],
+        observations: Sequence[Observation],
+        ticks: Sequence[int] | None = None,
+    ) -> NDArray[np.float32]:
+        """Return what is fed beside the features, (n, …); see `answer`."""
+        vectors = np.stack(
+            [np.concatenate([told(robot) for told in self._told]) for robot in robots]
+        )
+        if self._clocked and ticks is not None:
+            clocks = clock(np.array(ticks))
+            vectors = np.concatenate([vectors, clocks], axis=1, dtype=np.float32)
+        if self._progress is not None:
+            said = self._progress.answer(robots, observations)[:, PROGRESS_AT:]
+            vectors = np.concatenate([vectors, said], axis=1, dtype=np.float32)
+        return vectors
+
+    def features(self, observations: Sequence[Observation]) -> NDArray[np.float32] | None:
         """Encode all views of all slots in one call, (n, views · dim)."""
         encoder = self._encoder
         if encoder is None:

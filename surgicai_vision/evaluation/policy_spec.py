@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from policies.chunks import ChunkPolicy
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
@@ -29,6 +30,7 @@ from surgicai_vision.evaluation.agents import (
     ReplayAgent,
     mean_demonstration,
 )
+from surgicai_vision.evaluation.chunk_agent import ChunkAgent
 from surgicai_vision.evaluation.hierarchical import HierarchicalAgent
 from surgicai_vision.evaluation.hierarchical_config import (
     ORDER,
@@ -257,7 +259,7 @@ def _from_checkpoint(folder: Path, weights: WeightsSource) -> PolicySpec:
         MissingWeights: the encoder's weights are not at hand.
     """
     checkpoint = read_checkpoint(folder)
-    if policies.policy_plugin(checkpoint.policy).target != names.ACTION:
+    if policies.policy_plugin(checkpoint.policy).target == names.STAGE:
         raise InputError(
             f"{folder} chooses subtasks and does not act; "
             "name it as hlp: in the file of a hierarchical policy (docs/hierarchical.md)."
@@ -275,11 +277,23 @@ def _from_checkpoint(folder: Path, weights: WeightsSource) -> PolicySpec:
         },
         "folder": str(folder),
     }
-    return PolicySpec(checkpoint.run, functools.partial(policy_agent, folder, weights), about)
+    return PolicySpec(checkpoint.run, functools.partial(acting_agent, folder, weights), about)
+
+
+def acting_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> Agent:
+    """Make the agent of a checkpoint folder that acts, one action or a chunk of them at a time.
+
+    Raises:
+        InputError: the encoder at hand is not the one the policy was trained on.
+        BadFile: the policy whose progress it is fed is not in its folder.
+    """
+    agent = policy_agent(folder, weights)
+    policy = agent.policy
+    return ChunkAgent(policy, agent) if isinstance(policy, ChunkPolicy) else agent
 
 
 def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent:
-    """Make the agent of a checkpoint folder (in a worker process).
+    """Make the agent of a checkpoint folder that answers one observation at a time.
 
     Raises:
         InputError: the encoder at hand is not the one the policy was trained on.

@@ -49,6 +49,7 @@ from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, 
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
+from surgicai_vision.evaluation.robustness.axes import AXES
 from surgicai_vision.experiments.dataset_config import (
     MOST_EPISODES,
     DatasetConfig,
@@ -57,7 +58,14 @@ from surgicai_vision.experiments.dataset_config import (
 )
 from surgicai_vision.experiments.sweep.experiment import Evaluated, Training
 from surgicai_vision.features import encoders
-from surgicai_vision.training.run_config import BANKS, RunConfig, Starts, with_epochs
+from surgicai_vision.training.run_config import (
+    BANKS,
+    OWN,
+    RunConfig,
+    Shift,
+    Starts,
+    with_epochs,
+)
 
 HLP = "hlp"
 """Name of the high-level policy, and of its kind."""
@@ -114,6 +122,7 @@ class Condition:
         upset: let one thing go wrong in every episode (`envs.upset`).
         seed: training seeds that are evaluated so; all by default.
         episodes: starts; the plan's by default.
+        shift: an axis of robustness (`evaluation.robustness.AXES`) and its strength, 0 to 1.
     """
 
     name: str
@@ -123,6 +132,22 @@ class Condition:
     upset: bool = False
     seed: tuple[int, ...] = ()
     episodes: int | None = None
+    shift: Shift | None = None
+
+
+@dataclass(frozen=True)
+class NotRun:
+    """Rows of a plan that cannot be run where it was written, and what they need.
+
+    Attributes:
+        policy: what they are of.
+        task: their tasks.
+        needs: what is needed, for the reader.
+    """
+
+    policy: str
+    task: tuple[str, ...]
+    needs: str
 
 
 @dataclass(frozen=True)
@@ -146,6 +171,7 @@ class Plan:
         expert: evaluate the expert beside the policies, in every condition.
         accept_licence: accept weights under a non-commercial licence.
         licence: the policies' licence, where they are released.
+        not_run: rows that are listed and not run, with what they need.
     """
 
     size: int
@@ -164,6 +190,7 @@ class Plan:
     expert: bool = False
     accept_licence: bool = False
     licence: str = "MIT"
+    not_run: tuple[NotRun, ...] = ()
 
     def __post_init__(self) -> None:
         check_name("bank of starts", self.starts, BANKS)
@@ -230,6 +257,13 @@ class Plan:
                     "evaluated; leave it out."
                 )
         self.task_config(names.SUTURE, condition)
+        if condition.shift is not None:
+            check_name("axis", condition.shift.axis, AXES)
+            if not 0 <= condition.shift.strength <= 1:
+                raise InputError(
+                    f"condition {condition.name}: strength is {condition.shift.strength}; "
+                    "allowed: 0 to 1."
+                )
 
     def task_config(self, task: str, condition: Condition | None = None) -> TaskConfig:
         """Return the configuration of a task in the plan's env, or in that of a condition."""
@@ -323,7 +357,7 @@ class Plan:
     @property
     def runs(self) -> tuple[RunConfig, ...]:
         """Every policy in every condition, for one training seed after the other."""
-        return tuple(self._evaluated)
+        return (*self._evaluated, *self._listed)
 
     @functools.cached_property
     def _evaluated(self) -> dict[RunConfig, tuple[str, Condition]]:
@@ -339,6 +373,28 @@ class Plan:
                     found[self._run(name, condition, seed)] = (name, condition)
         return found
 
+    @functools.cached_property
+    def _listed(self) -> dict[RunConfig, str]:
+        """Each run that is listed alone → what it needs; in every condition without a shift."""
+        return {
+            RunConfig(
+                self.task_config(task, condition),
+                OWN,
+                ("front",),
+                policy=row.policy,
+                starts=Starts(BANKS[self.starts], condition.episodes or self.episodes),
+                condition=condition.name,
+            ): row.needs
+            for row in self.not_run
+            for task in row.task
+            for condition in self.conditions
+            if condition.shift is None
+        }
+
+    def needs(self, run: RunConfig) -> str:
+        """Return what a run needs that is not here; "" where it may be run."""
+        return self._listed.get(run, "")
+
     def _run(self, name: str, condition: Condition, seed: int) -> RunConfig:
         """Return the evaluation of a policy, or of the whole procedure, in a condition."""
         episodes = condition.episodes or self.episodes
@@ -352,13 +408,19 @@ class Plan:
                 termination=self.hierarchical(condition, {}).termination,
                 parts=self._digest,
                 starts=starts,
+                shift=condition.shift,
                 upset=condition.upset,
                 condition=condition.name,
             )
         training = self.training(self._policy(name), seed)
         env = self.task_config(training.task, condition)
         return replace(
-            training, env=env, starts=starts, upset=condition.upset, condition=condition.name
+            training,
+            env=env,
+            starts=starts,
+            shift=condition.shift,
+            upset=condition.upset,
+            condition=condition.name,
         )
 
     def _policy(self, name: str) -> PlannedPolicy:
@@ -387,6 +449,8 @@ class Plan:
 
     def parts(self, run: RunConfig) -> Mapping[str, Training]:
         """Return the policies that a run evaluates, by their names."""
+        if run in self._listed:
+            return {}
         name, condition = self._evaluated[run]
         if name != names.SUTURE:
             return {name: self._training(self._policy(name), run.seed)}
@@ -414,11 +478,12 @@ class Plan:
                 run.env,
                 policy="expert",
                 starts=run.starts,
+                shift=run.shift,
                 upset=run.upset,
                 condition=run.condition,
             ): None
             for run in runs
-            if self.expert
+            if self.expert and run not in self._listed
         }
         return tuple(found)
 

@@ -6,11 +6,15 @@ the one that is there, so running again continues.
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from encoders.base import Encoder
+from policies.base import Recipe
+from policies.chunks import ChunkRecipe
+from surgicai_vision.core.files import read_json
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.subset import (
@@ -20,11 +24,13 @@ from surgicai_vision.dataset.subset import (
     with_frame_stride,
 )
 from surgicai_vision.features.cache import Features, encode
+from surgicai_vision.features.devices import AUTO, CPU, find_device
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training import policies
+from surgicai_vision.training.chunks import timeline_of, with_chunks
 from surgicai_vision.training.progress_input import check_progress_policy, with_progress
 from surgicai_vision.training.run_config import RunConfig
-from surgicai_vision.training.train import train
+from surgicai_vision.training.train import REQUEST, epochs_within, train
 
 
 def train_run(
@@ -37,7 +43,9 @@ def train_run(
     start: Path | None = None,
     progress_from: Path | None = None,
     subtask: str | None = None,
+    demos: Path | None = None,
     save_every: int = 0,
+    device: str | None = None,
     log: Callable[[int, dict[str, float]], None] | None = None,
 ) -> None:
     """Encode a run's views, from the cache where they are at hand, and train its policy.
@@ -52,17 +60,26 @@ def train_run(
         progress_from: checkpoint folder of the policy whose progress a recipe with
             `progress_input` feeds.
         subtask: train on this subtask's frames of the dataset's whole procedures.
+        demos: folder of the dataset's demonstrations, for a policy that plans chunks where the
+            dataset was rendered with fewer frames than control steps.
         save_every: also keep a checkpoint every so many epochs.
+        device: where to encode and train, one of `features.devices.DEVICES`; by default it is
+            encoded on a GPU where there is one, and trained on the CPU.
         log: called with (epoch, losses by name).
     """
     recipe = policies.recipe_of(run)
     policies.check_progress_from(recipe, progress_from)
+    plugin = policies.policy_plugin(run.policy)
+    if plugin.offsets is not None:
+        plugin.make(recipe, ())  # refuses its settings before anything is encoded
+    encodes_on = AUTO if device is None else find_device(device)
+    trains_on = CPU if device is None else encodes_on
     dataset = with_frame_stride(dataset, recipe.frame_stride)
     progress_policy = policies.load_policy(progress_from) if progress_from else None
     if progress_policy is not None:
         check_progress_policy(progress_policy.checkpoint, dataset)
     start_policy = policies.load_policy(start) if start else None
-    features = _encode(run, dataset, stage, weights)
+    features = _encode(run, dataset, stage, weights, encodes_on)
     if progress_policy is not None:
         encoder = policies.load_encoder_of(progress_policy.checkpoint, weights)
         views = progress_policy.checkpoint.views
@@ -71,6 +88,9 @@ def train_run(
         dataset = fed
         features = [entry.part(fed.rows, fed.fingerprint) for entry in features]
     subsets: list[Callable[[Dataset], DatasetSubset]] = []
+    if plugin.offsets is not None:
+        offsets = plugin.offsets(recipe)
+        subsets.append(lambda present: with_chunks(present, timeline_of(present, demos), offsets))
     if run.demonstrations not in (None, len(np.unique(dataset.demonstration_index))):
         subsets.append(functools.partial(first_episodes, count=run.demonstrations))
     if subtask is not None:
@@ -79,11 +99,12 @@ def train_run(
         subset = select(dataset)
         dataset = subset
         features = [entry.part(subset.rows, subset.fingerprint) for entry in features]
+    recipe = _within_budget(recipe, dataset, features, run, out, trains_on)
     with stage(f"policy: {run.name}", "epochs") as progress:
         train(
             dataset,
             features,
-            policies.policy_plugin(run.policy),
+            plugin,
             recipe,
             seed=run.seed,
             out=out,
@@ -92,23 +113,54 @@ def train_run(
             start=start_policy,
             progress_policy=progress_policy.checkpoint if progress_policy else None,
             save_every=save_every,
+            device=trains_on,
             log=log,
         )
 
 
+def _within_budget(
+    recipe: Recipe,
+    dataset: Dataset,
+    features: Sequence[Features],
+    run: RunConfig,
+    out: Path,
+    device: str,
+) -> Recipe:
+    """Return the recipe with the epochs that fit into its minutes, where it has a budget.
+
+    A training that was broken off goes on with the number it was begun with.
+    """
+    if not (isinstance(recipe, ChunkRecipe) and recipe.minutes):
+        return recipe
+    if (out / REQUEST).is_file():
+        begun = read_json(out / REQUEST).get("recipe", {}).get("epochs", recipe.epochs)
+        return replace(recipe, epochs=int(begun))
+    plugin = policies.policy_plugin(run.policy)
+    return replace(
+        recipe,
+        epochs=epochs_within(
+            recipe.minutes, dataset, features, plugin, recipe, seed=run.seed, device=device
+        ),
+    )
+
+
 def encode_run(
-    run: RunConfig, dataset: Dataset, stage: Stage, weights: WeightsSource = ANYWHERE
+    run: RunConfig,
+    dataset: Dataset,
+    stage: Stage,
+    weights: WeightsSource = ANYWHERE,
+    device: str = AUTO,
 ) -> list[Features]:
     """Encode a run's views, all frames that its recipe takes, or find them in the cache."""
     recipe = policies.recipe_of(run)
-    return _encode(run, with_frame_stride(dataset, recipe.frame_stride), stage, weights)
+    return _encode(run, with_frame_stride(dataset, recipe.frame_stride), stage, weights, device)
 
 
 def _encode(
-    run: RunConfig, dataset: Dataset, stage: Stage, weights: WeightsSource
+    run: RunConfig, dataset: Dataset, stage: Stage, weights: WeightsSource, device: str
 ) -> list[Features]:
     """Encode a run's views, all frames of `dataset`."""
-    encoder = load_encoder(run.encoder, run.pool, weights) if run.encoder else None
+    encoder = load_encoder(run.encoder, run.pool, weights, device) if run.encoder else None
     return _encode_views(encoder, run.views, dataset, stage, f"features: {run.encoder}")
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from encoders.weights import find
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.plugins import ENCODERS_GROUP, Registry, resolve
+from surgicai_vision.features.devices import AUTO, find_device
 
 if TYPE_CHECKING:
     from encoders.base import Encoder, EncoderCard, Plugin
@@ -153,24 +154,33 @@ ANYWHERE: Final = WeightsSource()
 """No file is named; a non-commercial licence is not accepted."""
 
 
-def load_encoder(name: str, pool: str = "global", weights: WeightsSource = ANYWHERE) -> "Encoder":
+def load_encoder(
+    name: str,
+    pool: str = "global",
+    weights: WeightsSource = ANYWHERE,
+    device: str = AUTO,
+) -> "Encoder":
     """Load an encoder by name, frozen for good.
 
     Args:
         name: one of `encoder_names()`.
         pool: one of `POOLS`.
         weights: where its pretrained weights come from.
+        device: one of `devices.DEVICES`.
 
     Raises:
         UnknownName: a name or pool that does not exist.
+        InputError: a device that is not there.
         MissingWeights: the weights are found nowhere; raised within seconds and before any work.
         BadFile: a weights file that is missing, damaged or of another architecture.
     """
     plugin = encoder_plugin(name)
     path = find_weights(name, weights)
     check_name("pool", pool, POOLS)
+    where = find_device(device)
     card, network = plugin.build(plugin.card, path)
-    encoder: Encoder = resolve("encoders.base:Encoder")(card, network, pool)  # imports torch
+    make = resolve("encoders.base:open_encoder")  # imports torch
+    encoder: Encoder = make(card, network, pool, where)
     return encoder
 
 

@@ -36,6 +36,9 @@ POLICIES: Final = Registry["Plugin"](
         "hlp": "policies.hlp:HLP",
         "actor": "policies.actor:ACTOR",
         "bcq": "policies.actor:BCQ",
+        "act": "policies.lerobot:ACT",
+        "diffusion": "policies.lerobot:DIFFUSION",
+        "vqbet": "policies.lerobot:VQBET",
     },
 )
 """Policy name → its `policies.base.Plugin`."""
@@ -65,6 +68,11 @@ def recipe_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in (configs_folder() / "recipes").glob("*.yaml")))
 
 
+def default_recipe(policy: str) -> str:
+    """Return the recipe of a policy that is given without one: its own, else the paper's."""
+    return policy if policy in recipe_names() else "paper"
+
+
 def load_recipe(
     policy: str = "bc", recipe: str | Path = "paper", changes: Mapping[str, JSON] | None = None
 ) -> "Recipe":
@@ -85,8 +93,11 @@ def load_recipe(
     if path.suffix not in (".yaml", ".yml"):
         check_name("recipe", str(recipe), recipe_names())
         path = (configs_folder() / "recipes") / f"{recipe}.yaml"
-    values = read_yaml(path, may_be_empty=True)
-    return from_mapping(plugin.recipe, {**values, **(changes or {})}, f"recipe {recipe}")
+    values: Mapping[str, object] = read_yaml(path, may_be_empty=True)
+    given = changes or {}
+    if "epochs" in given:  # whoever says the epochs wants them, and no budget
+        values = {key: value for key, value in values.items() if key != "minutes"}
+    return from_mapping(plugin.recipe, {**values, **given}, f"recipe {recipe}")
 
 
 def recipe_of(run: RunConfig) -> "Recipe":

@@ -22,7 +22,7 @@ OWN = "own"
 REFERENCES = ("expert", "random", "zero", "replay", "recover")
 """Policies that are not trained: what the trained ones stand beside."""
 LEROBOT_POLICIES = ("act", "diffusion")
-"""Policies that a sweep trains by `lerobot-train`."""
+"""Policies that a grid trains by `lerobot-train`, for a number of updates."""
 TERMINATIONS = ("privileged", "learned")
 """How a subtask ends under a hierarchical policy."""
 
@@ -159,6 +159,11 @@ class RunConfig:
         return self.policy not in REFERENCES
 
     @property
+    def by_lerobot_train(self) -> bool:
+        """Whether a sweep trains it by `lerobot-train`, and not from cached features."""
+        return self.policy in LEROBOT_POLICIES and self.updates is not None
+
+    @property
     def is_hierarchical(self) -> bool:
         """Whether this is a high-level policy over low-level ones."""
         return self.termination is not None
@@ -213,6 +218,20 @@ class RunConfig:
 def with_epochs(changes: tuple[str, ...], epochs: int | None) -> tuple[str, ...]:
     """Return the changes of a recipe with the number of epochs among them, where one is given."""
     return changes if epochs is None else (*changes, f"epochs={epochs}")
+
+
+def with_budget(
+    changes: tuple[str, ...], epochs: int | None, minutes: float | None
+) -> tuple[str, ...]:
+    """Return the changes of a recipe with the length of the training among them.
+
+    Raises:
+        InputError: epochs and minutes are both given.
+    """
+    if epochs is not None and minutes is not None:
+        raise InputError(f"--epochs {epochs} and --minutes {minutes:g} are given; give one.")
+    changes = with_epochs(changes, epochs)
+    return changes if minutes is None else (*changes, f"minutes={minutes:g}")
 
 
 def of_training(run: RunConfig) -> RunConfig:

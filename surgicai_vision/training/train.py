@@ -4,6 +4,7 @@ Interface:
 
 * `train(dataset, features, policy, recipe, seed=…, out=…, progress=…) -> Checkpoint`: train from
   the feature cache. Running it again goes on where it was broken off, or returns what is done.
+* `epochs_within(minutes, …)`: how many epochs fit into a budget.
 * What it reads of a dataset, its split and its batches: `surgicai_vision.training.data`.
 
 Layout of the folder while it trains; the first and the last two stay (see
@@ -25,8 +26,9 @@ import functools
 import io
 import json
 import pickle
+import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -45,6 +47,7 @@ from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
 from surgicai_vision.training.augment import with_noise, with_shift
+from surgicai_vision.training.averages import MovingAverage
 from surgicai_vision.training.checkpoint import (
     CARD,
     Checkpoint,
@@ -53,6 +56,7 @@ from surgicai_vision.training.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
+from surgicai_vision.training.chunks import earlier_rows
 from surgicai_vision.training.data import column, cuts, over_places, split
 from surgicai_vision.training.progress_input import copy_progress_policy
 from surgicai_vision.training.run_config import RunConfig
@@ -65,6 +69,8 @@ STATE_EVERY = 5  # epochs between training states: a broken-off training loses a
 TRIM_THRESHOLD = -1  # of malloc.h, as is the next
 MMAP_THRESHOLD = -3
 STATISTICS_ROWS = 1024  # rows summed at a time
+WARM = 3  # updates made before the first that is timed
+TIMED = 20
 SMALLEST_STD = 1e-6  # an input that varies less is constant, and only its mean is removed
 
 Log = Callable[[int, dict[str, float]], None]
@@ -127,12 +133,39 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / REQUEST, request)
     _keep_memory()
-    with torch.random.fork_rng(devices=[]), one_thread():
-        checkpoint = _Training(task, start, torch.device(device)).run(
-            out, save_every, progress, log
-        )
+    where = torch.device(device)
+    with torch.random.fork_rng(devices=_cuda(where)), one_thread():
+        checkpoint = _Training(task, start, where).run(out, save_every, progress, log)
     (out / STATE).unlink(missing_ok=True)
     return checkpoint
+
+
+def epochs_within(
+    minutes: float,
+    dataset: Dataset,
+    features: Sequence[Features],
+    policy: Plugin,
+    recipe: Recipe,
+    *,
+    seed: int = 0,
+    device: str = "cpu",
+) -> int:
+    """Return how many epochs fit into so many minutes of one core, at least 1.
+
+    A few updates are made and timed by the processor's clock, so that other processes do not count;
+    what they learn is thrown away. On a GPU it is the wall's clock.
+    """
+    task = _Task(dataset, tuple(features), policy, recipe, seed, RunConfig(recipe="custom"))
+    _check(task)
+    _keep_memory()
+    where = torch.device(device)
+    clock = time.process_time if where.type == "cpu" else time.perf_counter
+    with torch.random.fork_rng(devices=_cuda(where)), one_thread():
+        begun = clock()
+        training = _Training(task, None, where)
+        prepared = clock() - begun
+        seconds = training.time_epoch(clock)
+    return max(1, int((60 * minutes - prepared) / seconds))
 
 
 def _keep_memory() -> None:
@@ -252,11 +285,17 @@ class _Training:
         target = task.columns[task.policy.target]
         kind = np.int64 if np.issubdtype(target.dtype, np.integer) else np.float32
         self.target = torch.from_numpy(target.astype(kind))
+        history = self.policy.history
+        self.seen = earlier_rows(task.dataset, history) if history > 1 else None
         if start is None:
             self._measure()
+            self.policy.measure(self.target[self.rows])
         else:
             self._copy(start)
         self.policy.to(device)
+        self.average = (
+            MovingAverage(self.policy, self.policy.averaging) if self.policy.averaging else None
+        )
         self.optimiser, self.schedule = self._optimiser()
         self.order = np.random.default_rng((task.seed, 1))
         self.losses: list[float] = []
@@ -286,10 +325,28 @@ class _Training:
                 progress(done, epochs)
         return self._write(out, self._conclude())
 
+    def time_epoch(self, clock: Callable[[], float]) -> float:
+        """Return about how long an epoch takes [s], by `TIMED` updates and a validation."""
+        batches = self._batches()
+        self.policy.train()
+        for rows in batches[:WARM]:
+            self._update(rows)
+        timed = [batches[index % len(batches)] for index in range(TIMED)]
+        begun = clock()
+        for rows in timed:
+            self._update(rows)
+        seconds = (clock() - begun) / TIMED * len(batches)
+        begun = clock()
+        if len(self.held_rows):
+            self._validate()
+        return seconds + clock() - begun
+
     @torch.no_grad()
     def _conclude(self) -> StageErrors | None:
         """Calibrate on the frames held out; return a high-level policy's errors there."""
         if not len(self.held_rows):
+            return None
+        if self.task.policy.target == names.ACTION_CHUNK:
             return None
         target = self.target[self.held_rows]
         self.policy.eval()
@@ -329,6 +386,17 @@ class _Training:
         if self.vector is not None:
             parts.append(torch.from_numpy(self.vector[rows]))
         return torch.cat(parts, dim=1)
+
+    def _inputs(self, rows: NDArray[np.int64]) -> torch.Tensor:
+        """Return the raw inputs of some frames with what came before them, on the device.
+
+        Returns:
+            (n, inputs) float32, or (n, history, inputs) for a policy with a history.
+        """
+        if self.seen is None:
+            return self._observed(rows).to(self.device)
+        moments = self.seen[rows]
+        return self._observed(moments.ravel()).unflatten(0, moments.shape).to(self.device)
 
     def _measure(self) -> None:
         """Store mean and standard deviation of the inputs over the training frames."""
@@ -372,22 +440,40 @@ class _Training:
         self.policy.train()
         total = 0.0
         for rows in self._batches():
-            observed = self._augmented(self.policy.normalise(self._observed(rows).to(self.device)))
-            loss = self.policy.loss(observed, self.target[rows].to(self.device))
-            self.optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            self.optimiser.step()
-            if self.schedule:
-                self.schedule.step()
-            total += loss.item() * len(rows)
+            total += self._update(rows) * len(rows)
         if not np.isfinite(total):
             raise SurgicaiError(
                 "The training loss is not finite; lower the learning rate or look at the features."
             )
         return total / len(self.rows)
 
+    def _update(self, rows: NDArray[np.int64]) -> float:
+        """Make one update of the weights on some frames; return its loss."""
+        observed = self._augmented(self.policy.normalise(self._inputs(rows)))
+        loss = self.policy.loss(observed, self.target[rows].to(self.device))
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        if self.policy.clip:
+            torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.policy.clip)
+        self.optimiser.step()
+        if self.schedule:
+            self.schedule.step()
+        if self.average:
+            self.average.update(self.policy)
+        return loss.item()
+
+    def _averaged(self) -> AbstractContextManager[None]:
+        """Let the policy have the weights that are kept, for a while."""
+        return self.average.applied(self.policy) if self.average else nullcontext()
+
     def _augmented(self, observed: torch.Tensor) -> torch.Tensor:
-        """Return normalised inputs (B, inputs.dim) as the recipe's augmentation leaves them."""
+        """Return normalised inputs as the recipe's augmentation leaves them.
+
+        Args:
+            observed: (B, inputs.dim), or (B, history, inputs.dim), each moment by its own draw.
+        """
+        if observed.ndim == 3:
+            return self._augmented(observed.flatten(0, 1)).unflatten(0, observed.shape[:2])
         recipe = self.task.recipe
         inputs = self.policy.inputs
         if recipe.map_shift:
@@ -399,15 +485,16 @@ class _Training:
 
     @torch.no_grad()
     def _validate(self) -> float:
-        """Return the mean loss over the frames held out."""
+        """Return the mean loss over the frames held out; a policy that samples draws the same."""
         self.policy.eval()
         total = 0.0
-        for at in range(0, len(self.held_rows), STATISTICS_ROWS):
-            rows = self.held_rows[at : at + STATISTICS_ROWS]
-            observed = self.policy.normalise(self._observed(rows).to(self.device))
-            total += self.policy.loss(observed, self.target[rows].to(self.device)).item() * len(
-                rows
-            )
+        with self._averaged(), torch.random.fork_rng(devices=_cuda(self.device)):
+            torch.manual_seed(self.task.seed)
+            for at in range(0, len(self.held_rows), STATISTICS_ROWS):
+                rows = self.held_rows[at : at + STATISTICS_ROWS]
+                observed = self.policy.normalise(self._inputs(rows))
+                target = self.target[rows].to(self.device)
+                total += self.policy.loss(observed, target).item() * len(rows)
         return total / len(self.held_rows)
 
     def _save(self, path: Path) -> None:
@@ -422,6 +509,7 @@ class _Training:
             "random": torch.get_rng_state(),
             "losses": self.losses,
             "held_losses": self.held_losses,
+            "average": self.average.state() if self.average else {},
         }
         torch.save(state, content)
         write_bytes(path, content.getvalue())
@@ -440,6 +528,8 @@ class _Training:
         torch.set_rng_state(state["random"])
         self.losses = list(state["losses"])
         self.held_losses = list(state["held_losses"])
+        if self.average:
+            self.average.restore(**state["average"])
 
     def _write(self, folder: Path, errors: StageErrors | None = None) -> Checkpoint:
         """Write the policy as it stands."""
@@ -466,7 +556,13 @@ class _Training:
             stage_errors=errors,
             progress_sha256=fed.policy_sha256 if fed else "",
         )
-        return write_checkpoint(folder, checkpoint, self.policy.state_dict())
+        with self._averaged():
+            return write_checkpoint(folder, checkpoint, self.policy.state_dict())
+
+
+def _cuda(device: torch.device) -> list[torch.device]:
+    """Return the CUDA devices whose random state a computation on `device` draws from."""
+    return [device] if device.type == "cuda" else []
 
 
 def _record(entry: Features) -> EncoderRecord:

@@ -8,6 +8,7 @@ import importlib.metadata
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,14 +17,23 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+import yaml
 
+from policies import lerobot as lerobot_policies
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
 from surgicai_vision.core.executor import RunContext
+from surgicai_vision.core.instructions import draw_instruction
+from surgicai_vision.core.progress import silent_stage
 from surgicai_vision.dataset import open_dataset, render_demos
 from surgicai_vision.dataset.feature_export import export_features
 from surgicai_vision.demos.record import record
+from surgicai_vision.evaluation.policy_spec import open_policy
+from surgicai_vision.evaluation.rollout import evaluate
+from surgicai_vision.experiments.run import train_run
+from surgicai_vision.training import policies
+from surgicai_vision.training.run_config import RunConfig
 
 TASK, SIZE, STEPS = "place", 32, 4
 CHECKPOINT = "checkpoints/last/pretrained_model"
@@ -634,3 +644,137 @@ def test_lerobot_edits_our_dataset(dataset: Path, folder: Path, tmp_path: Path, 
     assert infos["less"]["total_episodes"] == 2
     parts = infos["train"]["total_frames"] + infos["val"]["total_frames"]
     assert infos["whole"]["total_frames"] == parts > 0
+
+
+CHUNKS = {
+    "act": {"dim_model": 32, "dim_feedforward": 64, "n_heads": 2, "n_encoder_layers": 1},
+    "diffusion": {
+        "down_dims": [16, 32],
+        "diffusion_step_embed_dim": 8,
+        "n_groups": 4,
+        "num_inference_steps": 2,
+    },
+    "vqbet": {
+        "gpt_input_dim": 16,
+        "gpt_output_dim": 16,
+        "gpt_hidden_dim": 16,
+        "gpt_n_layer": 1,
+        "gpt_n_head": 2,
+        "n_vqvae_training_steps": 2,
+    },
+}
+
+
+def chunk_recipe(name: str, **changes: object) -> Any:
+    history = 2 if name == "diffusion" else 1
+    table = {"chunk": 4, "execute": 2, "history": history, "epochs": 1, "settings": CHUNKS[name]}
+    return policies.load_recipe(name, "act", table | changes)
+
+
+@pytest.mark.parametrize("name", CHUNKS)
+def test_a_policy_of_lerobot_trains_on_cached_features(
+    name: str, dataset: Path, tmp_path: Path
+) -> None:
+    """From the cache to `evaluate`: a checkpoint of ours, read back and acted chunk by chunk."""
+    text = yaml.safe_dump(to_mapping(chunk_recipe(name, ema=0.9, map_head="convolutions")))
+    (tmp_path / "recipe.yaml").write_text(text, encoding="utf-8")
+    run = RunConfig(
+        TaskConfig(TASK),
+        "imagenet-lite-early",
+        ("back",),
+        name,
+        "spatial",
+        recipe=str(tmp_path / "recipe.yaml"),
+    )
+    train_run(run, open_dataset(dataset), tmp_path / "policy", silent_stage)
+    spec = open_policy(tmp_path / "policy")
+    config = replace(spec.config, max_steps=6)
+    one, other = (
+        evaluate(spec.make_agent, config, [7, 8], workers=1, batch=batch) for batch in (1, 2)
+    )
+    told = [[repr(episode.row) for episode in episodes] for episodes in (one, other)]  # of NaN too
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("name", CHUNKS)
+def test_no_tensor_of_a_chunk_policy_is_left_on_another_device(name: str) -> None:
+    policy = policies.policy_plugin(name).make(chunk_recipe(name), ((12,),))
+    policy.train().to("meta")
+    tensors = (*policy.parameters(), *policy.buffers())
+    assert {tensor.device.type for tensor in tensors} == {"meta"}
+
+
+def test_settings_of_a_chunk_policy_are_lerobots() -> None:
+    with pytest.raises(UnknownName, match="dim_model"):
+        policies.policy_plugin("act").make(chunk_recipe("act", settings={"dim_modle": 3}), ())
+    with pytest.raises(InputError, match="follows"):
+        policies.policy_plugin("act").make(chunk_recipe("act", settings={"chunk_size": 3}), ())
+    with pytest.raises(InputError, match="history"):
+        policies.policy_plugin("act").make(chunk_recipe("act", history=2), ())
+    with pytest.raises(InputError, match="VQ-BeT"):
+        policies.policy_plugin("vqbet").make(chunk_recipe("vqbet", history=2), ())
+
+
+def test_what_acts_needs_without_lerobot_is_lerobots_own() -> None:
+    from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+    from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+
+    assert DiffusionConfig().down_dims == lerobot_policies.DOWN_DIMS
+    assert VQBeTConfig().n_action_pred_token == lerobot_policies.PREDICTED_TOKENS
+    for name in CHUNKS:
+        recipe = chunk_recipe(name)
+        config = policies.policy_plugin(name).make(recipe, ()).network.config
+        offsets = policies.policy_plugin(name).offsets(recipe)
+        assert list(offsets) == config.action_delta_indices
+
+
+# -- EnvHub and several tasks ----------------------------------------------------------------------
+
+
+def test_the_hubs_loader_makes_the_envs_of_a_local_folder(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot's own `make_env("user/repository")`, with the file in the place of its download."""
+    from lerobot.envs import utils
+    from lerobot.envs.factory import make_env
+
+    hub = root / "lerobot_env_surgicai/hub"
+    monkeypatch.setattr(utils, "hf_hub_download", lambda filename, **_: str(hub / filename))
+    with pytest.raises(RuntimeError, match="trust_remote_code"):
+        make_env("someone/suturing")
+    made = make_env("someone/suturing", n_envs=1, trust_remote_code=True)
+    assert list(made) == list(names.SUBTASKS)
+    for task, group in made.items():
+        assert group[0].call("task_description") == (names.TASK_TEXTS[task],)
+        assert group[0].call("_max_episode_steps") == (TaskConfig(task).max_steps,)
+        group[0].close()
+
+
+def test_several_tasks_are_counted_in_one_call_in_other_words(tmp_path: Path, command: Any) -> None:
+    command(
+        "lerobot_eval",
+        "--env.type=surgicai",
+        "--env.tasks=[grasp, handoff]",
+        "--env.instructions=heldout",
+        f"--env.image_size={SIZE}",
+        "--policy.type=surgicai_bc",
+        "--policy.encoder=null",
+        "--policy.device=cpu",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={tmp_path / 'out'}",
+    )
+    told = json.loads((tmp_path / "out/eval_info.json").read_text())
+    assert [row["task_group"] for row in told["per_task"]] == ["grasp", "handoff"]
+    assert set(told["per_group"]) == {"grasp", "handoff"} and told["overall"]["n_episodes"] == 2
+
+
+def test_an_episode_is_told_by_its_seeds_sentence() -> None:
+    from lerobot_env_surgicai.environment import SurgicaiEnv
+
+    env = SurgicaiEnv(task="grasp", image_size=SIZE, instructions="train").create_envs(1)
+    vector = env["surgicai"][0]
+    for seed in (3, 4, 3):
+        vector.reset(seed=[seed])
+        assert vector.call("task_description") == (draw_instruction("grasp", "train", seed),)
+    vector.close()

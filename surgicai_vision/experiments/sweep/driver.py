@@ -60,6 +60,7 @@ def run_sweep(
     context: RunContext,
     attempts: int = ATTEMPTS,
     choice: Choice = EVERYTHING,
+    device: str | None = None,
 ) -> Row:
     """Do every run that is not done and can be done.
 
@@ -69,6 +70,8 @@ def run_sweep(
         context: processes, engine and progress; the result does not depend on them.
         attempts: how often a run is started whose worker dies.
         choice: the runs to work on; others that are not there yet are left for another call.
+        device: where it is encoded and trained, one of `features.devices.DEVICES`; by default
+            encoded on a GPU where there is one, and trained on the CPU.
 
     Returns:
         {"runs", "done" (by this call), "cached", "failed", "not_run", "left", "digest" (of all
@@ -89,7 +92,7 @@ def run_sweep(
     with claim(out / WORK):
         states = plan(experiment, out, choice)
         asked = [state.run for state in states if state.state != LEFT]
-        sweep = _Sweep(experiment, out, context, attempts, experiment.references(asked))
+        sweep = _Sweep(experiment, out, context, attempts, experiment.references(asked), device)
         to_do = [state for state in states if state.state == TO_DO]
         sweep.prepare(to_do)
         sweep.do(to_do)
@@ -174,6 +177,7 @@ class _Sweep:
     Attributes:
         experiment, out, context, attempts: as `run_sweep`'s.
         references: what is not trained and wanted beside the runs.
+        device: as `run_sweep`'s.
         errors: run's key → what went wrong, in one line.
         problems: what went wrong beside the runs.
     """
@@ -183,6 +187,7 @@ class _Sweep:
     context: RunContext
     attempts: int
     references: tuple[RunConfig, ...]
+    device: str | None = None
     errors: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     jobs: Jobs = field(init=False)
@@ -195,7 +200,7 @@ class _Sweep:
         ours = {
             name: value for name, value in os.environ.items() if name.startswith("SURGICAI_VISION_")
         }
-        self.jobs = Jobs(self.experiment, self.out, command_line(), ours)
+        self.jobs = Jobs(self.experiment, self.out, command_line(), ours, self.device)
 
     def prepare(self, to_do: Sequence[RunState]) -> None:
         """Make the datasets, features and policies that runs share.

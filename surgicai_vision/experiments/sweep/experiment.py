@@ -81,6 +81,9 @@ class Experiment(Protocol):
     def parts(self, run: RunConfig) -> Mapping[str, Training]:
         """Return the policies that a run evaluates, by their names; empty if it trains its own."""
 
+    def needs(self, run: RunConfig) -> str:
+        """Return what a run needs that no machine of ours has; "" where it may be run."""
+
     def evaluated(self, run: RunConfig) -> Evaluated:
         """Return how a run is evaluated."""
 

@@ -172,7 +172,7 @@ class Grid:
             if name != OWN:
                 encoders.check_encoder_name(name)
         for name in self.policy:
-            check_name("policy", name, (*policies.policy_names(), *LEROBOT_POLICIES))
+            check_name("policy", name, policies.policy_names())
         check_name("demonstrator", self.demonstrator, SCRIPTED_DEMONSTRATORS)
         check_name("bank of starts", self.starts, BANKS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
@@ -350,6 +350,10 @@ class Grid:
             )
             for name, part in parts_of(run).items()
         }
+
+    def needs(self, run: RunConfig) -> str:
+        """Return "": a grid lists nothing that it cannot run."""
+        return ""
 
     def evaluated(self, run: RunConfig) -> Evaluated:
         """Return how a run is evaluated: in the env it was trained in."""

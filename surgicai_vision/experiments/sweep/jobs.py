@@ -24,14 +24,16 @@ from surgicai_vision.evaluation.policy_spec import (
     in_env,
     open_policy,
 )
+from surgicai_vision.evaluation.robustness.axes import shifted
 from surgicai_vision.evaluation.run import evaluate_into
 from surgicai_vision.evaluation.storage import RESULT_FILE
 from surgicai_vision.experiments.run import encode_run, train_run
 from surgicai_vision.experiments.sweep.lerobot import SCRATCH, train_lerobot
 from surgicai_vision.experiments.sweep.plan import PROBE_FILE, REFERENCE_FILE
+from surgicai_vision.features.devices import AUTO
 from surgicai_vision.features.encoders import WeightsSource
 from surgicai_vision.features.probe import probe
-from surgicai_vision.training.run_config import LEROBOT_POLICIES, RunConfig
+from surgicai_vision.training.run_config import RunConfig
 
 type Table = Mapping[str, JSON]
 
@@ -41,13 +43,14 @@ def encode_features(
     run: Table,
     dataset: str,
     accept_licence: bool,
+    device: str | None,
     command: str,
     environment: Mapping[str, str],
 ) -> None:
     """Job "sweep-features": put what a run sees into the feature cache."""
     os.environ.update(environment)
     weights = WeightsSource(accept_licence=accept_licence)
-    features = encode_run(_run(run), _dataset(dataset), silent_stage, weights)
+    features = encode_run(_run(run), _dataset(dataset), silent_stage, weights, device or AUTO)
     write_json(folder / "features.json", [entry.folder.name for entry in features])
 
 
@@ -58,6 +61,7 @@ def train_policy(
     encodes_all: bool,
     dataset: str,
     accept_licence: bool,
+    device: str | None,
     command: str,
     environment: Mapping[str, str],
 ) -> None:
@@ -68,7 +72,7 @@ def train_policy(
     if subtask and not encodes_all:
         data = of_subtask(data, subtask)
         subtask = None
-    train_run(_run(run), data, folder, silent_stage, weights, subtask=subtask)
+    train_run(_run(run), data, folder, silent_stage, weights, subtask=subtask, device=device)
 
 
 def train_andevaluate_as(
@@ -80,6 +84,7 @@ def train_andevaluate_as(
     procedure: Table,
     dataset: str,
     accept_licence: bool,
+    device: str | None,
     command: str,
     environment: Mapping[str, str],
 ) -> None:
@@ -97,9 +102,9 @@ def train_andevaluate_as(
         elif policies:
             spec = open_policy(*policies.values(), task=what.task, weights=weights)
         else:
-            spec = _trained(what, _dataset(dataset), folder / "policy", measured, weights)
+            spec = _trained(what, _dataset(dataset), folder / "policy", measured, weights, device)
             about["folder"] = str(Path(final) / "policy")
-        spec = in_env(spec, env)
+        spec = _shifted(in_env(spec, env), what)
         about = {**spec.about, **about}
         with measured("evaluation", "steps"):
             summary = evaluate_as(folder / "evaluation", spec, what, about)
@@ -116,6 +121,7 @@ def evaluate_reference(
     demonstrated = _dataset(dataset) if what.policy == "replay" else None
     spec = open_policy(what.policy, task=what.task, dataset=demonstrated)
     spec = dataclasses.replace(spec, run=dataclasses.replace(spec.run, env=what.env))
+    spec = _shifted(spec, what)
     summary = evaluate_as(folder, spec, what, {**spec.about, "command": command})
     write_json(folder / REFERENCE_FILE, {"summary": summary})
 
@@ -125,6 +131,7 @@ def run_probe(
     run: Table,
     dataset: str,
     accept_licence: bool,
+    device: str | None,
     command: str,
     environment: Mapping[str, str],
 ) -> None:
@@ -133,7 +140,7 @@ def run_probe(
     what = _run(run)
     data = _dataset(dataset)
     weights = WeightsSource(accept_licence=accept_licence)
-    features = encode_run(what, data, silent_stage, weights)
+    features = encode_run(what, data, silent_stage, weights, device or AUTO)
     row = {
         "task": what.task,
         "encoder": what.encoder,
@@ -144,14 +151,19 @@ def run_probe(
 
 
 def _trained(
-    run: RunConfig, dataset: RenderedDataset, policy: Path, stage: Stage, weights: WeightsSource
+    run: RunConfig,
+    dataset: RenderedDataset,
+    policy: Path,
+    stage: Stage,
+    weights: WeightsSource,
+    device: str | None,
 ) -> PolicySpec:
     """Train a run's policy and return it."""
-    if run.policy in LEROBOT_POLICIES:
+    if run.by_lerobot_train:
         with stage("policy", "steps"):
-            train_lerobot(run, dataset, policy, weights)
+            train_lerobot(run, dataset, policy, weights, device)
     else:
-        train_run(run, dataset, policy, stage, weights)
+        train_run(run, dataset, policy, stage, weights, device=device)
     return open_policy(policy, task=run.task, weights=weights)
 
 
@@ -161,6 +173,11 @@ def evaluate_as(folder: Path, spec: PolicySpec, run: RunConfig, about: Table) ->
     stored = dataclasses.replace(run, env=spec.config)
     spec = dataclasses.replace(spec, run=stored, about=about)
     return evaluate_into(folder, spec, run.starts.seeds, workers=1)
+
+
+def _shifted(spec: PolicySpec, run: RunConfig) -> PolicySpec:
+    """Return a policy in the shift that its run says."""
+    return shifted(spec, run.shift.axis, run.shift.strength) if run.shift else spec
 
 
 def _run(table: Table) -> RunConfig:

@@ -17,6 +17,7 @@ from surgicai_vision.core.processes import OFFLINE, run_module
 from surgicai_vision.dataset import Dataset, RenderedDataset
 from surgicai_vision.dataset.feature_export import export_features
 from surgicai_vision.features.cache import encode
+from surgicai_vision.features.devices import AUTO, CPU, find_device
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training.run_config import OWN, RunConfig
 
@@ -35,7 +36,11 @@ VARIABLES = {**OFFLINE, "HF_DATASETS_DISABLE_PROGRESS_BARS": "1", "WANDB_MODE": 
 
 
 def train_lerobot(
-    run: RunConfig, dataset: RenderedDataset, out: Path, weights: WeightsSource = ANYWHERE
+    run: RunConfig,
+    dataset: RenderedDataset,
+    out: Path,
+    weights: WeightsSource = ANYWHERE,
+    device: str | None = None,
 ) -> None:
     """Train a policy of LeRobot into `out`, as `lerobot-train` writes it.
 
@@ -45,6 +50,7 @@ def train_lerobot(
         dataset: an opened dataset of the run's task.
         out: folder to make.
         weights: where pretrained weights come from.
+        device: where to encode and train, one of `features.devices.DEVICES`; the CPU by default.
 
     Raises:
         InputError: a dataset without every step's frame.
@@ -57,9 +63,10 @@ def train_lerobot(
     root = dataset.path
     if run.encoder != OWN:
         root = out.with_name(SCRATCH)
-        _export(run, dataset, root, weights)
+        _export(run, dataset, root, weights, device or AUTO)
     arguments = _arguments(run, dataset, root, out)
     arguments += [
+        f"--policy.device={find_device(device or CPU)}",
         f"--steps={run.updates}",
         f"--save_freq={run.updates}",
         f"--batch_size={run.batch_size}",
@@ -69,9 +76,11 @@ def train_lerobot(
         raise SurgicaiError(f"lerobot-train failed for {run.name}:\n{done.stderr[-2000:]}")
 
 
-def _export(run: RunConfig, dataset: RenderedDataset, root: Path, weights: WeightsSource) -> None:
+def _export(
+    run: RunConfig, dataset: RenderedDataset, root: Path, weights: WeightsSource, device: str
+) -> None:
     """Write a dataset with the run's features in place of images."""
-    encoder = load_encoder(str(run.encoder), run.pool, weights)
+    encoder = load_encoder(str(run.encoder), run.pool, weights, device)
     rows = [encode(dataset, view, encoder).rows for view in run.views]
     about = {
         "encoder": run.encoder,
@@ -93,7 +102,6 @@ def _arguments(run: RunConfig, dataset: Dataset, root: Path, out: Path) -> list[
         f"--policy.type={run.policy}",
         "--policy.pretrained_backbone_weights=null",
         "--policy.push_to_hub=false",
-        "--policy.device=cpu",
         "--env_eval_freq=0",
         "--num_workers=0",
         f"--seed={run.seed}",

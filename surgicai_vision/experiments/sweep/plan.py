@@ -22,7 +22,7 @@ from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import WeightsSource
 from surgicai_vision.rl.extra import check_extra
 from surgicai_vision.training import policies
-from surgicai_vision.training.run_config import LEROBOT_POLICIES, OWN, RunConfig
+from surgicai_vision.training.run_config import OWN, RunConfig
 
 REFERENCE_FILE = "reference.json"
 PROBE_FILE = "probe.json"
@@ -136,8 +136,10 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
     if any(run.algo for run in experiment.runs):
         check_extra("A sweep over algorithms", *LIBRARIES)
     for run in experiment.runs:
+        if experiment.needs(run):
+            continue
         for trained in trained_by(experiment, run):
-            if trained.policy not in LEROBOT_POLICIES and not trained.algo:
+            if not trained.by_lerobot_train and not trained.algo:
                 policies.check_progress_from(policies.recipe_of(trained), None)
         if not experiment.parts(run):
             _check_acts(run.policy)
@@ -174,6 +176,9 @@ def _missing(encoder: str, weights: WeightsSource) -> str:
 def _state(run: RunConfig, jobs: "Jobs", missing: Callable[[str], str], choice: Choice) -> RunState:
     """Return a run with its state."""
     key = run_key(run)
+    needs = jobs.experiment.needs(run)
+    if needs:
+        return RunState(run, key, NOT_RUN, needs)
     path = run_folder(jobs.out, key) / RESULT_FILE
     is_made = path.exists()
     if is_made and read_json(path).get("job") == jobs.key_of_run(run):
@@ -195,6 +200,7 @@ class Jobs:
         out: the sweep's folder.
         command: the command to be named beside each result.
         environment: variables for the workers, where an engine does not hand ours on.
+        device: where it is encoded and trained, one of `features.devices.DEVICES`.
     """
 
     def __init__(
@@ -203,10 +209,12 @@ class Jobs:
         out: Path,
         command: str = "",
         environment: Mapping[str, str] | None = None,
+        device: str | None = None,
     ):
         self.experiment = experiment
         self.out = out
         self._where: dict[str, JSON] = {"command": command, "environment": dict(environment or {})}
+        self._device = device
         self._digests: dict[str, str | None] = {}
 
     def data_folder(self, name: str) -> Path:
@@ -342,7 +350,7 @@ class Jobs:
         if not run.encoder or run.encoder == OWN:
             return []
         changes: tuple[str, ...] = ()
-        if run.policy not in LEROBOT_POLICIES:
+        if not run.by_lerobot_train:
             stride = policies.recipe_of(run).frame_stride
             changes = (f"frame_stride={stride}",) if stride > 1 else ()
         jobs = []
@@ -386,6 +394,7 @@ class Jobs:
         return {
             "dataset": self._dataset(dataset),
             "accept_licence": self.experiment.accept_licence,
+            "device": self._device,
             **self._where,
         }
 
@@ -394,12 +403,12 @@ class Jobs:
         inputs = [self.dataset_digest(dataset) or ""]
         if run.encoder and run.encoder != OWN:
             inputs.append(_card_digest(run.encoder))
-        if run.policy not in LEROBOT_POLICIES:
+        if not run.by_lerobot_train:
             inputs.append(_recipe_digest(run.policy, run.recipe, run.changes, run.privileged))
         return inputs
 
 
-LABELS = ("dataset", "accept_licence", "command", "environment")
+LABELS = ("dataset", "accept_licence", "device", "command", "environment")
 """Arguments that change where and how a job is done, and not its result."""
 RL_LABELS = (*LABELS, "final", "policies", "demos", "scratch")
 LIBRARIES = ("stable_baselines3", "sb3_contrib", "d3rlpy")

@@ -1,0 +1,225 @@
+"""Policies that plan several actions at a time: what they share.
+
+A chunk is what `plan` returns: the actions of the present and the next `chunk - 1` control steps.
+The first `execute` of them are executed, then the policy plans anew; with `ensemble` every action
+is the weighted mean of all chunks that hold one for its step (Zhao et al., Learning fine-grained
+bimanual manipulation with low-cost hardware, RSS 2023, Algorithm 2).
+
+Interface:
+
+* `ChunkRecipe`: a recipe, and how far is planned.
+* `ChunkPolicy`: abstract. `policy.plan(features (B, h, F) | None, vectors (B, h, n), seed)` →
+  (B, chunk, 7) in [-1, 1], for observations of `history` moments h, the present one last.
+* A member implements `plan_normalised` and `chunk_loss`; actions come to it normalised over the
+  training frames, as LeRobot's normalisers do: "mean_std" or "min_max" (to [-1, 1]).
+
+The chunk's column is made by `surgicai_vision.training.chunks`; it is acted by
+`surgicai_vision.evaluation.chunk_agent`. Members: the distribution `lerobot_env_surgicai` offers
+LeRobot's `act`, `diffusion` and `vqbet`.
+"""
+
+import abc
+import copy
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from policies.base import ACTIONS, Inputs, Policy, Recipe, fed_vector
+from policies.layers import FeatureHeads
+from surgicai_vision.core.config import JSON
+from surgicai_vision.core.errors import InputError, check_name
+
+NORMALISATIONS = ("mean_std", "min_max")
+SMALLEST_RANGE = 1e-6
+"""An action that varies less is constant, and only its offset is removed."""
+
+
+@dataclass(frozen=True)
+class ChunkRecipe(Recipe):
+    """Settings of a policy that plans chunks.
+
+    Attributes:
+        chunk: actions that are planned at a time [control steps].
+        execute: how many of them are executed before the next plan.
+        history: observations that are seen, the present one last, `frame_stride` control steps
+            apart.
+        ensemble: average overlapping chunks by the weights exp(-ensemble · i), i = 0 for the
+            oldest; None executes the newest alone.
+        ema: largest decay of the moving average of the weights; 0 keeps the last weights.
+        clip_gradient: largest norm of a gradient; 0 clips none.
+        minutes: train for as many epochs as fit into so many minutes of one core, in the place of
+            `epochs`; 0 for `epochs`.
+        settings: fields of the network's own configuration.
+    """
+
+    batch_norm: bool = False
+    chunk: int = 25
+    execute: int = 10
+    history: int = 1
+    ensemble: float | None = None
+    ema: float = 0.0
+    clip_gradient: float = 0.0
+    minutes: float = 0.0
+    settings: dict[str, JSON] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.execute <= self.chunk:
+            raise InputError(f"execute is {self.execute}; allowed: 1 to chunk, {self.chunk}.")
+        if self.history < 1:
+            raise InputError(f"history is {self.history}; it must be at least 1.")
+        if not 0 <= self.ema < 1:
+            raise InputError(f"ema is {self.ema}; allowed: 0 to below 1.")
+        if not (self.clip_gradient >= 0 and self.minutes >= 0):
+            raise InputError(
+                f"clip_gradient is {self.clip_gradient}, minutes {self.minutes}; at least 0."
+            )
+        if not self.proprioception and not self.privileged:
+            raise InputError("A policy that plans chunks needs its state; keep proprioception.")
+
+
+class ChunkPolicy(Policy, abc.ABC):
+    """Base of the policies that plan chunks.
+
+    Args:
+        recipe: its settings.
+        visual: shape of each view's feature.
+        normalisation: how actions are normalised, one of `NORMALISATIONS`.
+
+    Attributes:
+        chunk, execute, ensemble: as in the recipe.
+        spacing: control steps from one observation of the history to the next.
+        heads: what takes in the features.
+    """
+
+    action_centre: torch.Tensor
+    action_scale: torch.Tensor
+
+    def __init__(
+        self, recipe: ChunkRecipe, visual: tuple[tuple[int, ...], ...], normalisation: str
+    ):
+        super().__init__(Inputs(visual, fed_vector(recipe)))
+        check_name("normalisation", normalisation, NORMALISATIONS)
+        self.history = recipe.history
+        self.averaging = recipe.ema
+        self.clip = recipe.clip_gradient
+        self.chunk = recipe.chunk
+        self.execute = recipe.execute
+        self.ensemble = recipe.ensemble
+        self.spacing = recipe.frame_stride
+        self.heads = FeatureHeads(recipe, self.inputs)
+        self._normalisation = normalisation
+        self.register_buffer("action_centre", torch.zeros(ACTIONS))
+        self.register_buffer("action_scale", torch.ones(ACTIONS))
+
+    @abc.abstractmethod
+    def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+        """Return normalised actions (B, at least chunk, 7), the present step's first.
+
+        Args:
+            visual: what the heads leave, (B, history, heads.dim).
+            vector: what is fed beside the features, normalised, (B, history, n).
+        """
+
+    @abc.abstractmethod
+    def chunk_loss(
+        self,
+        visual: torch.Tensor,
+        vector: torch.Tensor,
+        actions: torch.Tensor,
+        is_pad: torch.Tensor,
+    ) -> torch.Tensor:
+        """Return the loss (scalar).
+
+        Args:
+            visual, vector: as in `plan_normalised`.
+            actions: demonstrated and normalised, (B, T, 7), of the plug-in's `offsets`.
+            is_pad: (B, T) bool: where the demonstration holds no such step.
+        """
+
+    def measure(self, target: torch.Tensor) -> None:
+        """Store the statistics of the actions over the training frames; target (N, T, 8)."""
+        actions = target[..., :ACTIONS][target[..., ACTIONS] == 0].double()
+        if self._normalisation == "mean_std":
+            centre = actions.mean(0)
+            scale = actions.std(0, correction=0)
+        else:
+            low = actions.amin(0)
+            high = actions.amax(0)
+            centre = (low + high) / 2
+            scale = (high - low) / 2
+        self.action_centre.copy_(centre)
+        self.action_scale.copy_(torch.where(scale > SMALLEST_RANGE, scale, torch.ones_like(scale)))
+
+    def forward(self, observed: torch.Tensor) -> torch.Tensor:
+        """Return the first planned actions (B, 7) for normalised inputs (B, [history,] dim)."""
+        with torch.random.fork_rng(devices=_cuda_of(observed)):
+            torch.manual_seed(0)
+            return self._chunks(observed)[:, 0]
+
+    def loss(self, observed: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Return the loss for normalised inputs (B, [history,] dim) and chunks (B, T, 8)."""
+        visual, vector = self._seen(observed)
+        actions = (target[..., :ACTIONS] - self.action_centre) / self.action_scale
+        return self.chunk_loss(visual, vector, actions, target[..., ACTIONS] > 0)
+
+    @final
+    @torch.inference_mode()
+    def plan(
+        self,
+        features: NDArray[np.float32] | None,
+        vectors: NDArray[np.float32],
+        seed: int,
+    ) -> NDArray[np.float32]:
+        """Return the chunks of a batch of histories.
+
+        Args:
+            features: (B, history, `inputs.features`); None without views.
+            vectors: (B, history, n), what `inputs.vector` names.
+            seed: of what a policy that samples draws.
+
+        Returns:
+            (B, chunk, 7) float32 in [-1, 1].
+
+        Raises:
+            InputError: arrays of other shapes than the policy was trained on, or not finite.
+        """
+        if vectors.shape[1:2] != (self.history,):
+            raise InputError(
+                f"The policy sees {self.history} moments, got vectors of {vectors.shape}."
+            )
+        flat = self._observed(
+            None if features is None else features.reshape(-1, features.shape[-1]),
+            vectors.reshape(-1, vectors.shape[-1]),
+        )
+        observed = torch.from_numpy(flat).to(self.input_mean).unflatten(0, (-1, self.history))
+        with torch.random.fork_rng(devices=_cuda_of(self.input_mean)):
+            torch.manual_seed(seed)
+            chunks = self._chunks(self.normalise(observed))
+        return np.asarray(chunks.cpu().numpy(), np.float32)
+
+    def _chunks(self, observed: torch.Tensor) -> torch.Tensor:
+        """Return chunks (B, chunk, 7) in [-1, 1] for normalised inputs (B, [history,] dim)."""
+        planned = self.plan_normalised(*self._seen(observed.to(self.input_mean.dtype)))
+        actions = planned[:, : self.chunk] * self.action_scale + self.action_centre
+        return actions.clamp(-1.0, 1.0)
+
+    def _seen(self, observed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return what the heads leave and the vector, both (B, history, …)."""
+        if observed.ndim == 2:  # a single moment, seen ever since
+            observed = observed[:, None].expand(-1, self.history, -1)
+        visual, vector = self.heads(observed.flatten(0, 1))
+        moments = observed.shape[:2]
+        return visual.unflatten(0, moments), vector.unflatten(0, moments)
+
+    def _copy_to_act(self) -> Policy:
+        """Return the copy that acts: as it was trained, for samplers know no other precision."""
+        return copy.deepcopy(self).cpu()
+
+
+def _cuda_of(tensor: torch.Tensor) -> list[torch.device]:
+    """Return the CUDA devices whose random state a computation on `tensor` draws from."""
+    return [tensor.device] if tensor.device.type == "cuda" else []

@@ -1,0 +1,148 @@
+"""A policy that plans chunks, in an evaluation.
+
+Interface:
+
+* `ChunkAgent(policy, senses)`: an agent; `senses` is the same policy's `PolicyAgent`, which reads
+  vectors and features and never acts.
+
+Each slot plans by itself, in a batch of one and with random numbers of its own seed and step, so
+that a result depends neither on the batch nor on the processes. An image is encoded only when a
+plan needs it. `restart` forgets what is planned.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.chunks import ChunkPolicy
+from surgicai_vision.evaluation.agent import Actions, Agent, FeatureTable, Observation, Robot
+from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.training.threads import one_thread
+
+SEED_STRIDE = 1_000_003
+"""A prime beyond any step limit: no two steps of two episodes draw the same numbers."""
+
+
+@dataclass
+class _Episode:
+    """What a slot remembers.
+
+    Attributes:
+        seed: the episode's.
+        tick: control steps since its subtask began.
+        past: the last observations with what stood beside them, the present one last.
+        plans: (tick at which it was made, its actions (chunk, 7)), the oldest first.
+    """
+
+    seed: int
+    past: deque[tuple[Observation, NDArray[np.float32]]]
+    tick: int = 0
+    plans: list[tuple[int, NDArray[np.float32]]] = field(default_factory=list)
+
+
+@final
+class ChunkAgent(Agent):
+    """Plans a chunk of actions, executes its beginning and plans anew.
+
+    Args:
+        policy: plans.
+        senses: the same policy's eyes and proprioception.
+    """
+
+    def __init__(self, policy: ChunkPolicy, senses: PolicyAgent):
+        self.name = senses.name
+        self.cameras = senses.cameras
+        self.image_size = senses.image_size
+        self.depth = senses.depth
+        self.privileged = senses.privileged
+        self._policy = policy
+        self._senses = senses
+        self._sees = bool(senses.views)
+        self._episodes: dict[int, _Episode] = {}
+
+    def share(self, features: FeatureTable) -> None:
+        """Look features up in a table that agents share, and put new ones there."""
+        self._senses.share(features)
+
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
+        """Forget everything; random numbers are drawn from `seed`."""
+        moments = (self._policy.history - 1) * self._policy.spacing + 1
+        self._episodes[slot] = _Episode(seed, deque(maxlen=moments))
+
+    def restart(self, slot: int) -> None:
+        """Forget what the slot has planned and seen: its subtask begins."""
+        episode = self._episodes[slot]
+        episode.past.clear()
+        episode.plans.clear()
+        episode.tick = 0
+
+    def act(
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
+    ) -> Actions:
+        """Return the planned actions of this step (n, 7)."""
+        episodes = [self._episodes[slot] for slot in slots]
+        with one_thread():
+            ticks = [episode.tick for episode in episodes]
+            vectors = self._senses.vectors(robots, observations, ticks)
+            for episode, observation, vector in zip(episodes, observations, vectors, strict=True):
+                episode.past.append((observation, vector))
+            self._plan([episode for episode in episodes if self._is_due(episode)])
+        actions = [self._action(episode) for episode in episodes]
+        for episode in episodes:
+            episode.tick += 1
+        return np.stack(actions)
+
+    def _is_due(self, episode: _Episode) -> bool:
+        """Return True if a new plan is to be made now."""
+        return not episode.plans or episode.tick - episode.plans[-1][0] >= self._policy.execute
+
+    def _plan(self, episodes: Sequence[_Episode]) -> None:
+        """Plan for some slots; all their images are encoded at once."""
+        policy = self._policy
+        histories = [self._history(episode) for episode in episodes]
+        if not histories:
+            return
+        features = None
+        if self._sees:
+            seen = [observation for history in histories for observation, _ in history]
+            encoded = self._senses.features(seen)
+            assert encoded is not None, "a policy with views has an encoder"
+            features = encoded.reshape(len(histories), policy.history, -1)
+        for row, (episode, history) in enumerate(zip(episodes, histories, strict=True)):
+            vectors = np.stack([vector for _, vector in history])
+            chunk = policy.plan(
+                None if features is None else features[row : row + 1],
+                vectors[None],
+                episode.seed * SEED_STRIDE + episode.tick,
+            )[0]
+            kept = [(tick, plan) for tick, plan in episode.plans if episode.tick - tick < len(plan)]
+            episode.plans = [*kept, (episode.tick, chunk)]
+
+    def _history(self, episode: _Episode) -> list[tuple[Observation, NDArray[np.float32]]]:
+        """Return the moments that the policy sees, the present one last.
+
+        At the start the first stands for what came before.
+        """
+        past = episode.past
+        back = [
+            (len(past) - 1) - moment * self._policy.spacing
+            for moment in range(self._policy.history - 1, -1, -1)
+        ]
+        return [past[max(0, at)] for at in back]
+
+    def _action(self, episode: _Episode) -> NDArray[np.float32]:
+        """Return the action of this step (7,), of the newest plan or the mean of all."""
+        held = [
+            plan[episode.tick - tick]
+            for tick, plan in episode.plans
+            if episode.tick - tick < len(plan)
+        ]
+        if self._policy.ensemble is None:
+            return held[-1]
+        weights = np.exp(-self._policy.ensemble * np.arange(len(held)))
+        mean = np.average(np.stack(held), axis=0, weights=weights)
+        return mean.astype(np.float32)

@@ -1,0 +1,168 @@
+"""Chunks: the actions around each frame, as a column of a dataset.
+
+    timeline = timeline_of(whole)               # every control step's action
+    dataset = with_chunks(with_frame_stride(whole, 5), timeline, range(0, 25))
+    dataset.columns()[names.ACTION_CHUNK]       # (N, 25, 8) float32
+
+The last of the eight values is 1 where the demonstration holds no such step: there the nearest step
+it holds stands, as in LeRobot's `action_is_pad`. A chunk ends with its episode and, in a whole
+procedure, with its subtask, after which another arm acts.
+
+Frames may be few, actions are those of every control step. A dataset that was rendered with
+`--frame-stride` holds no others than its frames': the rest is read from its demonstrations, which
+are known by their hash.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.dataset.protocol import Dataset
+from surgicai_vision.dataset.reader import RenderedDataset
+from surgicai_vision.dataset.subset import DatasetSubset
+from surgicai_vision.demos.store import demos_digest, list_demos, read_demo
+
+BESIDE = "demos"
+"""Where the demonstrations of a dataset lie, beside it, in a sweep."""
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The actions of every control step of a dataset's demonstrations.
+
+    Attributes:
+        action: (M, 7) float32.
+        first: (M,) first step of each step's run: of its demonstration and its subtask.
+        last: (M,) last step of it.
+        step: (L,) the step of each frame of the dataset as it was rendered.
+    """
+
+    action: NDArray[np.float32]
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    step: NDArray[np.int64]
+
+
+def timeline_of(dataset: Dataset, demos: Path | None = None) -> Timeline:
+    """Return the timeline of a dataset, of all it was selected from.
+
+    Args:
+        dataset: any dataset.
+        demos: the folder of its demonstrations, for one that was rendered with fewer frames; by
+            default the one beside it, of a sweep.
+
+    Raises:
+        InputError: frames were left out, and the demonstrations are not there or other ones.
+    """
+    root = _root(dataset)
+    if root.fps == names.FPS:
+        columns = root.columns()
+        phase = columns.get(names.PHASE)
+        index = np.asarray(root.episode_index)
+        runs = _runs(index, np.zeros(len(index)) if phase is None else np.asarray(phase))
+        action = np.asarray(columns[names.ACTION], np.float32)
+        return Timeline(action, *runs, np.arange(root.length))
+    return _from_demos(root, demos or root.path.parent / BESIDE)
+
+
+def _from_demos(dataset: Dataset, folder: Path) -> Timeline:
+    """Return the timeline of a dataset whose demonstrations lie in `folder`."""
+    need = (
+        f"{dataset.path} holds {dataset.fps} frames a second, and a policy that plans chunks "
+        f"learns from the action of every control step, {names.FPS} a second"
+    )
+    try:
+        paths = list_demos(folder)
+    except (BadFile, InputError) as error:
+        raise InputError(f"{need}; name its demonstrations with --demos DIR ({error})") from None
+    if not isinstance(dataset, RenderedDataset) or (
+        demos_digest(paths) != dataset.meta["demos_digest"]
+    ):
+        raise InputError(f"{need}; {folder} holds other demonstrations. Give its own by --demos.")
+    shown = [read_demo(path) for path in paths]
+    lengths = np.array([len(demo) for demo in shown])
+    begins = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    runs = _runs(
+        np.repeat(np.arange(len(shown)), lengths), np.concatenate([demo.phase for demo in shown])
+    )
+    seconds = np.asarray(dataset.columns()["timestamp"], np.float64)
+    within = np.rint(seconds * names.FPS).astype(np.int64)
+    step = begins[np.asarray(dataset.demonstration_index)] + within
+    return Timeline(np.concatenate([demo.action for demo in shown]), *runs, step)
+
+
+def with_chunks(dataset: Dataset, timeline: Timeline, offsets: Sequence[int]) -> DatasetSubset:
+    """Return a dataset with the column `names.ACTION_CHUNK`, (N, T, 8) float32.
+
+    Args:
+        dataset: any frames of the dataset that `timeline` is of.
+        timeline: of `timeline_of`.
+        offsets: (T,) which actions a chunk holds, in control steps from the present one.
+    """
+    present = timeline.step[_rows(dataset)]
+    wanted = present[:, None] + np.asarray(offsets, np.int64)
+    held = np.clip(wanted, timeline.first[present, None], timeline.last[present, None])
+    is_pad = (wanted != held).astype(np.float32)
+    chunks = np.concatenate([timeline.action[held], is_pad[..., None]], axis=2)
+    return DatasetSubset(
+        dataset,
+        np.arange(dataset.length),
+        {"chunks": " ".join(map(str, offsets))},
+        added={names.ACTION_CHUNK: chunks},
+    )
+
+
+def _root(dataset: Dataset) -> Dataset:
+    """Return what a dataset was selected from, itself where it is whole."""
+    while isinstance(dataset, DatasetSubset):
+        dataset = dataset.whole
+    return dataset
+
+
+def _rows(dataset: Dataset) -> NDArray[np.int64]:
+    """Return where a dataset's frames are in its root, (N,)."""
+    rows = np.arange(dataset.length)
+    while isinstance(dataset, DatasetSubset):
+        rows = dataset.rows[rows]
+        dataset = dataset.whole
+    return rows
+
+
+def _runs(
+    episode: NDArray[np.generic], phase: NDArray[np.generic]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first and the last step of each step's run, (M,) each.
+
+    Args:
+        episode: (M,) episode of each step.
+        phase: (M,) its subtask.
+    """
+    breaks = (np.diff(episode) != 0) | (np.diff(phase) != 0)
+    starts = np.concatenate([[0], np.flatnonzero(breaks) + 1])
+    ends = np.concatenate([starts[1:] - 1, [len(episode) - 1]])
+    run = np.cumsum(np.concatenate([[0], breaks]))
+    return starts[run].astype(np.int64), ends[run].astype(np.int64)
+
+
+def earlier_rows(dataset: Dataset, moments: int) -> NDArray[np.int64]:
+    """Return which frames a policy with a history sees at each frame, (N, moments) int64.
+
+    The present frame is the last; at the start of a run the first stands for what came before.
+
+    Args:
+        dataset: its frames are evenly spaced within a run.
+        moments: observations that the policy sees.
+    """
+    index = np.asarray(dataset.episode_index)
+    times = np.rint(np.asarray(dataset.columns()["timestamp"], np.float64) * names.FPS)
+    breaks = (np.diff(index) != 0) | (np.diff(times) != names.FPS // dataset.fps)
+    starts = np.concatenate([[0], np.flatnonzero(breaks) + 1])
+    first = starts[np.cumsum(np.concatenate([[0], breaks]))]
+    wanted = np.arange(len(index))[:, None] - np.arange(moments)[::-1]
+    rows: NDArray[np.int64] = np.maximum(wanted, first[:, None]).astype(np.int64)
+    return rows

@@ -1,0 +1,260 @@
+"""Chunks of actions: their column, their policies, and how they are acted."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import final
+
+import numpy as np
+import pytest
+import torch
+from fake_dataset import DIM, FakeDataset, fake_procedures, features_of
+from torch import nn
+
+from policies.base import ACTIONS, VECTORS, Plugin
+from policies.chunks import ChunkPolicy, ChunkRecipe
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.executor import RunContext
+from surgicai_vision.dataset import open_dataset, render_demos
+from surgicai_vision.dataset.protocol import Dataset
+from surgicai_vision.dataset.subset import of_subtask, with_frame_stride
+from surgicai_vision.demos.record import record
+from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.evaluation.chunk_agent import ChunkAgent
+from surgicai_vision.training.averages import MovingAverage
+from surgicai_vision.training.chunks import earlier_rows, timeline_of, with_chunks
+from surgicai_vision.training.policies import POLICIES, load_policy
+from surgicai_vision.training.train import epochs_within, train
+
+QUICK = ChunkRecipe(epochs=8, batch_size=32, learning_rate=1e-2, chunk=4, execute=2, history=2)
+
+
+@final
+class Linear(ChunkPolicy):
+    """A chunk that is linear in what is seen, with a draw of its own on top."""
+
+    def __init__(self, recipe: ChunkRecipe, visual: tuple[tuple[int, ...], ...]):
+        super().__init__(recipe, visual, "min_max")
+        width = self.history * (self.heads.dim + VECTORS[names.STATE])
+        self.layer = nn.Linear(width, self.chunk * ACTIONS)
+
+    def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+        seen = torch.cat([visual, vector], dim=2).flatten(1)
+        chunk = self.layer(seen).unflatten(1, (self.chunk, ACTIONS))
+        return chunk + 0.01 * torch.rand(())
+
+    def chunk_loss(
+        self,
+        visual: torch.Tensor,
+        vector: torch.Tensor,
+        actions: torch.Tensor,
+        is_pad: torch.Tensor,
+    ) -> torch.Tensor:
+        error = (self.plan_normalised(visual, vector) - actions) ** 2
+        return (error * ~is_pad[..., None]).mean()
+
+
+LINEAR = Plugin(
+    "linear", ChunkRecipe, Linear, names.ACTION_CHUNK, lambda recipe: range(recipe.chunk)
+)
+
+
+@pytest.fixture
+def registered(monkeypatch: pytest.MonkeyPatch):
+    POLICIES.register("linear", LINEAR)
+    yield
+    POLICIES.unregister("linear")
+
+
+def recorded(episodes: int = 5, steps: int = 40) -> FakeDataset:
+    dataset = FakeDataset(episodes, steps)
+    dataset._columns["timestamp"] = np.tile(np.arange(steps) / names.FPS, episodes)
+    return dataset
+
+
+def chunked(stride: int = 1) -> tuple[FakeDataset, Dataset]:
+    whole = recorded()
+    return whole, with_chunks(with_frame_stride(whole, stride), timeline_of(whole), range(4))
+
+
+@pytest.mark.parametrize("offsets", [range(6), range(-2, 5)])
+@pytest.mark.parametrize("stride", [1, 5])
+def test_a_chunk_holds_the_actions_of_its_episode(offsets: range, stride: int) -> None:
+    whole = recorded(3, 17)
+    dataset = with_frame_stride(whole, stride)
+    column = with_chunks(dataset, timeline_of(dataset), offsets).columns()[names.ACTION_CHUNK]
+    actions = whole.columns()[names.ACTION]
+    steps = [step for step in range(whole.length) if step % 17 % stride == 0]
+    assert column.shape == (len(steps), len(offsets), ACTIONS + 1)
+    for row, step in enumerate(steps):
+        first = step // 17 * 17
+        for place, offset in enumerate(offsets):
+            inside = first <= step + offset < first + 17
+            nearest = min(max(step + offset, first), first + 16)
+            np.testing.assert_array_equal(column[row, place, :ACTIONS], actions[nearest])
+            assert column[row, place, ACTIONS] == (not inside)
+
+
+def test_a_chunk_ends_with_its_subtask() -> None:
+    whole = fake_procedures(2, 10)
+    part = of_subtask(whole, "insert")
+    column = with_chunks(part, timeline_of(part), range(3)).columns()[names.ACTION_CHUNK]
+    assert column[9, :, ACTIONS].tolist() == [0, 1, 1]
+    assert column[7, :, ACTIONS].tolist() == [0, 0, 0]
+    actions = whole.columns()[names.ACTION][20:30]
+    np.testing.assert_array_equal(column[:8, 2, :ACTIONS], actions[2:])
+
+
+def test_a_dataset_of_few_frames_has_its_actions_in_its_demonstrations(tmp_path: Path) -> None:
+    record(TaskConfig("place"), episodes=2, out=tmp_path / "demos", context=RunContext(0))
+    for stride, out in ((1, "whole"), (5, "few")):
+        render_demos(
+            tmp_path / "demos",
+            tmp_path / out,
+            views=("back",),
+            size=16,
+            frame_stride=stride,
+            context=RunContext(0),
+        )
+    whole, few = (open_dataset(tmp_path / name) for name in ("whole", "few"))
+    strided = with_frame_stride(whole, 5)
+    expected = with_chunks(strided, timeline_of(strided), range(-1, 9)).columns()
+    found = with_chunks(few, timeline_of(few), range(-1, 9)).columns()
+    np.testing.assert_array_equal(found[names.ACTION_CHUNK], expected[names.ACTION_CHUNK])
+    record(TaskConfig("place"), episodes=1, out=tmp_path / "others", context=RunContext(0))
+    with pytest.raises(InputError, match="other demonstrations"):
+        timeline_of(few, tmp_path / "others")
+    with pytest.raises(InputError, match="--demos"):
+        timeline_of(few, tmp_path / "nowhere")
+
+
+def test_earlier_rows_stay_within_their_episode() -> None:
+    dataset = with_frame_stride(recorded(2, 11), 5)
+    assert earlier_rows(dataset, 2).tolist() == [[0, 0], [0, 1], [1, 2], [3, 3], [3, 4], [4, 5]]
+
+
+def test_a_chunk_policy_trains_and_reads_back(tmp_path: Path, registered: None) -> None:
+    recipe = replace(QUICK, frame_stride=5, ema=0.9, clip_gradient=1.0)
+    whole, dataset = chunked(5)
+    rows = np.flatnonzero(np.arange(whole.length) % 40 % 5 == 0)
+    entry = features_of(whole).part(rows, dataset.fingerprint)
+    checkpoint = train(dataset, [entry], LINEAR, recipe, out=tmp_path / "a")
+    assert checkpoint.train_losses[-1] < checkpoint.train_losses[0]
+    policy = load_policy(tmp_path / "a")
+    features = np.random.default_rng(0).normal(size=(3, 2, DIM)).astype(np.float32)
+    vectors = np.zeros((3, 2, 7), np.float32)
+    chunk = policy.plan(features, vectors, 5)
+    assert chunk.shape == (3, 4, 7) and chunk.dtype == np.float32 and np.abs(chunk).max() <= 1
+    assert np.array_equal(chunk, policy.plan(features, vectors, 5)), "a seed's draw is its own"
+    assert not np.array_equal(chunk, policy.plan(features, vectors, 6))
+    actions = dataset.columns()[names.ACTION_CHUNK]
+    kept = ~np.isin(dataset.episode_index, checkpoint.validation_episodes)
+    held = actions[kept][actions[kept][..., ACTIONS] == 0][:, :ACTIONS]
+    np.testing.assert_allclose(policy.action_centre, (held.min(0) + held.max(0)) / 2, atol=1e-6)
+    np.testing.assert_allclose(policy.action_scale, np.ptp(held, axis=0) / 2, atol=1e-6)
+
+
+def test_a_broken_off_training_ends_the_same(tmp_path: Path, registered: None) -> None:
+    recipe = replace(QUICK, ema=0.99, schedule="one_cycle")
+    whole, dataset = chunked()
+    entry = features_of(whole).part(np.arange(whole.length), dataset.fingerprint)
+    train(dataset, [entry], LINEAR, recipe, out=tmp_path / "whole")
+
+    def stop(epoch: int, _: dict[str, float]) -> None:
+        if epoch == 6:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, [entry], LINEAR, recipe, out=tmp_path / "broken", log=stop)
+    train(dataset, [entry], LINEAR, recipe, out=tmp_path / "broken")
+    one, other = (load_policy(tmp_path / name).state_dict() for name in ("whole", "broken"))
+    assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+def test_a_budget_is_counted_in_epochs(registered: None) -> None:
+    whole, dataset = chunked()
+    entry = features_of(whole).part(np.arange(whole.length), dataset.fingerprint)
+    short, long = (
+        epochs_within(minutes, dataset, [entry], LINEAR, QUICK) for minutes in (0.0001, 1.0)
+    )
+    assert short == 1 and long > 10
+
+
+def test_the_average_is_the_weighted_sum_of_all_weights() -> None:
+    layer = nn.Linear(1, 1, bias=False)
+    with torch.no_grad():
+        layer.weight.fill_(1.0)
+    average = MovingAverage(layer, 0.7)
+    expected = 1.0
+    for update, value in enumerate([2.0, -1.0, 4.0, 0.5, 3.0], 1):
+        with torch.no_grad():
+            layer.weight.fill_(value)
+        average.update(layer)
+        decay = min(0.7, 1 - (1 + update) ** -0.75)
+        expected = decay * expected + (1 - decay) * value
+    with average.applied(layer):
+        assert layer.weight.item() == pytest.approx(expected)
+    assert layer.weight.item() == 3.0
+
+
+def acting(recipe: ChunkRecipe) -> tuple[ChunkAgent, list[float]]:
+    """Return an agent of a policy without images, and the seeds it plans with."""
+    policy = Linear(recipe, ())
+    seeds: list[float] = []
+
+    def plan(features: None, vectors: np.ndarray, seed: int) -> np.ndarray:
+        seeds.append(seed)
+        start = vectors[0, :, 0]
+        steps = np.arange(recipe.chunk)[None, :, None]
+        return (start[-1] * 100 + start[0] * 10 + steps * np.ones((1, 1, 7))).astype(np.float32)
+
+    policy.plan = plan  # type: ignore[method-assign,assignment]
+    return ChunkAgent(policy, PolicyAgent("linear", policy, None, (), 32)), seeds
+
+
+def moved(agent: ChunkAgent, steps: int) -> list[float]:
+    """Return the first value of each action while the arm moves by 1 a step."""
+    arm = SimpleNamespace(agent_pos=lambda: np.full(7, arm.step, np.float32), step=0)
+    actions = []
+    for arm.step in range(steps):
+        actions.append(float(agent.act([0], [arm], [{}])[0, 0]))
+    return actions
+
+
+def test_the_beginning_of_a_chunk_is_executed_and_then_planned_anew() -> None:
+    agent, seeds = acting(replace(QUICK, execute=3, frame_stride=2))
+    agent.reset(0, None, 7)
+    # Plans at 0, 3 and 6; the earlier observation is two steps back, at the start the first.
+    assert moved(agent, 7) == [0, 1, 2, 310, 311, 312, 640]
+    assert len(set(seeds)) == 3
+    agent.restart(0)
+    assert moved(agent, 2) == [0, 1]
+    agent.reset(0, None, 7)
+    moved(agent, 7)
+    assert seeds[:3] == seeds[-3:]
+
+
+def test_an_ensemble_is_the_weighted_mean_of_the_plans() -> None:
+    agent, _ = acting(replace(QUICK, execute=2, chunk=4, ensemble=0.5, history=1))
+    agent.reset(0, None, 0)
+    actions = moved(agent, 4)
+    older, newer = 2.0, 220.0  # made at 0, and at 2 where the arm stands at 2
+    weight = np.exp(-0.5)
+    assert actions[2] == pytest.approx((older + weight * newer) / (1 + weight), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change", [{"execute": 5}, {"history": 0}, {"ema": 1.0}, {"proprioception": False}]
+)
+def test_a_recipe_refuses_what_cannot_be(change: dict[str, object]) -> None:
+    with pytest.raises(InputError):
+        replace(QUICK, **change)
+
+
+def test_no_tensor_is_left_where_the_policy_was() -> None:
+    policy = Linear(QUICK, ((DIM,),)).to("meta")
+    observed = torch.empty(3, 2, policy.inputs.dim, device="meta")
+    target = torch.empty(3, 4, ACTIONS + 1, device="meta")
+    assert policy.loss(policy.normalise(observed), target).device.type == "meta"
