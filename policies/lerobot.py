@@ -28,7 +28,7 @@ def horizon(recipe: ChunkRecipe) -> int:
     widths = recipe.settings.get("down_dims", DOWN_DIMS)
     if not isinstance(widths, list | tuple):
         raise InputError(f"settings: down_dims is {widths}; it must be a list of widths.")
-    halvings = 2 ** len(widths)
+    halvings: int = 2 ** len(widths)
     return -(-(recipe.chunk + recipe.history - 1) // halvings) * halvings
 
 

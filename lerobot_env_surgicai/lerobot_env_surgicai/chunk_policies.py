@@ -31,7 +31,7 @@ from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import nn
 
-from policies.base import ACTIONS, VECTORS, Recipe
+from policies.base import ACTIONS, Recipe
 from policies.chunks import ChunkPolicy, ChunkRecipe
 from policies.lerobot import horizon
 from surgicai_vision.core import names
@@ -51,7 +51,7 @@ class LeRobotChunks(ChunkPolicy, abc.ABC):
     def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
         assert isinstance(recipe, ChunkRecipe)
         super().__init__(recipe, visual, self.normalisation)
-        self.vector_dim = VECTORS[self.inputs.vector or names.STATE]
+        self.vector_dim = self.inputs.width
         self.seen_dim = self.heads.dim or self.vector_dim
         self.network = self.build(recipe)
 
@@ -264,6 +264,7 @@ def _config[Config: PreTrainedConfig](
     }
     action = {ACTION: PolicyFeature(FeatureType.ACTION, (ACTIONS,))}
     try:
-        return kind(**{**lists, **ours, "output_features": action, "device": "cpu"})
+        config: Config = kind(**{**lists, **ours, "output_features": action, "device": "cpu"})
     except (TypeError, ValueError, NotImplementedError) as error:
         raise InputError(f"LeRobot refuses the settings: {error}.") from None
+    return config

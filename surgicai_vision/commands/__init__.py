@@ -69,6 +69,8 @@ COMMANDS = MappingProxyType(
         "sweep": "Encode, train and evaluate every run of a grid.",
         "release": "Build the policies that come with the product, from nothing.",
         "report": "Write the report of stored results.",
+        "submit": "Make the row of an evaluation for the leaderboard.",
+        "leaderboard": "Check the rows that others measured and write their page.",
         "completion": "Print the script that completes commands and options in a shell.",
     }
 )

@@ -142,7 +142,7 @@ class ChunkAgent(Agent):
             if episode.tick - tick < len(plan)
         ]
         if self._policy.ensemble is None:
-            return held[-1]
+            newest: NDArray[np.float32] = held[-1]
+            return newest
         weights = np.exp(-self._policy.ensemble * np.arange(len(held)))
-        mean = np.average(np.stack(held), axis=0, weights=weights)
-        return mean.astype(np.float32)
+        return np.asarray(np.average(np.stack(held), axis=0, weights=weights), np.float32)

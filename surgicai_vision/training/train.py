@@ -396,7 +396,8 @@ class _Training:
         if self.seen is None:
             return self._observed(rows).to(self.device)
         moments = self.seen[rows]
-        return self._observed(moments.ravel()).unflatten(0, moments.shape).to(self.device)
+        observed: torch.Tensor = self._observed(moments.ravel()).unflatten(0, moments.shape)
+        return observed.to(self.device)
 
     def _measure(self) -> None:
         """Store mean and standard deviation of the inputs over the training frames."""
@@ -473,7 +474,9 @@ class _Training:
             observed: (B, inputs.dim), or (B, history, inputs.dim), each moment by its own draw.
         """
         if observed.ndim == 3:
-            return self._augmented(observed.flatten(0, 1)).unflatten(0, observed.shape[:2])
+            moments = self._augmented(observed.flatten(0, 1))
+            augmented: torch.Tensor = moments.unflatten(0, observed.shape[:2])
+            return augmented
         recipe = self.task.recipe
         inputs = self.policy.inputs
         if recipe.map_shift:

@@ -11,7 +11,7 @@ import torch
 from fake_dataset import DIM, FakeDataset, fake_procedures, features_of
 from torch import nn
 
-from policies.base import ACTIONS, VECTORS, Plugin
+from policies.base import ACTIONS, Plugin
 from policies.chunks import ChunkPolicy, ChunkRecipe
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
@@ -37,7 +37,7 @@ class Linear(ChunkPolicy):
 
     def __init__(self, recipe: ChunkRecipe, visual: tuple[tuple[int, ...], ...]):
         super().__init__(recipe, visual, "min_max")
-        width = self.history * (self.heads.dim + VECTORS[names.STATE])
+        width = self.history * (self.heads.dim + self.inputs.width)
         self.layer = nn.Linear(width, self.chunk * ACTIONS)
 
     def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:

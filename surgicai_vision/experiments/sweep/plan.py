@@ -156,7 +156,7 @@ def trained_by(experiment: Experiment, run: RunConfig) -> list[RunConfig]:
 
 def _check_acts(policy: str) -> None:
     """Refuse a policy that cannot be evaluated by itself."""
-    if policy in LEROBOT_POLICIES or policies.policy_plugin(policy).target == names.ACTION:
+    if policies.policy_plugin(policy).target != names.STAGE:
         return
     raise InputError(
         f"policy: '{policy}' chooses subtasks and does not act; it is evaluated over a policy for "

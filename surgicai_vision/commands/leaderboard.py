@@ -1,0 +1,50 @@
+"""`leaderboard`: check the rows that others measured and write them as one page."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.options import default_text
+
+app = App(
+    name="leaderboard",
+    help_epilogue="""\
+example:
+  surgicai-vision leaderboard rows --out leaderboard.html""",
+)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `leaderboard`.
+
+    Attributes:
+        dir: Folder with the files that `submit` wrote, at any depth.
+        out: The page to write.
+    """
+
+    dir: Annotated[Path, Parameter(metavar="DIR")] = field(kw_only=False)
+    out: Annotated[
+        Path | None, Parameter(metavar="FILE.html"), default_text("DIR/leaderboard.html")
+    ] = None
+
+
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
+    """Write the page; exit 1 where a row is not taken."""
+    from surgicai_vision.report.leaderboard import write_leaderboard
+
+    board = write_leaderboard(options.dir, options.out or options.dir / "leaderboard.html")
+    for name, reason in board.refused.items():
+        console.say(f"not taken: {name}: {reason}")
+    console.say(f"{len(board.taken)} rows: {board.page}")
+    return {
+        "page": str(board.page),
+        "taken": len(board.taken),
+        "refused": board.refused,
+        "exit_code": 1 if board.refused else 0,
+    }

@@ -1,0 +1,66 @@
+"""`submit`: make the row of an evaluation for the leaderboard."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter, validators
+
+from surgicai_vision.commands.console import Console
+from surgicai_vision.commands.options import default_text
+from surgicai_vision.core.files import check_output
+
+app = App(
+    name="submit",
+    help_epilogue="""\
+example:
+  surgicai-vision evaluate outputs/train/mine --episodes 100 --out outputs/evaluate/mine
+  surgicai-vision submit outputs/evaluate/mine --name "My policy" --by "Jane Doe" --minutes 25""",
+)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `submit`.
+
+    Attributes:
+        evaluation: Folder that `evaluate --out` or a sweep wrote.
+        name: The policy, as the page is to call it.
+        by: Who measured it.
+        link: Where its code or paper is, https://…
+        minutes: Minutes of training.
+        hardware: What it was trained on.
+        note: Whatever a reader must know.
+        out: The file to write.
+    """
+
+    evaluation: Annotated[Path, Parameter(metavar="DIR")] = field(kw_only=False)
+    name: str
+    by: str
+    link: str = ""
+    minutes: Annotated[float | None, Parameter(validator=validators.Number(gte=0))] = None
+    hardware: str = ""
+    note: str = ""
+    out: Annotated[
+        Path | None,
+        Parameter(metavar="FILE.json"),
+        default_text("<task>-<digest>.json"),
+    ] = None
+
+
+@app.default
+def run(options: Options, *, console: Console) -> dict[str, object]:
+    """Check the evaluation as the leaderboard will and write its row."""
+    from surgicai_vision.report.leaderboard import Entry, make_row, write_row
+
+    entry = Entry(
+        options.name, options.by, options.link, options.minutes, options.hardware, options.note
+    )
+    row = make_row(options.evaluation, entry)
+    out = options.out or Path(f"{row.run.task}-{row.digest[:12]}.json")
+    check_output(out)
+    write_row(row, out)
+    console.say(f"row: {out}")
+    console.say("next: send it as docs/submit.md says")
+    return {"row": str(out), "digest": row.digest, "successes": sum(row.successes)}
