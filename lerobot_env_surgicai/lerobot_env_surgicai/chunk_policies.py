@@ -176,7 +176,7 @@ class VqBet(LeRobotChunks):
                 "predicts the actions of every moment it sees: take history=1 or frame_stride=1."
             )
         dim = self.seen_dim + self.seen_dim % 2  # twice a number of key points, to LeRobot
-        side = 32  # of an image that nobody sees
+        side = 64  # of an image that nobody sees, though an encoder is built for it
         config = _config(
             VQBeTConfig,
             recipe,
