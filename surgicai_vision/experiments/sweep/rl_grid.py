@@ -211,6 +211,10 @@ class RLGrid:
             for task in names.SUBTASKS
         }
 
+    def needs(self, run: RunConfig) -> str:
+        """Return "": a grid lists nothing that it cannot run."""
+        return ""
+
     def evaluated(self, run: RunConfig) -> Evaluated:
         """Return how a run is evaluated: in the env it was trained in."""
         return Evaluated({}, {"termination": run.termination} if run.is_hierarchical else {})
