@@ -37,6 +37,8 @@ from surgicai_vision.core.instructions import INSTRUCTION_BANKS, STANDARD, draw_
 from surgicai_vision.core.tasks import env_id, task_names
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.features import encoders
+from surgicai_vision.training import released
+from surgicai_vision.training.checkpoint import read_checkpoint
 
 AGENT_POS = "agent_pos"
 FEATURES = "environment_state"
@@ -50,12 +52,14 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
     """An env of surgicai-vision.
 
     What is None is taken from `dataset`, and without one is the default of `TaskConfig`, two views
-    of 224 px, and images. After that nothing is None but `encoder`, and `dataset` is forgotten: a
-    saved configuration is whole.
+    of 224 px, and images. After that nothing is None but `encoder`; `dataset` and `checkpoint` are
+    forgotten: a saved configuration is whole.
 
     Attributes:
         task: one of `tasks.task_names()`.
         dataset: a dataset of ours.
+        checkpoint: a checkpoint of `surgicai-vision train`, or released:NAME, to take task, views
+            and image size from, in the place of `dataset`.
         cameras: views.
         image_size: height and width of an image [px].
         step: step-size preset.
@@ -80,6 +84,7 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
     task: str | None = None
     fps: int = names.FPS
     dataset: str | None = None
+    checkpoint: str | None = None
     cameras: list[str] | None = None
     image_size: int | None = None
     step: str | None = None
@@ -124,7 +129,7 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
         self.features_map = {key: renamed.get(key, key) for key in self.features}
 
     def _fill(self, config: TaskConfig, cameras: list[str], image_size: int) -> None:
-        """Fill what is None from the dataset, or from the arguments where there is none."""
+        """Fill what is None from the dataset or the checkpoint, else from the arguments."""
         features: dict[str, PolicyFeature] = {}
         if self.dataset:
             dataset = open_dataset(Path(self.dataset))
@@ -132,6 +137,11 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
             image_size = dataset.image_size
             features = dataset.meta.get("features") or {}
             cameras = list(features.get("views", dataset.views))
+        if self.checkpoint:
+            trained = read_checkpoint(released.resolve(self.checkpoint))
+            config = trained.task
+            image_size = trained.image_size
+            cameras = list(dict.fromkeys(map(names.camera_of, trained.views))) or cameras
         for key in TASK_FIELDS:
             if getattr(self, key) is None:
                 setattr(self, key, getattr(config, key))
@@ -141,6 +151,7 @@ class SurgicaiEnv(EnvConfig):  # type: ignore[misc]  # mypy skips LeRobot
             self.encoder = features["encoder"]
             self.encoder_sha256 = features["weights_sha256"]
         self.dataset = None
+        self.checkpoint = None
 
     @property
     def views(self) -> tuple[str, ...]:

@@ -676,6 +676,11 @@ def test_a_policy_of_lerobot_trains_on_cached_features(
     name: str, dataset: Path, tmp_path: Path
 ) -> None:
     """From the cache to `evaluate`: a checkpoint of ours, read back and acted chunk by chunk."""
+    from lerobot.envs.utils import preprocess_observation
+    from lerobot_env_surgicai.modeling_surgicai_checkpoint import SurgicaiCheckpointPolicy
+
+    from lerobot_env_surgicai import SurgicaiCheckpointConfig, SurgicaiEnv
+
     text = yaml.safe_dump(to_mapping(chunk_recipe(name, ema=0.9, map_head="convolutions")))
     (tmp_path / "recipe.yaml").write_text(text, encoding="utf-8")
     run = RunConfig(
@@ -692,6 +697,14 @@ def test_a_policy_of_lerobot_trains_on_cached_features(
     one, other = (
         evaluate(spec.make_agent, config, [7, 8], workers=1, batch=batch) for batch in (1, 2)
     )
+    # The same agent under lerobot-eval, which may not see more than its env tells.
+    config = SurgicaiCheckpointConfig(checkpoint=str(tmp_path / "policy"), device="cpu")
+    agent = SurgicaiCheckpointPolicy(config)
+    env = SurgicaiEnv(checkpoint=str(tmp_path / "policy"))
+    assert (env.task, env.views, env.image_size) == (TASK, ("back",), SIZE)
+    shown = env.create_envs(1)["surgicai"][0].reset(seed=[7])[0]
+    action = agent.select_action(preprocess_observation(shown))
+    assert action.shape == (1, 7) and action.abs().max() <= 1
     told = [[repr(episode.row) for episode in episodes] for episodes in (one, other)]  # of NaN too
     assert told[0] == told[1]
 
