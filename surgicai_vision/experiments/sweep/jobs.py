@@ -75,7 +75,7 @@ def train_policy(
     train_run(_run(run), data, folder, silent_stage, weights, subtask=subtask, device=device)
 
 
-def train_andevaluate_as(
+def train_and_evaluate(
     folder: Path,
     run: Table,
     final: str,
