@@ -7,10 +7,12 @@
     client.step(["/PSM1/servo_cp"])      # only where the simulation's clock is ours
 
 The topics are a dVRK's (`robot.topics`); a `RenamedTransport` renames them where a robot's differ.
-What is sent has its own stamp; what is received is as old as its arrival here, since clocks differ.
+What is sent has its own stamp. What is received is as old as its arrival here, since clocks differ,
+and by as much as its stamp lags behind the least late message of the last minutes.
 """
 
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +32,8 @@ POLL_S = 0.005
 CONNECT_S = 20.0
 """Time in which a robot must be found [s]."""
 ASK_AGAIN_S = 0.5
+DRIFT = 1e-4
+"""How fast clocks may drift apart [s/s]; quartzes do by less than 1e-4."""
 _DUE = (
     *("measured_js", "setpoint_js", "measured_cp", "setpoint_cp", "image_raw", "compressed"),
     "judgement",
@@ -56,10 +60,39 @@ class ClientConfig:
 
 @dataclass(frozen=True)
 class Heard:
-    """A message and when it arrived here [s, monotonic]."""
+    """A message that came.
+
+    Attributes:
+        message: it.
+        arrived: when it arrived here [s, monotonic].
+        lag: how much later than the least late ones of its topic [s].
+    """
 
     message: Message
     arrived: float
+    lag: float = 0.0
+
+
+class _Lag:
+    """How much later than usual the messages of one topic come.
+
+    The sender's clock is another one: its stamps differ from arrivals by the difference of the
+    clocks and by the delay. The least difference there was is taken for no delay; it may rise by
+    `DRIFT`, as clocks drift.
+    """
+
+    def __init__(self) -> None:
+        self._least = math.inf
+        self._last = 0.0
+
+    def of(self, message: Message, arrived: float) -> float:
+        """Return the lag of a message that arrived at a time [s]; 0 without a stamp."""
+        if isinstance(message, String) or not message.header.stamp:
+            return 0.0
+        difference = arrived - message.header.stamp / 1e9
+        self._least = min(difference, self._least + DRIFT * (arrived - self._last))
+        self._last = arrived
+        return difference - self._least
 
 
 @final
@@ -89,6 +122,7 @@ class Client:
             said += [topics.STEP, topics.RESET, topics.ENTER]
         for topic in heard:
             self._inboxes[topic.name] = transport.inbox(topic)
+        self._lags = {name: _Lag() for name in self._inboxes}
         self._said = said
         for topic in said:
             self._publishers[topic.name] = transport.publisher(topic)
@@ -126,7 +160,9 @@ class Client:
             for received in inbox():
                 before = self._newest.get(name)
                 if before is None or not _is_older(received.message, before.message):
-                    self._newest[name] = Heard(received.message, time.monotonic())
+                    now = time.monotonic()
+                    lag = self._lags[name].of(received.message, now)
+                    self._newest[name] = Heard(received.message, now, lag)
 
     def image_topic(self, view: str) -> str:
         """Return the topic on which a view's images come."""
@@ -137,9 +173,9 @@ class Client:
         return self._newest.get(topic)
 
     def age(self, topic: str) -> float:
-        """Return for how long nothing has come on a topic [s], infinity before the first."""
+        """Return how old the newest message of a topic is [s], infinity before the first."""
         heard = self._newest.get(topic)
-        return float("inf") if heard is None else time.monotonic() - heard.arrived
+        return math.inf if heard is None else time.monotonic() - heard.arrived + heard.lag
 
     def stamp(self) -> int:
         """Return the present time [ns since the epoch], later than any before."""

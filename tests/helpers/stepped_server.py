@@ -21,11 +21,11 @@ def env_of(task):
 class Served(MemoryTransport):
     """A transport at whose other end a stepped server is asked whenever the client waits."""
 
-    def __init__(self, task, views=(), recordings=None, tell=None):
+    def __init__(self, task, views=(), recordings=None, tell=None, size=64):
         super().__init__()
         self.robot = SimulatedRobot(env_of(task))
         self.robot.reset(SEED)
-        config = ServeConfig("stepped", views=views, size=(64, 64))
+        config = ServeConfig("stepped", views=views, size=(size, size))
         recorder = Recorder(self.robot, recordings, tell) if recordings else None
         self.server = Server(self.robot, self, config, recorder)
         self.server.__enter__()
