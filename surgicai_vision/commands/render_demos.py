@@ -46,6 +46,7 @@ class Options:
         episodes: Without --demos, demonstrations to record.
         seed: Without --demos, seed of the first start.
         view: Views to render.
+        layout: Columns of the dataset: ours, or both arms' poses as Open-H-Embodiment has them.
         size: Height and width of images [px].
         depth: Render depth beside RGB.
         segmentation: Render the parts beside RGB.
@@ -65,7 +66,10 @@ class Options:
     task: Annotated[str | None, TASK, default_text("grasp")] = None
     episodes: Annotated[int | None, COUNT, default_text("50")] = None
     seed: Annotated[int, NOT_NEGATIVE] = names.TRAIN_SEED
-    view: Annotated[tuple[str, ...], VIEWS] = ("front", "back")
+    view: Annotated[
+        tuple[str, ...], VIEWS, default_text("front,back; of open-h its endoscope and wrists")
+    ] = ()
+    layout: Annotated[str, Parameter(choices=("surgicai", "open-h"))] = "surgicai"
     size: Annotated[int, IMAGE_SIZE] = 224
     depth: bool = False
     segmentation: bool = False
@@ -80,7 +84,9 @@ class Options:
     video: Annotated[str | None, VIDEO, default_text("lossless images")] = None
     workers: Annotated[int, COUNT] = folders.CORES
     executor: Annotated[str, EXECUTOR] = "local"
-    out: Annotated[Path | None, DIRECTORY, default_text("outputs/datasets/<task>")] = None
+    out: Annotated[
+        Path | None, DIRECTORY, default_text("outputs/datasets/<task>, of open-h <task>-open-h")
+    ] = None
     env: EnvFields = None
 
 
@@ -89,6 +95,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Record demonstrations if none are given, render them and print where the dataset is."""
     from surgicai_vision.core.executor import LOCAL, RunContext, open_engine
     from surgicai_vision.dataset import render_demos
+    from surgicai_vision.dataset.layouts import LAYOUTS
     from surgicai_vision.dataset.variants import Variants
     from surgicai_vision.scene.opengl import check_opengl
 
@@ -102,7 +109,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     if options.appearance or options.distractors or options.variants > 1:
         variants = Variants(options.appearance or "", options.distractors or 0, options.variants)
     task = folders.demos_task(options.demos[0]) if options.demos else options.task or "grasp"
-    out = options.out or folders.dataset_folder(task)
+    of_others = "" if options.layout == "surgicai" else f"-{options.layout}"
+    out = options.out or folders.dataset_folder(f"{task}{of_others}")
     folders.check_folder(out, names.META_FILE)
     if context.engine == LOCAL:  # elsewhere it is the workers that must draw
         check_opengl()
@@ -117,6 +125,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         frame_stride=options.frame_stride,
         variants=variants,
         video=options.video,
+        layout=options.layout,
         context=context,
     )
     console.say(
@@ -126,7 +135,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     return {
         **dataclasses.asdict(summary),
         "task": task,
-        "views": list(options.view),
+        "views": list(options.view) or list(LAYOUTS[options.layout].views),
         "dataset": str(out),
     }
 

@@ -80,11 +80,31 @@ LAYOUTS = ("simple", "3dmed", "3dmed_straight")
 
 ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "jaw")
 STATE_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "jaw")
+ACTION_MODES = ("increments", "absolute")
+"""How an env is acted on: increments of the active arm, or both arms' set-points
+(`envs.absolute`).
+"""
+INCREMENTS, ABSOLUTE = ACTION_MODES
 BOTH_ARMS_NAMES = tuple(f"{arm}_{name}" for arm in ARMS for name in STATE_NAMES)
 SETPOINT_NAMES = ("x", "y", "z", "rx", "ry", "rz", "jaw")
 PRIVILEGED_NAMES = tuple(
     f"{part}_{name}" for part in ("now", "goal", "error") for name in STATE_NAMES
 )
+
+_POSE_NAMES = (
+    *(f"position.{axis}" for axis in "xyz"),
+    *(f"orientation.{axis}" for axis in "xyzw"),
+)
+ABSOLUTE_STATE_NAMES = tuple(
+    name for arm in ARMS for name in (*(f"{arm}_pose.{part}" for part in _POSE_NAMES), f"{arm}_jaw")
+)
+"""Elements of `envs.absolute.measured`, called as in Open-H-Embodiment (`dataset.open_h`)."""
+ABSOLUTE_ACTION_NAMES = tuple(
+    name
+    for arm in ARMS
+    for name in (*(f"{arm}_sp.{part}" for part in _POSE_NAMES), f"{arm}_jaw_sp")
+)
+"""Elements of an action in action mode "absolute"."""
 
 RELATIVE_NAMES = (
     *("x", "y", "z"),

@@ -306,6 +306,11 @@ def _read_meta(path: Path) -> schema.Table:
             f"{meta.get('format', 1)}; this version reads {schema.FORMAT}); render it again with "
             "'surgicai-vision render-demos'."
         )
+    if "layout" in meta:
+        raise BadFile(
+            f"{path} has the layout '{meta['layout']}' of others, which lerobot-train and LeRobot's "
+            "tools read; render the demonstrations without --layout for what this command does."
+        )
     return meta
 
 

@@ -16,13 +16,20 @@ from typing import NamedTuple
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import check_camera
-from surgicai_vision.core.config import JSON, TaskConfig, check_frame_stride, to_mapping
-from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.core.config import (
+    ACTION_REPEAT_LIMIT,
+    JSON,
+    TaskConfig,
+    check_frame_stride,
+    to_mapping,
+)
+from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.executor import Job, RunContext, building, register_job, run
 from surgicai_vision.core.files import check_output, code_version, read_json, sha256_file
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.convert import DatasetSummary, check_video, finished, write_converted
+from surgicai_vision.dataset.layouts import LAYOUTS, SURGICAI
 from surgicai_vision.dataset.reader import open_dataset
 from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.variants import Variants
@@ -43,13 +50,14 @@ def render_demos(
     demos: Path | Sequence[Path],
     out: Path,
     *,
-    views: Sequence[str] = ("front", "back"),
+    views: Sequence[str] = (),
     size: int = 224,
     depth: bool = False,
     segmentation: bool = False,
     frame_stride: int = 1,
     variants: Variants | None = None,
     video: str | None = None,
+    layout: str = SURGICAI,
     context: RunContext = RunContext(),
 ) -> DatasetSummary:
     """Render demonstrations into a LeRobot dataset.
@@ -58,27 +66,34 @@ def render_demos(
         demos: folder of demonstrations, or several, one behind the other; all of one task and
             scene.
         out: dataset folder to make; the same request continues it or finds it finished.
-        views: cameras, in the order of the dataset's columns.
+        views: cameras, in the order of the dataset's columns; by default those of the layout,
+            front and back of ours.
         size: side of the square images [px].
         depth: also render depth, float32 [m].
         segmentation: also render part indices (`names.PARTS`).
         frame_stride: render every n-th frame of each episode alone, from its first; a divisor of
             `names.FPS`, so that the dataset has `names.FPS / frame_stride` frames per second of
-            simulated time. Actions stay those of one step.
+            simulated time. Increments stay those of one step; set-points of layout "open-h" are
+            held until the next frame.
         variants: looks in which each demonstration is rendered; None renders each once, as it was
             recorded.
         video: codec of the RGB views, a key of `video.CODECS`; lossless images by default.
+        layout: which columns it has, a key of `layouts.LAYOUTS`.
         context: workers, engine and display.
 
     Raises:
-        UnknownName: a view or codec that does not exist.
-        InputError: a folder of demonstrations that is given twice.
+        UnknownName: a view, codec or layout that does not exist.
+        InputError: a folder of demonstrations that is given twice, a video or too long a frame
+            stride of a layout that has none.
         BadFile: `demos` holds no readable demonstrations, or of another scene.
         OutputExists: `out` holds something else.
     """
     started = time.monotonic()
+    chosen = LAYOUTS[check_name("layout", layout, LAYOUTS)]
+    views = views or chosen.views
     _check_images(views, size, video)
     check_frame_stride(frame_stride)
+    _check_layout(layout, frame_stride, video)
     check_output(out, may_resume=names.META_FILE)
     sources = _distinct([demos] if isinstance(demos, Path) else demos)
     paths = [path for source in sources for path in list_demos(source)]
@@ -89,6 +104,7 @@ def render_demos(
         "segmentation": segmentation,
         **({"frame_stride": frame_stride} if frame_stride > 1 else {}),
         **({"variants": variants.request} if variants else {}),
+        **({"layout": layout} if layout != SURGICAI else {}),
     }
     request = {**options, "demos": demos_digest(paths), **({"video": video} if video else {})}
     if (out / names.META_FILE).exists():
@@ -107,8 +123,12 @@ def render_demos(
     with building(out) as (store, result), context.stage(title, "frames") as progress:
         shards = run(jobs, store, context, progress=progress, unit="frames")
         summaries = [read_json(shard / SUMMARY_FILE) for shard in shards]
-        meta = _meta(sources, request, config, summaries, origins)
-        table = schema.features(views, size, depth, segmentation)
+        meta = {
+            **_meta(sources, request, chosen.task_config(config, frame_stride), summaries, origins),
+            **({"layout": layout} if layout != SURGICAI else {}),
+            **({"robot_type": chosen.robot_type} if chosen.robot_type else {}),
+        }
+        table = chosen.features(views, size, depth, segmentation)
         lossless = store / "lossless" if video else result
         shutil.rmtree(lossless, ignore_errors=True)
         assemble(shards, lossless, table, task_text(config.task), meta)
@@ -150,6 +170,22 @@ def _check_images(views: Sequence[str], size: int, video: str | None) -> None:
     if not SIZES[0] <= size <= SIZES[1]:
         raise InputError(f"size is {size}; it must be within {SIZES[0]} and {SIZES[1]} pixels.")
     check_video(video)
+
+
+def _check_layout(layout: str, frame_stride: int, video: str | None) -> None:
+    """Refuse what a layout of others does not have."""
+    if layout == SURGICAI:
+        return
+    if video:
+        raise InputError(
+            f"--video {video} is of our own layout; render --layout {layout} as images and make "
+            "videos of them with 'lerobot-edit-dataset --operation.type convert_image_to_video'."
+        )
+    if frame_stride > ACTION_REPEAT_LIMIT:
+        raise InputError(
+            f"frame_stride is {frame_stride}, and an action of layout '{layout}' is held until the "
+            f"next frame; allowed: at most {ACTION_REPEAT_LIMIT}."
+        )
 
 
 class _Origin(NamedTuple):

@@ -7,7 +7,7 @@ the state before action t. This module needs MuJoCo, so only the processes that 
 import atexit
 import functools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -22,25 +22,18 @@ from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import sha256_file, write_json
 from surgicai_vision.dataset import codecs, schema
+from surgicai_vision.dataset.layouts import LAYOUTS, SURGICAI
 from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
 from surgicai_vision.dataset.variants import Variants
 from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, column_array, compression
-from surgicai_vision.demos.store import Demo, read_demo
+from surgicai_vision.demos.store import read_demo
 from surgicai_vision.envs.looks import draw as draw_look
 from surgicai_vision.scene.cameras import crop_of
 from surgicai_vision.scene.rendering import renderer_string
 
 LOOK_STREAM = 0x100C5
 """Sets the random numbers of variants' looks apart from all others."""
-MEASURED: Mapping[str, Callable[[envs.SuturingEnv], NDArray[np.float32]]] = {
-    names.STATE: lambda env: env.agent_pos(),
-    names.NEEDLE_POSE: lambda env: env.needle_pose(),
-    names.BOTH_ARMS: lambda env: env.both_arms(),
-    names.SETPOINT: lambda env: env.setpoint(),
-    names.PRIVILEGED_STATE: lambda env: env.state_vector(),
-}
-"""Column → what the env measures in the state that was set."""
 
 
 def _calibration(env: envs.SuturingEnv, view: str, size: int) -> dict[str, NDArray[np.float32]]:
@@ -79,11 +72,14 @@ def render_episode(
     frame_stride: int = 1,
     variants: Mapping[str, str | int] = MappingProxyType({}),
     variant: int = 0,
+    layout: str = SURGICAI,
 ) -> None:
     """Write one episode's columns and images into `folder`; the job "render-episode".
 
-    `variants` are the fields of `variants.Variants`, `variant` is the number of one of them.
+    `variants` are the fields of `variants.Variants`, `variant` is the number of one of them;
+    `layout` is a key of `layouts.LAYOUTS`.
     """
+    chosen = LAYOUTS[layout]
     episode = read_demo(Path(demo))
     looks = from_mapping(Variants, variants) if variants else None
     config = looks.shown(episode.config) if looks else episode.config
@@ -94,12 +90,12 @@ def render_episode(
             f"{env.scene.hash[:12]}); record it again with this version."
         )
     # The images, frame by frame: encoded, counted and hashed; what the env measures beside them.
-    keys = schema.image_keys(views, depth, segmentation)
+    keys = chosen.image_keys(views, depth, segmentation)
     content: dict[str, list[bytes]] = {key: [] for key, _, _ in keys}
     statistics = {key: ImageStatistics() for key in content}
     digest = schema.EpisodeDigest(content)
     measured: dict[str, list[NDArray[np.float32]]] = {
-        key: [] for key in (*MEASURED, *schema.calibration_keys(views))
+        key: [] for key in (*chosen.measured, *schema.calibration_keys(views))
     }
     look = _look(looks, Path(demo), variant) if looks else {}
     for state in episode.state[:-1:frame_stride]:
@@ -113,22 +109,30 @@ def render_episode(
             content[key].append(codecs.encode(frame))
             statistics[key].add(frame)
             digest.add(key, frame)
-        for key, measure in MEASURED.items():
+        for key, measure in chosen.measured.items():
             measured[key].append(measure(env))
         for view in views:
             for key, matrix in _calibration(env, view, size).items():
                 measured[key].append(matrix)
     # The columns, and everything in one file and its summary.
-    unordered = _columns(episode, frame_stride, measured)
-    columns = {key: unordered[key] for key in schema.columns(views)}
+    unordered: dict[str, NDArray[np.generic]] = {
+        **{key: np.stack(rows).astype(np.float32) for key, rows in measured.items()},
+        **chosen.recorded(episode, frame_stride, env),
+    }
+    order = chosen.columns(views)
+    columns = {key: unordered[key] for key in order}
     depth_keys = [key for key, _, modality in keys if modality == names.DEPTH]
     _write_episode(folder, content, columns, depth_keys)
     summary = {
         "frames": len(columns[names.DONE]),
-        "digest": digest.hexdigest(columns, views),
+        "digest": digest.hexdigest(columns, views, order),
         "statistics": {
             **{key: statistics[key].result() for key in content},
-            **{key: column_statistics(values) for key, values in columns.items()},
+            **{
+                key: column_statistics(values)
+                for key, values in columns.items()
+                if values.dtype.kind != "U"  # LeRobot has none of texts either
+            },
         },
         "renderer": _renderer(),
         "cameras": {view: _camera(view) for view in views},
@@ -140,23 +144,6 @@ def _look(looks: Variants, demo: Path, variant: int) -> Mapping[str, Sequence[fl
     """Return the numbers of a variant's look, drawn from the demonstration's file and `variant`."""
     rng = np.random.default_rng([LOOK_STREAM, int(sha256_file(demo), 16), variant])
     return draw_look(looks.shown(TaskConfig()).randomisation, rng)
-
-
-def _columns(
-    demo: Demo, frame_stride: int, measured: Mapping[str, Sequence[NDArray[np.float32]]]
-) -> dict[str, NDArray[np.generic]]:
-    """Return every column of `schema.columns`, (T,) or (T, n), for the T frames rendered."""
-    frames = len(measured[names.STATE])
-    return {
-        **{key: np.stack(rows).astype(np.float32) for key, rows in measured.items()},
-        names.ACTION: demo.action[::frame_stride],
-        names.REWARD: demo.reward[::frame_stride],
-        names.DONE: np.arange(frames) == frames - 1,
-        names.SUCCESS: demo.success[::frame_stride],
-        names.CONTACT: demo.contact[::frame_stride],
-        names.PHASE: demo.phase[::frame_stride].astype(np.int64),
-        names.SEED: np.full(frames, demo.seed, np.int64),
-    }
 
 
 def _write_episode(

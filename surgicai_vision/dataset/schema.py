@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
+from surgicai_vision.demos.store import Demo
 
 Table = Mapping[str, Any]
 """A JSON object, as it is read from a file."""
@@ -86,12 +87,7 @@ def features(views: Sequence[str], size: int, depth: bool, segmentation: bool) -
     A segmentation image is stored as RGB with the part's index in all three channels: LeRobot
     admits one-channel images as depth only.
     """
-    table: dict[str, Table] = {}
-    for key, _, modality in image_keys(views, depth, segmentation):
-        shape = (size, size, 1 if modality == names.DEPTH else 3)
-        image = {"dtype": "image", "shape": shape, "names": list(IMAGE_AXES)}
-        info = {"is_depth_map": True, "depth_unit": "m"}
-        table[key] = image | ({"info": info} if modality == names.DEPTH else {})
+    table = image_features(image_keys(views, depth, segmentation), size)
     for key, elements in VECTORS.items():
         table[key] = {"dtype": "float32", "shape": (len(elements),), "names": list(elements)}
     for key, dtype in SCALARS.items():
@@ -102,8 +98,34 @@ def features(views: Sequence[str], size: int, depth: bool, segmentation: bool) -
     return table
 
 
+def image_features(keys: Iterable[tuple[str, str, str]], size: int) -> dict[str, Table]:
+    """Return the features of image columns, (key, view, modality) each."""
+    table: dict[str, Table] = {}
+    for key, _, modality in keys:
+        shape = (size, size, 1 if modality == names.DEPTH else 3)
+        image = {"dtype": "image", "shape": shape, "names": list(IMAGE_AXES)}
+        info = {"is_depth_map": True, "depth_unit": "m"}
+        table[key] = image | ({"info": info} if modality == names.DEPTH else {})
+    return table
+
+
+def labels(demo: Demo, frame_stride: int) -> dict[str, NDArray[np.generic]]:
+    """Return the columns of `SCALARS` of each frame rendered, (frames,), as recorded."""
+    frames = len(range(0, len(demo), frame_stride))
+    return {
+        names.REWARD: demo.reward[::frame_stride],
+        names.DONE: np.arange(frames) == frames - 1,
+        names.SUCCESS: demo.success[::frame_stride],
+        names.CONTACT: demo.contact[::frame_stride],
+        names.PHASE: demo.phase[::frame_stride].astype(np.int64),
+        names.SEED: np.full(frames, demo.seed, np.int64),
+    }
+
+
 def column_bytes(key: str, values: NDArray[np.generic]) -> bytes:
     """Return the bytes of a column as they enter the digest."""
+    if values.dtype.kind == "U":
+        return "\0".join(map(str, values)).encode()
     dtype = SCALARS.get(key, "float32")
     return np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
 
@@ -125,7 +147,7 @@ class ImageDigest:
 
 
 class EpisodeDigest:
-    """sha256 over one episode: its columns in the order of `columns`, then each image column."""
+    """sha256 over one episode: its columns in their order, then each image column."""
 
     def __init__(self, keys: Iterable[str]):
         self._images = {key: ImageDigest() for key in keys}
@@ -139,10 +161,21 @@ class EpisodeDigest:
         """Take an image column's `ImageDigest` in the place of its frames."""
         self._known[key] = digest
 
-    def hexdigest(self, rows: Mapping[str, NDArray[np.generic]], views: Sequence[str] = ()) -> str:
-        """Return the episode's digest; `rows` are its columns, `views` those of the dataset."""
+    def hexdigest(
+        self,
+        rows: Mapping[str, NDArray[np.generic]],
+        views: Sequence[str] = (),
+        order: Sequence[str] = (),
+    ) -> str:
+        """Return the episode's digest.
+
+        Args:
+            rows: its columns.
+            views: those of the dataset.
+            order: its columns' keys, by default those of `columns(views)`.
+        """
         total = hashlib.sha256()
-        for key in columns(views):
+        for key in order or columns(views):
             total.update(key.encode() + b"\0" + column_bytes(key, rows[key]))
         for key, image in self._images.items():
             total.update(

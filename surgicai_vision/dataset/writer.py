@@ -45,7 +45,8 @@ def assemble(shards: Sequence[Path], out: Path, features: Features, text: str, m
         out: dataset folder; it does not exist yet.
         features: LeRobot feature table.
         text: the task's sentence.
-        meta: content of `meta/surgicai.json`; its `fps` is that of the frames.
+        meta: content of `meta/surgicai.json`; its `fps` is that of the frames, its `robot_type`,
+            where there is one, LeRobot's.
     """
     with whole_folder(out) as folder:
         data = DataFiles(folder, features, meta["fps"])
@@ -54,7 +55,8 @@ def assemble(shards: Sequence[Path], out: Path, features: Features, text: str, m
             statistics = read_json(shard / SUMMARY_FILE)["statistics"]
             rows.append(data.append(index, pq.read_table(shard / EPISODE_FILE), statistics))
         data.close()
-        write_metadata(folder, features, [text], rows, {"fps": meta["fps"]})
+        origin = {key: meta[key] for key in ("fps", "robot_type") if key in meta}
+        write_metadata(folder, features, [text], rows, origin)
         write_json(folder / names.META_FILE, meta)
 
 

@@ -46,12 +46,16 @@ def make(
     segmentation: bool = False,
     render_mode: str | None = None,
     truncates: bool = True,
+    action_mode: str = names.INCREMENTS,
 ) -> SuturingEnv:
-    """Return the unwrapped env of a task; see `observation` for what the arguments choose."""
+    """Return the unwrapped env of a task; see `observation` for what the arguments choose.
+
+    With `action_mode` "absolute" it is acted on by both arms' set-points (`absolute`).
+    """
     size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
     if len(size) != 2:
         raise InputError(f"image_size is {size}; it must be one side or (height, width) [pixel].")
-    view = ObservationConfig(obs_type, tuple(cameras), size, depth, segmentation)
+    view = ObservationConfig(obs_type, tuple(cameras), size, depth, segmentation, action_mode)
     shows_goal = obs_type == "goal"
     if config.task == names.SUTURE:
         procedure = GoalSuture if shows_goal else Suture

@@ -3,7 +3,9 @@
 * Description: two da Vinci PSMs, a needle and a phantom; one subtask, or all five in a row
   (`suture`).
 * Action: Box(-1, 1, (7,), float32): Δx Δy Δz Δroll Δpitch Δyaw of the active arm's tip in its own
-  base frame and Δjaw, each times the step size (`config.STEPS`); every step is 20 ms.
+  base frame and Δjaw, each times the step size (`config.STEPS`); every step is 20 ms. In action
+  mode "absolute" it is both arms' set-points, (16,): see `absolute`; then no step size holds, and
+  PSM2 lets go after the handoff only where it is told to.
 * Observation: see `observation`.
 * Reward: sparse: 0 on success, else -1; dense: -(d_trans / 100 + d_angle / 10) with d_trans in cm
   and d_angle in rad; staged: 0 on success, else -(tanh(d_trans / 1 cm) + tanh(d_angle / 0.5 rad) +
@@ -33,7 +35,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError, check_name
 from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.core.tasks import task_text
-from surgicai_vision.envs import hole_crossing, observation, poses, randomisation
+from surgicai_vision.envs import absolute, hole_crossing, observation, poses, randomisation
 from surgicai_vision.envs.calibration import Calibration
 from surgicai_vision.envs.camera_rig import Images
 from surgicai_vision.envs.control import Command, StepSize
@@ -106,7 +108,11 @@ class SuturingEnv(gymnasium.Env):
         refuse_impossible(config, any(subtask.through for subtask in subtasks))
         self.stitch = Stitch.of(self.scene.pair)
         self.observation_space = view.space()
+        self._is_absolute = view.action_mode == names.ABSOLUTE
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
+        if self._is_absolute:
+            _refuse_increments(config)
+            self.action_space = absolute.space()
         self._subtasks = subtasks
         self.simulation.task_state.phase = subtasks[0].phase
         self._step_size = StepSize.of(config.step)
@@ -176,6 +182,8 @@ class SuturingEnv(gymnasium.Env):
         """Take one control step of 20 ms."""
         self._moves += 1
         simulation = self.simulation
+        if self._is_absolute:
+            return self._after(simulation.advance_to(absolute.follow(action, simulation)))
         return self._after(
             simulation.advance(self.subtask.arm, self._checked(action), self._step_size)
         )
@@ -423,6 +431,13 @@ class SuturingEnv(gymnasium.Env):
             simulation.tip_in_base(arm), simulation.jaw(arm), told.pose, told.jaw
         )
 
+    def absolute_pos(self) -> NDArray[np.float32]:
+        """Return both arms' measured poses and jaws as the field's data have them, (16,).
+
+        See `absolute`; it is `agent_pos` of an observation in action mode "absolute".
+        """
+        return absolute.measured(self.simulation)
+
     def state_vector(self) -> NDArray[np.float32]:
         """Return the observation of obs_type "state", goal included, (21,)."""
         return self._state_vector(self._target())
@@ -445,7 +460,8 @@ class SuturingEnv(gymnasium.Env):
             return self._state_vector(target)
         if self.view.obs_type == "relative":
             return self._relative_state(target)
-        beside = {"agent_pos": self.agent_pos()} if self.view.shows_agent_pos else {}
+        own = self.absolute_pos if self._is_absolute else self.agent_pos
+        beside = {"agent_pos": own()} if self.view.shows_agent_pos else {}
         if self._defers:
             return LazyMapping(self._makers(), beside)
         return self._images.look(self.view) | beside
@@ -536,6 +552,16 @@ class SuturingEnv(gymnasium.Env):
     def _progress(self, info: Info) -> bool:
         """Go on to the next subtask, where a task has several; return True if so."""
         return False
+
+
+def _refuse_increments(config: TaskConfig) -> None:
+    """Raise `InputError` for options that change increments, where actions are set-points."""
+    if config.hold_jaw or config.randomisation.latency:
+        given = "hold_jaw" if config.hold_jaw else "latency"
+        raise InputError(
+            f"{given} changes increments, and in action mode 'absolute' an action is the set-point "
+            "of both arms; leave it out."
+        )
 
 
 def staged_reward(

@@ -14,7 +14,8 @@
   "front_depth" (height, width, 1) float32 [m], with segmentation=True also "front_segmentation"
   (height, width, 1) uint8.
 * `pixels_agent_pos`: the same and `agent_pos` (7,) float32: x y z [m], roll pitch yaw [rad], jaw
-  [rad] of the active arm's measured tip in its own base, as a dVRK reports it.
+  [rad] of the active arm's measured tip in its own base, as a dVRK reports it. In action mode
+  "absolute" `agent_pos` is both arms' (16,); see `envs.absolute`.
 
 Vision types hold images and proprioception only: no goal, no needle pose.
 """
@@ -54,6 +55,7 @@ class ObservationConfig:
         image_size: height and width of an image.
         depth: add depth images.
         segmentation: add segmentation images.
+        action_mode: one of `names.ACTION_MODES`; decides what `agent_pos` is.
     """
 
     obs_type: str = "state"
@@ -61,9 +63,11 @@ class ObservationConfig:
     image_size: tuple[int, int] = (224, 224)
     depth: bool = False
     segmentation: bool = False
+    action_mode: str = names.INCREMENTS
 
     def __post_init__(self) -> None:
         check_name("obs_type", self.obs_type, names.OBS_TYPES)
+        check_name("action mode", self.action_mode, names.ACTION_MODES)
         for camera in self.cameras:
             check_camera(camera)
         if len(set(self.cameras)) != len(self.cameras):
@@ -113,7 +117,8 @@ class ObservationConfig:
             for modality in self.modalities
         }
         if self.shows_agent_pos:
-            parts["agent_pos"] = _box(7)
+            is_absolute = self.action_mode == names.ABSOLUTE
+            parts["agent_pos"] = _box(len(names.ABSOLUTE_STATE_NAMES) if is_absolute else 7)
         return spaces.Dict(parts)
 
 

@@ -1,0 +1,159 @@
+"""The layout of Open-H-Embodiment, in which the field's dVRK data are published.
+
+    surgicai-vision render-demos --task suture --layout open-h
+
+| column | what it is |
+|---|---|
+| `observation.images.endoscope.left`, `….right` | the two eyes of the endoscope |
+| `observation.images.wrist.left`, `….right` | the wrist cameras of PSM2 and of PSM1 |
+| `observation.state` (16,) | both arms' measured poses and jaws (`envs.absolute.measured`) |
+| `action` (16,) | the set-points that they are given next (`envs.absolute.setpoints`) |
+| `instruction.text` | the subtask in words, frame by frame |
+| `observation.meta.tool.psm1`, `….psm2` | the instruments |
+| `needle_pose`, `phase`, `seed`, `contact`, `next.*`, `calibration.*` | ours, as in `schema` |
+
+`robot_type` is `dvrk`; `task` is the whole task in words.
+
+Sources: names, order, shapes and `names` of features (one list within a list) from
+`scripts/conversion/dvrk_zarr_to_lerobot.py` of github.com/open-h/open-h-embodiment, whose LeRobot
+v3 form this is; `wrist.left` is PSM2's there, and `psm1_pose`, `psm1_sp`, `psm1_jaw`, `psm1_jaw_sp`
+are recorded from `/PSM1/measured_cp`, `/PSM1/setpoint_cp`, `/PSM1/jaw/measured_js` and
+`/PSM1/jaw/setpoint_js`. The first public sets of it (Open-H-Embodiment v1, SutureBot, SutureBot2)
+are LeRobot v2.1 of the same columns.
+
+What differs: keys follow the arm, and our PSM2 stands on the right of the endoscope's image, as in
+SurgicAI, where a dVRK's usually stands on the left. Images are square. Columns of ours are no
+observation by their names, so that a policy is fed none of them; the instruments' names are, as in
+the original, and are texts that ACT and Diffusion leave alone.
+
+An action is where the arms are told to be when the next frame is taken, so with a frame stride
+whoever acts holds it for that many control steps: `task_config` says so by its `action_repeat`.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.tasks import task_text
+from surgicai_vision.dataset import schema
+from surgicai_vision.dataset.schema import Table
+from surgicai_vision.demos.store import Demo
+
+if TYPE_CHECKING:
+    from surgicai_vision.envs.base import SuturingEnv
+
+IMAGES: Mapping[str, str] = MappingProxyType(
+    {
+        "endo_left": "endoscope.left",
+        "endo_right": "endoscope.right",
+        "wrist_psm2": "wrist.left",
+        "wrist_psm1": "wrist.right",
+    }
+)
+"""View → what an image key calls it after `observation.images.`; other views keep their names."""
+INSTRUCTION = "instruction.text"
+TOOLS: Mapping[str, str] = MappingProxyType(
+    {arm: f"observation.meta.tool.{arm}" for arm in names.ARMS}
+)
+"""Arm → the column that names its instrument."""
+TOOL = "Large Needle Driver"
+"""Both arms' instrument: 400006 and 420006 are Large Needle Drivers (a dVRK's tool files)."""
+ROBOT_TYPE = "dvrk"
+VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        names.STATE: names.ABSOLUTE_STATE_NAMES,
+        names.ACTION: names.ABSOLUTE_ACTION_NAMES,
+    }
+)
+"""float32 columns of the layout → names of their elements."""
+TEXTS = (INSTRUCTION, *TOOLS.values())
+
+
+def image_name(view: str) -> str:
+    """Return what the layout calls a view."""
+    return IMAGES.get(view, view)
+
+
+def image_key(view: str) -> str:
+    """Return the LeRobot feature key of a view's image."""
+    return names.image_key(image_name(view))
+
+
+class OpenHLayout:
+    """The columns of Open-H-Embodiment; see the module's docstring."""
+
+    views: tuple[str, ...] = tuple(IMAGES)
+    robot_type: str | None = ROBOT_TYPE
+    measured: "Mapping[str, Callable[[SuturingEnv], NDArray[np.float32]]]" = MappingProxyType(
+        {
+            names.STATE: lambda env: env.absolute_pos(),
+            names.NEEDLE_POSE: lambda env: env.needle_pose(),
+        }
+    )
+
+    def image_keys(
+        self, views: Sequence[str], depth: bool, segmentation: bool
+    ) -> list[tuple[str, str, str]]:
+        """Return (key, view, modality) of every image column, in the order of the digest."""
+        shown = [image_name(view) for view in views]
+        own = dict(zip(shown, views, strict=True))
+        keys = schema.image_keys(shown, depth, segmentation)
+        return [(key, own[name], modality) for key, name, modality in keys]
+
+    def features(
+        self, views: Sequence[str], size: int, depth: bool, segmentation: bool
+    ) -> dict[str, Table]:
+        """Return LeRobot's feature table."""
+        table = schema.image_features(self.image_keys(views, depth, segmentation), size)
+        for key, elements in VECTORS.items():
+            table[key] = {"dtype": "float32", "shape": (16,), "names": [list(elements)]}
+        for arm, key in TOOLS.items():
+            table[key] = {"dtype": "string", "shape": (1,), "names": [f"{arm}_tool_type"]}
+        table[INSTRUCTION] = {"dtype": "string", "shape": (1,), "names": ["instruction"]}
+        own = schema.features(views, size, False, False)
+        return table | {key: own[key] for key in self.columns(views) if key not in table}
+
+    def columns(self, views: Sequence[str]) -> tuple[str, ...]:
+        """Return every column that is no image, in the order of the digest."""
+        own = (names.NEEDLE_POSE, *schema.SCALARS, *schema.calibration_keys(views))
+        return (*VECTORS, *TEXTS, *own)
+
+    def recorded(
+        self, demo: Demo, frame_stride: int, env: "SuturingEnv"
+    ) -> dict[str, NDArray[np.generic]]:
+        """Return set-points, texts and labels; rewards and marks are those of the frame's end."""
+        from surgicai_vision.envs.absolute import setpoints  # rendering alone needs MuJoCo
+
+        steps = np.arange(0, len(demo), frame_stride)
+        ends = np.minimum(steps + frame_stride, len(demo))
+        actions = []
+        for end in ends:
+            env.set_state_vector(demo.state[end])
+            actions.append(setpoints(env.simulation))
+        phases = demo.phase[steps].tolist()
+        texts = [instruction(demo.config.task, phase) for phase in phases]
+        last = ends - 1
+        return {
+            **schema.labels(demo, frame_stride),
+            names.REWARD: demo.reward[last],
+            names.SUCCESS: demo.success[last],
+            names.CONTACT: demo.contact[last],
+            names.ACTION: np.stack(actions),
+            INSTRUCTION: np.array(texts),
+            **{key: np.full(len(steps), TOOL) for key in TOOLS.values()},
+        }
+
+    def task_config(self, config: TaskConfig, frame_stride: int) -> TaskConfig:
+        """Return the config in which an action is held until the next frame."""
+        return dataclasses.replace(config, action_repeat=config.action_repeat * frame_stride)
+
+
+def instruction(task: str, phase: int) -> str:
+    """Return what is to be done in words, of a task and the subtask's index in it (-1 for none)."""
+    return task_text(names.SUBTASKS[phase] if phase >= 0 else task)
