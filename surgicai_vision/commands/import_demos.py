@@ -1,10 +1,10 @@
-"""`import-demos`: read demonstrations of the original SurgicAI, and bags of ROS 1 and ROS 2."""
+"""`import-demos`: read demonstrations of the original SurgicAI, bags of ROS, LeRobot datasets."""
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
@@ -22,6 +22,9 @@ from surgicai_vision.demos.imports.rosbag.config import (
     is_bag,
 )
 
+if TYPE_CHECKING:
+    from surgicai_vision.demos.imports.rosbag.importer import BagSummary
+
 ROLES = tuple(role.name for role in dataclasses.fields(Topics))
 app = App(
     name="import-demos",
@@ -32,6 +35,8 @@ example:
 
 A bag is a .bag, .db3 or .mcap file, or a folder of ROS 2; a folder of bags is read whole:
   surgicai-vision import-demos trial.bag --topic needle=/needle/pose --out outputs/demos/trial
+A LeRobot dataset (v2.1 or v3) of both arms' poses, as Open-H-Embodiment and SutureBot have them:
+  surgicai-vision import-demos datasets/suturing --out outputs/demos/suturing
 Roles of --topic: {", ".join(ROLES)}.
 Without --task every subtask that is found gets a folder below --out. Frames, units, labels and more
 stand in the table `bag` of a --config file, the scene in the table `env`; see docs/demos.md.\
@@ -45,12 +50,13 @@ class Options:
     """Options of `import-demos`.
 
     Attributes:
-        file: A pickle as SurgicAI writes it, an npz of its arrays, a bag, or a folder of bags.
+        file: A pickle as SurgicAI writes it, an npz of its arrays, a bag, a folder of bags, or the
+            folder of a LeRobot dataset.
         task: What it shows; needed for a pickle, which does not say it.
         out: Folder to make.
         topic: Topics of a bag that differ from the convention's.
         convention: Whose topics a bag has.
-        segmentation: What cuts a bag into subtasks.
+        segmentation: What cuts a bag or a dataset into subtasks.
     """
 
     file: Annotated[Path, Parameter(metavar="FILE")] = field(kw_only=False)
@@ -75,6 +81,8 @@ class Options:
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Import demonstrations and print where they are."""
     path = options.file
+    if (path / names.INFO_FILE).is_file():
+        return _import_dataset(path, options, console)
     if is_bag(path) or path.is_dir():
         return _import_bags(path, options, console)
     for_bags = {
@@ -121,6 +129,27 @@ def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str
     }
 
 
+def _import_dataset(path: Path, options: Options, console: Console) -> dict[str, object]:
+    from surgicai_vision.demos.imports.lerobot_dataset import import_dataset
+
+    if options.topic or options.convention:
+        raise InputError(
+            f"--topic and --convention are for bags, and {path} is a LeRobot dataset; frames, "
+            "labels and more stand in the table bag of a --config file."
+        )
+    out = options.out or folders.demos_folder(f"dataset-{path.resolve().name}")
+    with console.stage(f"importing {path.name}", "frames") as progress:
+        summaries = import_dataset(
+            path,
+            task=options.task,
+            out=out,
+            config=_config(options),
+            env=options.env,
+            progress=progress,
+        )
+    return {"tasks": _told(summaries, console)}
+
+
 def _import_bags(path: Path, options: Options, console: Console) -> dict[str, object]:
     from surgicai_vision.demos.imports.rosbag.importer import import_bags
 
@@ -140,7 +169,12 @@ def _import_bags(path: Path, options: Options, console: Console) -> dict[str, ob
             env=options.env,
             progress=progress,
         )
-    rows = {}
+    return {"bags": len(bags), "tasks": _told(summaries, console)}
+
+
+def _told(summaries: "Sequence[BagSummary]", console: Console) -> dict[str, dict[str, object]]:
+    """Print what an import made, and return it as a table: task → what."""
+    rows: dict[str, dict[str, object]] = {}
     for made in summaries:
         kept = len(made.paths)
         console.say(
@@ -165,7 +199,7 @@ def _import_bags(path: Path, options: Options, console: Console) -> dict[str, ob
             "skipped": len(made.skipped),
             "demos": str(made.out),
         }
-    return {"bags": len(bags), "tasks": rows}
+    return rows
 
 
 def _config(options: Options) -> BagConfig:

@@ -152,6 +152,9 @@ ACTION_CHUNK = "action_chunk"
 META_FILE = "meta/surgicai.json"
 """Our own sidecar inside a LeRobot dataset: cameras, units, renderer, hashes, versions."""
 
+INFO_FILE = "meta/info.json"
+"""What makes a folder a LeRobot dataset, whoever wrote it."""
+
 CALIBRATION = "calibration."
 """Beginning of the keys of a view's nominal K and T_world_camera, which are no policy's input."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import JSON, TaskConfig
 from surgicai_vision.dataset import open_h, schema
 from surgicai_vision.dataset.schema import Table
 from surgicai_vision.demos.store import Demo
@@ -37,8 +37,8 @@ class Layout(Protocol):
         """Views that are rendered where none are named."""
 
     @property
-    def robot_type(self) -> str | None:
-        """LeRobot's `robot_type`; None takes that of our datasets."""
+    def about(self) -> Mapping[str, JSON]:
+        """What `meta/surgicai.json` says besides; `robot_type` is LeRobot's too."""
 
     @property
     def measured(self) -> Mapping[str, Measure]:
@@ -73,7 +73,7 @@ class SurgicaiLayout:
     """Our own columns; see `dataset.schema`."""
 
     views: tuple[str, ...] = ("front", "back")
-    robot_type: str | None = None
+    about: Mapping[str, JSON] = MappingProxyType({})
     measured: Mapping[str, Measure] = MappingProxyType(
         {
             names.STATE: lambda env: env.agent_pos(),

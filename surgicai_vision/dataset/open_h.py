@@ -9,7 +9,6 @@
 | `observation.state` (16,) | both arms' measured poses and jaws (`envs.absolute.measured`) |
 | `action` (16,) | the set-points that they are given next (`envs.absolute.setpoints`) |
 | `instruction.text` | the subtask in words, frame by frame |
-| `observation.meta.tool.psm1`, `….psm2` | the instruments |
 | `needle_pose`, `phase`, `seed`, `contact`, `next.*`, `calibration.*` | ours, as in `schema` |
 
 `robot_type` is `dvrk`; `task` is the whole task in words.
@@ -23,8 +22,10 @@ are LeRobot v2.1 of the same columns.
 
 What differs: keys follow the arm, and our PSM2 stands on the right of the endoscope's image, as in
 SurgicAI, where a dVRK's usually stands on the left. Images are square. Columns of ours are no
-observation by their names, so that a policy is fed none of them; the instruments' names are, as in
-the original, and are texts that ACT and Diffusion leave alone.
+observation by their names, so that a policy is fed none of them. The original's texts
+`observation.meta.tool.psm1` and `….psm2` stand in `meta/surgicai.json` as `instruments`: LeRobot
+0.6.1 takes every column called `observation.…` for numbers that a policy sees, and its training
+ends at a text ("too many dimensions 'str'").
 
 An action is where the arms are told to be when the next frame is taken, so with a frame stride
 whoever acts holds it for that many control steps: `task_config` says so by its `action_repeat`.
@@ -39,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import JSON, TaskConfig
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.schema import Table
@@ -58,13 +59,8 @@ IMAGES: Mapping[str, str] = MappingProxyType(
 )
 """View → what an image key calls it after `observation.images.`; other views keep their names."""
 INSTRUCTION = "instruction.text"
-TOOLS: Mapping[str, str] = MappingProxyType(
-    {arm: f"observation.meta.tool.{arm}" for arm in names.ARMS}
-)
-"""Arm → the column that names its instrument."""
-TOOL = "Large Needle Driver"
+INSTRUMENT = "Large Needle Driver"
 """Both arms' instrument: 400006 and 420006 are Large Needle Drivers (a dVRK's tool files)."""
-ROBOT_TYPE = "dvrk"
 VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         names.STATE: names.ABSOLUTE_STATE_NAMES,
@@ -72,7 +68,6 @@ VECTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """float32 columns of the layout → names of their elements."""
-TEXTS = (INSTRUCTION, *TOOLS.values())
 
 
 def image_name(view: str) -> str:
@@ -89,7 +84,13 @@ class OpenHLayout:
     """The columns of Open-H-Embodiment; see the module's docstring."""
 
     views: tuple[str, ...] = tuple(IMAGES)
-    robot_type: str | None = ROBOT_TYPE
+    about: Mapping[str, JSON] = MappingProxyType(
+        {
+            "robot_type": "dvrk",
+            "frame": "ECM_view",
+            "instruments": dict.fromkeys(names.ARMS, INSTRUMENT),
+        }
+    )
     measured: "Mapping[str, Callable[[SuturingEnv], NDArray[np.float32]]]" = MappingProxyType(
         {
             names.STATE: lambda env: env.absolute_pos(),
@@ -113,8 +114,6 @@ class OpenHLayout:
         table = schema.image_features(self.image_keys(views, depth, segmentation), size)
         for key, elements in VECTORS.items():
             table[key] = {"dtype": "float32", "shape": (16,), "names": [list(elements)]}
-        for arm, key in TOOLS.items():
-            table[key] = {"dtype": "string", "shape": (1,), "names": [f"{arm}_tool_type"]}
         table[INSTRUCTION] = {"dtype": "string", "shape": (1,), "names": ["instruction"]}
         own = schema.features(views, size, False, False)
         return table | {key: own[key] for key in self.columns(views) if key not in table}
@@ -122,7 +121,7 @@ class OpenHLayout:
     def columns(self, views: Sequence[str]) -> tuple[str, ...]:
         """Return every column that is no image, in the order of the digest."""
         own = (names.NEEDLE_POSE, *schema.SCALARS, *schema.calibration_keys(views))
-        return (*VECTORS, *TEXTS, *own)
+        return (*VECTORS, INSTRUCTION, *own)
 
     def recorded(
         self, demo: Demo, frame_stride: int, env: "SuturingEnv"
@@ -146,7 +145,6 @@ class OpenHLayout:
             names.CONTACT: demo.contact[last],
             names.ACTION: np.stack(actions),
             INSTRUCTION: np.array(texts),
-            **{key: np.full(len(steps), TOOL) for key in TOOLS.values()},
         }
 
     def task_config(self, config: TaskConfig, frame_stride: int) -> TaskConfig:

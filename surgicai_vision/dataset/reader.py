@@ -308,8 +308,8 @@ def _read_meta(path: Path) -> schema.Table:
         )
     if "layout" in meta:
         raise BadFile(
-            f"{path} has the layout '{meta['layout']}' of others, which lerobot-train and LeRobot's "
-            "tools read; render the demonstrations without --layout for what this command does."
+            f"{path} has the layout '{meta['layout']}' of others, which lerobot-train and "
+            "LeRobot's tools read; for this command render the demonstrations without --layout."
         )
     return meta
 

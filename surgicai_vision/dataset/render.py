@@ -126,7 +126,7 @@ def render_demos(
         meta = {
             **_meta(sources, request, chosen.task_config(config, frame_stride), summaries, origins),
             **({"layout": layout} if layout != SURGICAI else {}),
-            **({"robot_type": chosen.robot_type} if chosen.robot_type else {}),
+            **chosen.about,
         }
         table = chosen.features(views, size, depth, segmentation)
         lossless = store / "lossless" if video else result

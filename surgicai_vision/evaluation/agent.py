@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from surgicai_vision.core import names
+
 if TYPE_CHECKING:
     from surgicai_vision.envs import base
     from surgicai_vision.scene.rendering import Frame
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 type Env = base.SuturingEnv
 type Observation = base.Observation
 type Actions = NDArray[np.float32]
-"""One action a slot, (n, 7)."""
+"""One action a slot, (n, 7), of an agent with action mode "absolute" (n, 16)."""
 
 
 class Robot(Protocol):
@@ -68,6 +70,8 @@ class Agent(abc.ABC):
         image_size: height and width of their images [px].
         depth: whether it needs their depth too.
         privileged: whether it reads the env's own state: it acts in simulation alone.
+        action_mode: what its actions are, one of `names.ACTION_MODES`: "increments" of the active
+            arm, or "absolute" set-points of both (`envs.absolute`), which only an env takes.
     """
 
     name: str
@@ -75,6 +79,7 @@ class Agent(abc.ABC):
     image_size: int = 224
     depth: bool = False
     privileged: bool = False
+    action_mode: str = names.INCREMENTS
 
     @abc.abstractmethod
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
@@ -84,7 +89,7 @@ class Agent(abc.ABC):
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
-        """Return the actions (len(slots), 7) of the running slots."""
+        """Return the actions (len(slots), 7) of the running slots; absolute ones have 16."""
 
     def restart(self, slot: int) -> None:
         """Forget what the slot has planned: its subtask begins, within the same episode."""

@@ -163,6 +163,11 @@ class HierarchicalAgent(Agent):
         self._high = high() if high is not None else None
         learned = config.termination == "learned"
         self._ends: _Ends = _LearnedEnds(config) if learned else _PrivilegedEnds(config.grasp_hold)
+        if any(agent.action_mode != names.INCREMENTS for agent in self._low):
+            raise InputError(
+                "A low-level policy moves the active arm by increments, and one of these says "
+                "set-points of both arms; evaluate it by itself."
+            )
         self._agents = [*self._low, *([self._high] if self._high else [])]
         self.privileged = not learned or any(agent.privileged for agent in self._agents)
         seen = {camera for agent in self._agents for camera in agent.cameras}

@@ -7,6 +7,11 @@ Interface:
 * `read(folder, task) -> LeRobotCheckpoint`: what the policy was trained for and what it sees.
 * `LeRobotAgent`: the policy as an agent.
 
+A policy of seven actions moves the active arm by increments and sees its pose. One of sixteen says
+both arms' set-points and sees both (`envs.absolute`), as policies trained on datasets of layout
+"open-h" or on the field's own do; of images it may then see those by their names there
+(`dataset.open_h`).
+
 The policy runs through LeRobot's own pipeline, as in `lerobot-eval`. So that a result depends
 neither on the batch nor on the processes, every slot has a policy of its own (sharing weights) with
 its own random numbers, drawn from the episode's seed; a policy that declares itself `memoryless`
@@ -24,13 +29,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, check_name
 from surgicai_vision.core.files import read_json, sha256_file
-from surgicai_vision.evaluation.agent import Actions, Agent, Observation, Robot, frame_of
+from surgicai_vision.dataset import open_h
+from surgicai_vision.evaluation.agent import (
+    Actions,
+    Agent,
+    Observation,
+    Robot,
+    frame_of,
+    simulated,
+)
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training.run_config import OWN
 from surgicai_vision.training.threads import one_thread
@@ -45,6 +59,7 @@ PLACES = ("", "pretrained_model", "checkpoints/last/pretrained_model")
 """Where a checkpoint lies in a folder the user names."""
 ENV_TYPE = "surgicai"
 VISUAL = "VISUAL"
+ABSOLUTE_SIZE = len(names.ABSOLUTE_ACTION_NAMES)
 
 
 class LeRobotPolicy(Protocol):
@@ -86,12 +101,22 @@ class Inputs:
         image_size: height and width of their images [px].
         encoder: encoder whose features it sees in place of images; None for images.
         sha256: hash of that encoder's weights; empty where unknown.
+        image_names: what the policy calls the views' images after `observation.images.`; empty for
+            the views' own names.
+        action_mode: one of `names.ACTION_MODES`.
     """
 
     cameras: tuple[str, ...]
     image_size: int
     encoder: str | None = None
     sha256: str = ""
+    image_names: tuple[str, ...] = ()
+    action_mode: str = names.INCREMENTS
+
+    @property
+    def shown(self) -> Mapping[str, str]:
+        """View → what the policy calls its images."""
+        return dict(zip(self.cameras, self.image_names or self.cameras, strict=True))
 
 
 @dataclass(frozen=True)
@@ -165,7 +190,42 @@ def _circumstances(
         config = TaskConfig(task=task)
     else:
         raise InputError(f"{folder} does not say what it was trained for; give --task.")
-    return config, _inputs(folder, policy.get("input_features") or {}, features)
+    seen = policy.get("input_features") or {}
+    action_mode = _action_mode(folder, seen, policy.get("output_features") or {})
+    if action_mode == names.ABSOLUTE and (config.hold_jaw or config.randomisation.latency):
+        raise InputError(
+            f"{folder} says both arms' set-points, and its env changes increments (hold_jaw or "
+            "latency); train it in an env without."
+        )
+    inputs = _inputs(folder, seen, features)
+    return config, dataclasses.replace(inputs, action_mode=action_mode)
+
+
+def _action_mode(folder: Path, seen: Mapping[str, Any], said: Mapping[str, Any]) -> str:
+    """Return what a policy's actions are, by their number; its state must have as many.
+
+    Raises:
+        InputError: actions that our envs do not take.
+    """
+    sizes = {len(names.ACTION_NAMES): names.INCREMENTS, ABSOLUTE_SIZE: names.ABSOLUTE}
+    for key, features in ((names.ACTION, said), (names.STATE, seen)):
+        shape = features.get(key, {}).get("shape")
+        if shape is not None and (len(shape) != 1 or shape[0] not in sizes):
+            raise InputError(
+                f"{folder}: its {key} has shape {shape}; our envs have 7 values of the active arm "
+                "or 16 of both (PSM1 then PSM2: position, quaternion x y z w, jaw)."
+            )
+    shapes = [
+        features.get(key, {}).get("shape")
+        for key, features in ((names.ACTION, said), (names.STATE, seen))
+    ]
+    known = {shape[0] for shape in shapes if shape}
+    if len(known) > 1:
+        raise InputError(
+            f"{folder} has {shapes[1][0]} values of state and {shapes[0][0]} of action; our envs "
+            "have 7 of both or 16 of both."
+        )
+    return sizes[known.pop()] if known else names.INCREMENTS
 
 
 def _inputs(folder: Path, seen: Mapping[str, Any], features: Mapping[str, Any]) -> Inputs:
@@ -184,6 +244,7 @@ def _inputs(folder: Path, seen: Mapping[str, Any], features: Mapping[str, Any]) 
         )
     shapes = {key: value["shape"] for key, value in seen.items() if value["type"] == VISUAL}
     known = {names.image_key(view): view for view in camera_names()}
+    known |= {open_h.image_key(view): view for view in open_h.IMAGES}
     for key in shapes:
         check_name(f"image of {folder}", key, known)
     sizes = {tuple(shape[1:]) for shape in shapes.values()}
@@ -191,7 +252,11 @@ def _inputs(folder: Path, seen: Mapping[str, Any], features: Mapping[str, Any]) 
         raise InputError(
             f"{folder} sees images of {sorted(sizes)}; our envs show square ones of one size."
         )
-    return Inputs(tuple(known[key] for key in shapes), next(iter(sizes))[0] if sizes else 224)
+    return Inputs(
+        tuple(known[key] for key in shapes),
+        next(iter(sizes))[0] if sizes else 224,
+        image_names=tuple(key.removeprefix(names.image_key("")) for key in shapes),
+    )
 
 
 def _table(path: Path) -> dict[str, Any]:
@@ -225,6 +290,8 @@ class LeRobotAgent(Agent):
         self.name = name
         self.cameras = inputs.cameras
         self.image_size = inputs.image_size
+        self.action_mode = inputs.action_mode
+        self._shown = inputs.shown
         self._policy, self._before, self._after = _load(folder, weights)
         self._text = text
         self._together = bool(getattr(self._policy, "memoryless", False))
@@ -255,7 +322,7 @@ class LeRobotAgent(Agent):
     def act(
         self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
-        """Return the policy's actions (n, 7)."""
+        """Return the policy's actions, (n, 7) or (n, 16)."""
         import torch
 
         cuda = [device for device in self._devices if device != "cpu"]
@@ -271,6 +338,15 @@ class LeRobotAgent(Agent):
                 self._slots[slot] = policy, {device: _random(device) for device in states}
             return np.concatenate(actions)
 
+    def _state(self, robots: Sequence[Robot]) -> NDArray[np.float32]:
+        """Return what the policy sees of the arms, (n, 7) or (n, 16).
+
+        Asked of the robot: another arm may have become active since it was observed.
+        """
+        if self.action_mode == names.ABSOLUTE:
+            return np.stack([simulated(robot).absolute_pos() for robot in robots])
+        return np.stack([robot.agent_pos() for robot in robots])
+
     def _act(
         self, policy: LeRobotPolicy, robots: Sequence[Robot], observations: Sequence[Observation]
     ) -> Actions:
@@ -278,11 +354,11 @@ class LeRobotAgent(Agent):
         import torch
         from lerobot.envs.utils import preprocess_observation
 
-        # Asked of the robot: another arm may have become active since it was observed.
-        raw: dict[str, object] = {"agent_pos": np.stack([robot.agent_pos() for robot in robots])}
+        raw: dict[str, object] = {"agent_pos": self._state(robots)}
         if self._encoder is None:
             raw["pixels"] = {
-                view: np.stack([frame_of(o, view) for o in observations]) for view in self.cameras
+                shown: np.stack([frame_of(o, view) for o in observations])
+                for view, shown in self._shown.items()
             }
         else:
             views = [

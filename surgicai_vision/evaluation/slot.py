@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision import envs
+from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import PhysicsError
+from surgicai_vision.core.errors import InputError, PhysicsError
 from surgicai_vision.envs.episode_monitor import EpisodeMonitor
 from surgicai_vision.envs.moment import Moment, present_moment
 from surgicai_vision.envs.suture import Suture
@@ -60,6 +61,7 @@ def env_of(agent: Agent, config: TaskConfig) -> Env:
         cameras=cameras,
         image_size=agent.image_size,
         depth=agent.depth,
+        action_mode=agent.action_mode,
     )
     if cameras:
         env.defer_images()
@@ -94,6 +96,11 @@ class Slot:
     upset: bool = False
 
     def __post_init__(self) -> None:
+        if self.upset and self.agent.action_mode != names.INCREMENTS:
+            raise InputError(
+                f"{self.agent.name} says set-points of both arms, which an upset cannot alter; "
+                "leave --upset out."
+            )
         self.env = env_of(self.agent, self.task_config)
         self._mishap = Upset(self.env, None)
         self.monitor = EpisodeMonitor(self.env)

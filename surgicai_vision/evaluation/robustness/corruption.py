@@ -120,6 +120,7 @@ class CorruptedAgent(Agent):
         self.image_size = agent.image_size
         self.depth = agent.depth
         self.privileged = agent.privileged
+        self.action_mode = agent.action_mode
         self._agent = agent
         self._change = change
         self._strength = strength

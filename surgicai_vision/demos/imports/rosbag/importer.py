@@ -42,6 +42,8 @@ from surgicai_vision.demos.store import (
 from surgicai_vision.envs import SUBTASKS
 
 Row = Mapping[str, JSON]
+DEMONSTRATOR = "bag"
+"""Who demonstrates in a bag, as it is stored."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +102,7 @@ def import_bags(
             can be replayed.
         OutputExists: `out` holds something else.
     """
-    base = from_mapping(
-        TaskConfig, {**(env or {}), "task": check_name("subtask", task or "grasp", names.SUBTASKS)}
-    )
+    base = base_config(task, env)
     if task:
         check_output(out, may_resume=MARKER)
     # Read the bags, split into tracks.
@@ -114,13 +114,50 @@ def import_bags(
         usable, unusable = extract_tracks(bag, task, config, base)
         tracks += usable
         skipped += unusable
-    if not tracks:
-        raise InputError(f"Nothing can be imported: {skipped[0]['task']}: {skipped[0]['reason']}.")
     request: dict[str, object] = {
         "bags": [_digests(bag) for bag in bags],
         "bag": to_mapping(config),
         "env": dict(env or {}),
     }
+    return write_tracks(tracks, skipped, task, out, base, config, request, report)
+
+
+def base_config(task: str | None, env: Mapping[str, object] | None) -> TaskConfig:
+    """Return the env of an import: of a subtask that is wanted, or of any."""
+    return from_mapping(
+        TaskConfig, {**(env or {}), "task": check_name("subtask", task or "grasp", names.SUBTASKS)}
+    )
+
+
+def write_tracks(
+    tracks: Sequence[SegmentTrack],
+    skipped: Sequence[Row],
+    task: str | None,
+    out: Path,
+    base: TaskConfig,
+    config: BagConfig,
+    request: Mapping[str, object],
+    report: Progress,
+    demonstrator: str = DEMONSTRATOR,
+) -> list[BagSummary]:
+    """Replay tracks into folders of demonstrations, one a subtask.
+
+    Args:
+        tracks: what was found.
+        skipped: what was found and cannot be used.
+        task: the subtask that is wanted, into `out`; None: all, into `out`/<task>.
+        out: folder to make.
+        base: the env (`base_config`).
+        config: how the recording was read.
+        request: what was asked for; the same request finds its folders finished.
+        report: counts demonstrations.
+        demonstrator: who demonstrates, as it is stored.
+
+    Raises:
+        InputError: nothing can be replayed.
+    """
+    if not tracks:
+        raise InputError(f"Nothing can be imported: {skipped[0]['task']}: {skipped[0]['reason']}.")
     # Make a folder for each subtask that was found, or find it finished.
     summaries = []
     done = 0
@@ -140,6 +177,7 @@ def import_bags(
                 config,
                 asked,
                 functools.partial(_report_all, report, done, len(tracks)),
+                demonstrator,
             )
         done += len(of_subtask)
         marker = read_marker(folder)
@@ -167,6 +205,7 @@ def _build(
     config: BagConfig,
     request: Mapping[str, object],
     report: Callable[[int], None],
+    demonstrator: str,
 ) -> None:
     """Replay the tracks of one subtask and write its folder."""
     task = tracks[0].task
@@ -184,7 +223,7 @@ def _build(
     with building(out) as (_, result), whole_folder(result) as folder:
         for number, track in enumerate(tracks, 1):
             try:
-                demo, clipped = as_demonstration(replay, track.track)
+                demo, clipped = as_demonstration(replay, track.track, demonstrator)
             except UnreachablePose as error:
                 rows.append(track.row(str(error)))
             else:
@@ -206,10 +245,12 @@ def _build(
             "episodes": count,
             "notes": {"step": step, **counts},
         }
-        write_marker(folder, task, "bag", **details)
+        write_marker(folder, task, demonstrator, **details)
 
 
-def as_demonstration(replay: Replay, track: Track) -> tuple[Demo, int]:
+def as_demonstration(
+    replay: Replay, track: Track, demonstrator: str = DEMONSTRATOR
+) -> tuple[Demo, int]:
     """Return a track as a demonstration, and how many of its actions were clipped.
 
     Raises:
@@ -233,7 +274,7 @@ def as_demonstration(replay: Replay, track: Track) -> tuple[Demo, int]:
         for succeeded, info in zip(success[1:], infos[1:], strict=True)
     ]
     demo = replay.as_demo(
-        "bag",
+        demonstrator,
         states,
         action=action,
         reward=np.array(reward, dtype=np.float32),

@@ -14,7 +14,7 @@ from surgicai_vision.core.config import JSON, TaskConfig
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.demos.imports.replay import Episode, Track, grip_error, needle_path
 from surgicai_vision.demos.imports.rosbag.config import BagConfig, topic_list
-from surgicai_vision.demos.imports.rosbag.resample import Arm, Recording, resample
+from surgicai_vision.demos.imports.rosbag.resample import Arm, Arrays, Recording, resample
 from surgicai_vision.demos.imports.rosbag.segments import Segment, holes_passed, moving, segments
 from surgicai_vision.demos.imports.sandbox import read_sandboxed
 from surgicai_vision.scene import kinematics, needle
@@ -78,6 +78,21 @@ def extract_tracks(
     arrays = read_sandboxed(
         bag, "bag", topics=config.all_topics, needed=list(config.topics.given())
     )
+    return tracks_of(arrays, bag, task, config, base)
+
+
+def tracks_of(
+    arrays: Arrays, path: Path, task: str | None, config: BagConfig, base: TaskConfig
+) -> tuple[list[SegmentTrack], list[dict[str, JSON]]]:
+    """Return the tracks of a recording's segments, and what is skipped, as `extract_tracks`.
+
+    Args:
+        arrays: see `reader.read`.
+        path: what it was read from, for messages; its name is the tracks'.
+        task: the subtask that is wanted; None for all.
+        config: how to read it.
+        base: the scene.
+    """
     try:
         recording = resample(arrays, config, base.scene.instrument)
         pair = PAIRS[base.scene.layout][base.scene.hole_pair - 1]
@@ -90,11 +105,11 @@ def extract_tracks(
             end = float(recording.time[segment.stop])
             try:
                 track, pauses = _track(recording, passed, segment, config, base)
-                tracks.append(SegmentTrack(bag.name, segment.task, begin, end, track, pauses))
+                tracks.append(SegmentTrack(path.name, segment.task, begin, end, track, pauses))
             except UnusableSegment as error:
-                skipped.append(_row(bag.name, segment.task, begin, end, str(error)))
+                skipped.append(_row(path.name, segment.task, begin, end, str(error)))
     except InputError as error:
-        raise type(error)(f"{bag}: {error}") if type(error) is InputError else error from None
+        raise type(error)(f"{path}: {error}") if type(error) is InputError else error from None
     return tracks, skipped
 
 

@@ -1,0 +1,331 @@
+"""Import of the field's datasets: both arms' poses from LeRobot files, replayed in our scene.
+
+    summaries = import_dataset(Path("suturing"), task=None, out=Path("demos"))
+
+A LeRobot dataset of format v2.1 or v3 whose `observation.state` holds the poses of both arms, as
+Open-H-Embodiment and SutureBot publish them and `render-demos --layout open-h` writes them. An
+episode of it is read as a bag is (`rosbag.importer`): resampled to the control rate, split into
+subtasks, freed of pauses and replayed. Poses and labels are taken; images are theirs and stay.
+
+* Arms: the elements of the state are found by name, `psm1_pose.position.x` … `psm1_jaw`, or
+  `psm1_pos_x`, `psm1_quat_x`; without names a state of sixteen is PSM1's position, quaternion
+  x y z w and jaw, then PSM2's. Elements of other names, as of the ECM, are left out.
+* Frame: the endoscope's view, `ECM_view`, as a dVRK reports `measured_cp`. Where theirs stands
+  otherwise than ours (`envs.absolute.T_WORLD_VIEW`), give its pose in each arm's base as
+  `bag: {frames: {psm1: […], psm2: […]}}`; the jaw is the angle between the fingers.
+* Labels: our column `phase`, else `instruction.text` frame by frame, else the task. Our own
+  sentences are known; `bag: {labels: {"needle pickup": grasp}}` says what others mean.
+* Needle: our column `needle_pose`; without it the needle is where the task's definition puts it, as
+  in a bag without one.
+
+Nothing in the files runs. Columns that are not named here are never read, so neither are images.
+"""
+
+import dataclasses
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import JSON, to_mapping
+from surgicai_vision.core.errors import BadFile, InputError, first_line
+from surgicai_vision.core.files import check_output, read_json
+from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.demos.imports.rosbag.config import BagConfig
+from surgicai_vision.demos.imports.rosbag.importer import BagSummary, base_config, write_tracks
+from surgicai_vision.demos.imports.rosbag.tracks import SegmentTrack, tracks_of
+from surgicai_vision.demos.store import MARKER
+from surgicai_vision.envs import poses
+from surgicai_vision.envs.absolute import ARM_SIZE, SIZE, T_BASE_VIEW
+from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
+
+DATA = "data/chunk-*/*.parquet"
+"""Data files of both formats: one an episode in v2.1, many episodes a file in v3."""
+VERSIONS = ("v2.1", "v3.0", "v3.1")
+DEMONSTRATOR = "dataset"
+"""Who demonstrates, as it is stored."""
+TEXT = "instruction.text"
+VIEW = "ECM_view"
+POSE = "geometry_msgs/PoseStamped"
+JOINT = "sensor_msgs/JointState"
+UNIT_TOLERANCE = 0.01
+"""Furthest a quaternion's length may be from 1."""
+JITTER_S = 1e-3
+"""Times this near to the frame rate's are taken as those: they are stored as float32 [s]."""
+MAX_FRAMES = 5_000_000
+"""Frames of a dataset, at most."""
+ELEMENTS: Sequence[tuple[str, ...]] = (
+    (
+        *(f"_pose.position.{axis}" for axis in "xyz"),
+        *(f"_pose.orientation.{axis}" for axis in "xyzw"),
+        "_jaw",
+    ),
+    (*(f"_pos_{axis}" for axis in "xyz"), *(f"_quat_{axis}" for axis in "xyzw"), "_jaw"),
+)
+"""Endings of the names of an arm's eight elements, in our order: Open-H-Embodiment's converter, and
+sets made after it for peg transfer."""
+LABELS: Mapping[str, str] = MappingProxyType(
+    {names.TASK_TEXTS[name].lower(): name for name in names.SUBTASKS}
+)
+"""Our sentences, in lower case → subtask."""
+
+type Arrays = dict[str, NDArray[np.generic]]
+
+
+def import_dataset(
+    path: Path,
+    *,
+    task: str | None,
+    out: Path,
+    config: BagConfig = BagConfig(),  # noqa: B008  # frozen
+    env: Mapping[str, object] | None = None,
+    progress: Progress | None = None,
+) -> list[BagSummary]:
+    """Import a dataset into folders of demonstrations, one a subtask.
+
+    Args:
+        path: the dataset's folder.
+        task: the subtask that is wanted, into `out`; None: every one that is found, into
+            `out`/<task>.
+        out: folder to make; the same import of the same data finds it finished.
+        config: how to read it; topics and convention are a bag's.
+        env: fields of `TaskConfig`, among them the scene with its hole pair and instrument.
+        progress: called with (frames read, frames, "frames"), then (demonstrations done,
+            demonstrations, "demonstrations").
+
+    Raises:
+        UnknownName: an unknown task.
+        BadFile: a damaged dataset, or one of another format.
+        InputError: no poses of the arms, an unknown label, nothing that can be replayed.
+        OutputExists: `out` holds something else.
+    """
+    base = base_config(task, env)
+    if task:
+        check_output(out, may_resume=MARKER)
+    config = _in_view(config)
+    report = progress or silent
+    files = DatasetFiles(path)
+    tracks: list[SegmentTrack] = []
+    skipped: list[dict[str, JSON]] = []
+    content = hashlib.sha256()
+    read = 0
+    for number, arrays in files.episodes():
+        for key in sorted(arrays):
+            content.update(key.encode() + b"\0" + np.ascontiguousarray(arrays[key]).tobytes())
+        name = path / f"episode {number}"
+        usable, unusable = tracks_of(arrays, name, task, config, base)
+        tracks += usable
+        skipped += unusable
+        read += len(arrays["psm1_pose.time"])
+        report(read, max(read, files.frames), "frames")
+    if not read:
+        raise BadFile(f"{path} holds no frames ({DATA}).")
+    request: dict[str, object] = {
+        "dataset": content.hexdigest(),
+        "bag": to_mapping(config),
+        "env": dict(env or {}),
+    }
+    return write_tracks(tracks, skipped, task, out, base, config, request, report, DEMONSTRATOR)
+
+
+def _in_view(config: BagConfig) -> BagConfig:
+    """Return the config with the frame and the labels of a dataset where it gives none."""
+    view = {arm: _seven(arm) for arm in names.ARMS}
+    frames = dataclasses.replace(
+        config.frames,
+        psm1=config.frames.psm1 or view[names.PSM1],
+        psm2=config.frames.psm2 or view[names.PSM2],
+    )
+    return dataclasses.replace(config, frames=frames, labels={**LABELS, **config.labels})
+
+
+def _seven(arm: str) -> tuple[float, ...]:
+    """Return `ECM_view` in an arm's base, x y z [m] and a quaternion w x y z."""
+    pose = T_BASE_VIEW[arm]
+    return (*poses.position(pose), *matrix_to_quaternion_flat(poses.rotation(pose)))
+
+
+class DatasetFiles:
+    """The frames of a LeRobot dataset of either format, without their images.
+
+    Attributes:
+        frames: number of frames, as its metadata says.
+
+    Raises:
+        BadFile: no such dataset, a damaged one, or one of another format.
+        InputError: no poses of both arms.
+    """
+
+    def __init__(self, path: Path):
+        self._path = path
+        info = read_json(path / names.INFO_FILE)
+        try:
+            version = str(info["codebase_version"])
+            self._fps = float(info["fps"])
+            features = dict(info["features"])
+            self.frames = int(info.get("total_frames", 0))
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadFile(
+                f"{path / names.INFO_FILE} is not that of a LeRobot dataset ({first_line(error)})."
+            ) from None
+        if version not in VERSIONS or not self._fps > 0:
+            raise BadFile(
+                f"{path / names.INFO_FILE}: version {version!r}, {self._fps:g} fps; read are "
+                f"{', '.join(VERSIONS)}."
+            )
+        self._index = _elements(path, features)
+        self._columns = [names.STATE, "episode_index", "frame_index", "timestamp"]
+        wanted = (names.PHASE, TEXT, "task_index", names.NEEDLE_POSE)
+        self._columns += [key for key in wanted if key in features]
+
+    def episodes(self) -> Iterator[tuple[int, Arrays]]:
+        """Yield the number and the arrays of each episode, as `rosbag.reader.read` has them."""
+        tasks = self._tasks()
+        waiting: pa.Table | None = None
+        total = 0
+        for file in sorted(self._path.glob(DATA)):
+            try:
+                table = pq.read_table(file, columns=self._columns)
+                numbers = table.column("episode_index").to_numpy()
+            except (OSError, KeyError, pa.ArrowException) as error:
+                raise BadFile(f"{file} cannot be read ({first_line(error)}).") from None
+            total += len(table)
+            if total > MAX_FRAMES:
+                raise BadFile(f"{self._path} holds over {MAX_FRAMES} frames.")
+            cuts = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(table)]
+            for start, stop in itertools.pairwise(cuts):
+                part = table.slice(start, stop - start)
+                if waiting is not None and _number(waiting) == _number(part):
+                    waiting = pa.concat_tables([waiting, part])
+                    continue
+                if waiting is not None:
+                    yield _number(waiting), self._arrays(waiting, tasks)
+                waiting = part
+        if waiting is not None and len(waiting):
+            yield _number(waiting), self._arrays(waiting, tasks)
+
+    def _tasks(self) -> dict[int, str]:
+        """Return each task's sentence; none where they cannot be read."""
+        v3 = self._path / "meta/tasks.parquet"
+        v2 = self._path / "meta/tasks.jsonl"
+        try:
+            if v3.is_file():
+                rows = pq.read_table(v3).to_pylist()
+            elif v2.is_file():
+                rows = [json.loads(line) for line in v2.read_text("utf-8").splitlines() if line]
+            else:
+                return {}
+            texts = [str(row.get("task", row.get("__index_level_0__", ""))) for row in rows]
+            return {int(row["task_index"]): text for row, text in zip(rows, texts, strict=True)}
+        except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+            raise BadFile(
+                f"{self._path}: its tasks cannot be read ({first_line(error)})."
+            ) from None
+
+    def _arrays(self, table: pa.Table, tasks: Mapping[int, str]) -> Arrays:
+        """Return one episode's arrays."""
+        where = f"{self._path}, episode {_number(table)}"
+        state = _matrix(table, names.STATE, where)
+        if state.shape[1] <= max(map(max, self._index.values())):
+            raise BadFile(
+                f"{where}: {names.STATE} has {state.shape[1]} elements, fewer than named."
+            )
+        time = self._times(table)
+        arrays: Arrays = {"topics": np.array([names.STATE], dtype=str)}
+
+        def add(role: str, values: NDArray[np.generic], kind: str, frame: str = "") -> None:
+            arrays[f"{role}.time"] = time
+            arrays[f"{role}.stamp"] = np.zeros_like(time)
+            arrays[f"{role}.value"] = values
+            arrays[f"{role}.type"] = np.array(kind)
+            arrays[f"{role}.frame"] = np.array(frame)
+
+        for arm, index in self._index.items():
+            eight = state[:, index]
+            add(f"{arm}_pose", _pose(eight[:, [0, 1, 2, 6, 3, 4, 5]], where, arm), POSE, VIEW)
+            add(f"{arm}_jaw", eight[:, 7], JOINT)
+        if names.NEEDLE_POSE in table.column_names:
+            needle = _matrix(table, names.NEEDLE_POSE, where)
+            if needle.shape[1] == 7:
+                add("needle", _pose(needle, where, "the needle"), POSE, "world")
+        labels = _labels(table, tasks)
+        if labels is not None:
+            add("label", labels, "std_msgs/String")
+        return arrays
+
+    def _times(self, table: pa.Table) -> NDArray[np.int64]:
+        """Return each frame's time [ns], the frame rate's where they are as even as float32."""
+        even = table.column("frame_index").to_numpy().astype(np.float64) / self._fps
+        stored = table.column("timestamp").to_numpy().astype(np.float64)
+        is_even = bool((np.abs(stored - stored[0] - (even - even[0])) < JITTER_S).all())
+        seconds = even - even[0] if is_even else stored - stored[0]
+        return np.round(seconds * 1e9).astype(np.int64)
+
+
+def _number(table: pa.Table) -> int:
+    return int(table.column("episode_index")[0].as_py())
+
+
+def _elements(path: Path, features: Mapping[str, JSON]) -> dict[str, list[int]]:
+    """Return where each arm's eight values stand in the state."""
+    row = features.get(names.STATE)
+    given = row.get("names") if isinstance(row, dict) else None
+    while isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
+        given = given[0]
+    known = [str(name) for name in given] if isinstance(given, list) else []
+    for endings in ELEMENTS:
+        found = {arm: [f"{arm}{ending}" for ending in endings] for arm in names.ARMS}
+        if all(name in known for arm_names in found.values() for name in arm_names):
+            return {arm: [known.index(name) for name in row] for arm, row in found.items()}
+    shape = row.get("shape") if isinstance(row, dict) else None
+    if shape == [SIZE] and not any(name.startswith("psm") for name in known):
+        return {
+            arm: list(range(ARM_SIZE * number, ARM_SIZE * (number + 1)))
+            for number, arm in enumerate(names.ARMS)
+        }
+    raise InputError(
+        f"{path}: {names.STATE} has shape {shape} and elements {', '.join(known) or 'unnamed'}; "
+        f"needed are the poses and jaws of both arms, {', '.join(f'psm1{e}' for e in ELEMENTS[0])} "
+        "and so on."
+    )
+
+
+def _matrix(table: pa.Table, key: str, where: str) -> NDArray[np.float64]:
+    """Return a column of lists as (N, n)."""
+    try:
+        values = np.array(table.column(key).to_pylist(), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise BadFile(f"{where}: {key} holds no numbers ({first_line(error)}).") from None
+    if values.ndim != 2 or not np.isfinite(values).all():
+        raise BadFile(f"{where}: {key} must hold rows of finite numbers.")
+    return values
+
+
+def _pose(values: NDArray[np.float64], where: str, what: str) -> NDArray[np.float64]:
+    """Return poses (N, 7), x y z and a unit quaternion w x y z."""
+    length = np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+    if (np.abs(length - 1.0) > UNIT_TOLERANCE).any():
+        raise BadFile(f"{where}: a quaternion of {what} is no unit quaternion.")
+    return np.hstack([values[:, :3], values[:, 3:] / length])
+
+
+def _labels(table: pa.Table, tasks: Mapping[int, str]) -> NDArray[np.str_] | None:
+    """Return what each frame shows: its phase, its instruction or its task; None of nothing."""
+    there = table.column_names
+    if names.PHASE in there:
+        phases = table.column(names.PHASE).to_numpy()
+        if (phases >= 0).all():
+            return phases.astype(str)
+    if TEXT in there:
+        return np.array(table.column(TEXT).to_pylist(), dtype=str)
+    if "task_index" in there and tasks:
+        return np.array([tasks.get(int(row), "") for row in table.column("task_index").to_numpy()])
+    return None

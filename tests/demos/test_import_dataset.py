@@ -1,0 +1,224 @@
+"""Datasets of the field, LeRobot v2.1 and v3, become demonstrations that show what they showed."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from surgicai_vision import envs
+from surgicai_vision.commands.main import main
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.core.executor import RunContext
+from surgicai_vision.demos.imports.lerobot_dataset import import_dataset
+from surgicai_vision.demos.imports.rosbag.config import BagConfig, Frames
+from surgicai_vision.demos.record import record
+from surgicai_vision.demos.store import Demo, list_demos, read_demo
+from surgicai_vision.envs import poses
+
+AS_RECORDED = BagConfig(drop_pauses=False)
+Rows = dict[str, list[Any]]
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> list[Demo]:
+    """Two demonstrations of place that go on for a moment after their success."""
+    folder = tmp_path_factory.mktemp("import-dataset") / "demos"
+    record(TaskConfig("place"), episodes=2, out=folder, post_success_steps=5, context=RunContext(0))
+    return [read_demo(path) for path in list_demos(folder)]
+
+
+def rows_of(demo: Demo, episode: int) -> Rows:
+    """Return what a dataset holds of a demonstration, each frame a state before an action."""
+    env = envs.make(demo.config)
+    rows: Rows = {names.STATE: [], names.NEEDLE_POSE: []}
+    for state in demo.state[:-1]:
+        env.set_state_vector(state)
+        rows[names.STATE].append(env.absolute_pos().tolist())
+        rows[names.NEEDLE_POSE].append(env.needle_pose().tolist())
+    count = len(demo)
+    return {
+        **rows,
+        "instruction.text": ["Needle Throw"] * count,
+        "phase": [1] * count,
+        "episode_index": [episode] * count,
+        "frame_index": list(range(count)),
+        "timestamp": (np.arange(count) / names.FPS).astype(np.float32).tolist(),
+        "task_index": [0] * count,
+    }
+
+
+def write_dataset(
+    folder: Path,
+    episodes: Sequence[Rows],
+    version: str = "v3.0",
+    state_names: object = (list(names.ABSOLUTE_STATE_NAMES),),
+    task: str = names.TASK_TEXTS["place"],
+) -> Path:
+    """Write rows as a LeRobot dataset without images."""
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data/chunk-000").mkdir(parents=True)
+    features: dict[str, Mapping[str, object]] = {
+        key: {"dtype": "int64", "shape": [1], "names": None} for key in episodes[0]
+    }
+    features[names.STATE] = {"dtype": "float32", "shape": [16], "names": state_names}
+    info = {"codebase_version": version, "fps": names.FPS, "features": features}
+    (folder / names.INFO_FILE).write_text(json.dumps(info))
+    if version == "v2.1":
+        for number, rows in enumerate(episodes):
+            file = folder / f"data/chunk-000/episode_{number:06d}.parquet"
+            pq.write_table(pa.table(rows), file)
+        (folder / "meta/tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": task}) + "\n")
+    else:
+        table = pa.concat_tables([pa.table(rows) for rows in episodes])
+        pq.write_table(table, folder / "data/chunk-000/file-000.parquet", row_group_size=50)
+        index = pandas.Index([task], name="task")
+        pandas.DataFrame({"task_index": [0]}, index=index).to_parquet(folder / "meta/tasks.parquet")
+    return folder
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_arms_and_needle_are_where_they_were(
+    demos: list[Demo], tmp_path: Path, version: str
+) -> None:
+    rows = [rows_of(demo, number) for number, demo in enumerate(demos)]
+    path = write_dataset(tmp_path / "dataset", rows, version)
+    (made,) = import_dataset(path, task=None, out=tmp_path / "out", config=AS_RECORDED)
+    assert (made.task, len(made.paths), made.succeeded, made.skipped) == ("place", 2, 2, ())
+    assert made.out == tmp_path / "out" / "place"
+    env = envs.make(demos[0].config)
+    for path_made, original in zip(made.paths, demos, strict=True):
+        demo = read_demo(path_made)
+        assert demo.demonstrator == "dataset"
+        assert len(demo) == len(original) - 1, "the last frame is the last state"
+        for state, recorded in zip(demo.state, original.state, strict=False):
+            env.set_state_vector(recorded)
+            wanted = {arm: env.simulation.tip(arm) for arm in names.ARMS}
+            needle = env.needle_pose()
+            env.set_state_vector(state)
+            for arm, tip in wanted.items():
+                assert poses.distance(env.simulation.tip(arm), tip) < 1e-6
+                assert poses.angle(env.simulation.tip(arm), tip) < 1e-4
+            np.testing.assert_allclose(env.needle_pose(), needle, atol=1e-5)
+
+
+def test_the_same_import_finds_it_finished(demos: list[Demo], tmp_path: Path) -> None:
+    path = write_dataset(tmp_path / "dataset", [rows_of(demos[0], 0)])
+    first = import_dataset(path, task="place", out=tmp_path / "out")
+    again = import_dataset(path, task="place", out=tmp_path / "out")
+    assert first == again
+    assert first[0].out == tmp_path / "out"
+
+
+def test_elements_are_found_by_name_or_order(demos: list[Demo], tmp_path: Path) -> None:
+    """Of a set with short names, one with an ECM among them, and one without names."""
+    rows = rows_of(demos[0], 0)
+    short = [
+        name.replace("_pose.position.", "_pos_").replace("_pose.orientation.", "_quat_")
+        for name in names.ABSOLUTE_STATE_NAMES
+    ]
+    swapped = {
+        **rows,
+        names.STATE: [[*row[8:], 9.0, *row[:8]] for row in rows[names.STATE]],
+    }
+    own = list(names.ABSOLUTE_STATE_NAMES)
+    sets = {
+        "named": write_dataset(tmp_path / "named", [rows]),
+        "short": write_dataset(tmp_path / "short", [rows], state_names=short),
+        "unnamed": write_dataset(tmp_path / "unnamed", [rows], state_names=None),
+        "ecm": write_dataset(
+            tmp_path / "ecm", [swapped], state_names=[[*own[8:], "ecm_pose.position.x", *own[:8]]]
+        ),
+    }
+    states = []
+    for name, path in sets.items():
+        (made,) = import_dataset(path, task="place", out=tmp_path / f"{name}-out")
+        states.append(read_demo(made.paths[0]).state)
+    for state in states[1:]:
+        np.testing.assert_array_equal(state, states[0])
+
+
+def test_labels_come_from_phase_text_or_task(demos: list[Demo], tmp_path: Path) -> None:
+    rows = rows_of(demos[0], 0)
+    without = {key: values for key, values in rows.items() if key != "phase"}
+    texts = write_dataset(tmp_path / "texts", [without])
+    with pytest.raises(InputError, match="Needle Throw"):
+        import_dataset(texts, task=None, out=tmp_path / "refused")
+    meant = dataclasses.replace(BagConfig(), labels={"needle throw": "place"})
+    (made,) = import_dataset(texts, task=None, out=tmp_path / "meant", config=meant)
+    assert made.task == "place"
+    bare = {key: values for key, values in without.items() if key != "instruction.text"}
+    (made,) = import_dataset(
+        write_dataset(tmp_path / "bare", [bare]), task=None, out=tmp_path / "of-task"
+    )
+    assert made.task == "place"
+
+
+def test_a_frame_of_theirs_is_given_in_the_arm_s_base(demos: list[Demo], tmp_path: Path) -> None:
+    """Poses in the arms' own bases are as good, where the config says so."""
+    env = envs.make(demos[0].config)
+    rows = rows_of(demos[0], 0)
+    local = []
+    for state in demos[0].state[:-1]:
+        env.set_state_vector(state)
+        row: list[float] = []
+        for arm in names.ARMS:
+            pose = poses.square(env.simulation.tip_in_base(arm))
+            from scipy.spatial.transform import Rotation
+
+            turn = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+            row += [*pose[:3, 3].tolist(), *turn, 2.0 * env.simulation.jaw(arm)]
+        local.append(row)
+    same = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    config = BagConfig(frames=Frames(psm1=same, psm2=same))
+    found = []
+    for name, state_rows, given in (
+        ("view", rows[names.STATE], BagConfig()),
+        ("base", local, config),
+    ):
+        path = write_dataset(tmp_path / name, [{**rows, names.STATE: state_rows}])
+        (made,) = import_dataset(path, task="place", out=tmp_path / f"{name}-out", config=given)
+        found.append(read_demo(made.paths[0]).state[:, 1 : 1 + env.model.nq])
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda rows: {**rows, names.STATE: [[np.nan] * 16] * len(rows["phase"])}, "finite"),
+        (lambda rows: {**rows, names.STATE: [[0.1] * 16] * len(rows["phase"])}, "unit quaternion"),
+        (lambda rows: {**rows, names.STATE: [[0.1] * 3] * len(rows["phase"])}, "fewer elements"),
+    ],
+)
+def test_damaged_numbers_are_refused(
+    demos: list[Demo], tmp_path: Path, spoil: Any, message: str
+) -> None:
+    path = write_dataset(tmp_path / "dataset", [spoil(rows_of(demos[0], 0))])
+    with pytest.raises(BadFile, match=message):
+        import_dataset(path, task="place", out=tmp_path / "out")
+
+
+def test_other_datasets_are_refused_and_the_command_says_so(
+    demos: list[Demo], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = rows_of(demos[0], 0)
+    own = write_dataset(tmp_path / "own", [rows], state_names=list("abcdefgh") * 2 + ["psm1_x"])
+    assert main(["import-demos", str(own), "--out", str(tmp_path / "out")]) == 2
+    assert "poses and jaws of both arms" in capsys.readouterr().err
+    old = write_dataset(tmp_path / "old", [rows], "v1.6")
+    assert main(["import-demos", str(old), "--out", str(tmp_path / "out")]) == 2
+    assert "v1.6" in capsys.readouterr().err
+    good = write_dataset(tmp_path / "good", [rows], "v2.1")
+    assert main(["import-demos", str(good), "--topic", "needle=/n"]) == 2
+    given = ["import-demos", str(good), "--task", "place", "--out", str(tmp_path / "out"), "--json"]
+    assert main(given) == 0
+    made = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert made["tasks"]["place"]["episodes"] == 1
