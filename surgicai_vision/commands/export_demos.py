@@ -18,7 +18,7 @@ app = App(
 example:
   surgicai-vision export-demos --task grasp --format d3rlpy""",
 )
-FORMATS = ("npz", "sb3", "d3rlpy", "minari")
+FORMATS = ("npz", "sb3", "d3rlpy", "minari", "robomimic")
 OBS_TYPES = ("relative", "state", "goal")
 
 
@@ -31,7 +31,7 @@ class Options:
         task: The demonstrations' task.
         demos: Folder of demonstrations.
         obs_type: What transitions observe; goal for hindsight relabelling.
-        format: What reads them: npz, Stable-Baselines3, d3rlpy or Minari.
+        format: What reads them: npz, Stable-Baselines3, d3rlpy, Minari or robomimic.
         episodes: Take the first N demonstrations.
         env: Fields of the env that differ from the recorded one's, such as reward.
         out: Folder to make.

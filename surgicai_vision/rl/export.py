@@ -8,12 +8,22 @@
 | sb3 | `buffer.pkl` | `model.load_replay_buffer`; of obs_type "goal" a `HerReplayBuffer` |
 | d3rlpy | `dataset.h5` | `d3rlpy.dataset.ReplayBuffer.load(file, InfiniteBuffer())` |
 | minari | `minari/` | `minari.load_dataset(id)` with `MINARI_DATASETS_PATH` there |
+| robomimic | `demo.hdf5` | robomimic's `SequenceDataset`, and `train.py` with it |
+
+A Minari dataset knows its env: `recover_environment()` is the one that the transitions are of, and
+its episodes' seeds are those of their starts.
+
+robomimic's keys of observations are `flat` of an array, as its `EnvGym` has it, and the three parts
+of a goal dict; every tenth demonstration is in the mask `valid`, the others in `train`. It makes
+envs of the old package gym, whose steps have four results, so train with
+`experiment.rollout.enabled` false and evaluate elsewhere.
 
 `fill(buffer, transitions)` puts them into the replay buffer of a Stable-Baselines3 model of one's
 own, HER's included. d3rlpy keeps no observation after the last action of an episode, which it does
 not need: an episode ends with its success.
 """
 
+import copy
 import io
 import json
 import os
@@ -22,10 +32,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, cast
 
+import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
+from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.files import write_bytes, write_json
 from surgicai_vision.core.tasks import env_id
@@ -39,6 +52,12 @@ if TYPE_CHECKING:
 NPZ = "transitions.npz"
 CARD = "transitions.json"
 """What the folder holds, in words."""
+ROBOMIMIC_GYM = 2
+"""`EnvType.GYM_TYPE` of robomimic 0.3 (robomimic/envs/env_base.py)."""
+ROBOMIMIC_FLAT = "flat"
+"""robomimic's key of an observation that is one array (robomimic/envs/env_gym.py)."""
+VALID_EVERY = 10
+"""One demonstration in so many is for validation, as robomimic's split_train_val.py has it."""
 ACTIONS = spaces.Box(-1.0, 1.0, (7,), np.float32)
 
 
@@ -127,6 +146,7 @@ def _write_minari(transitions: Transitions, out: Path) -> Path:
     minari.create_dataset_from_buffers(
         f"surgicai/{config.task}/{transitions.obs_type}-v0",
         episodes,
+        env=spec_of(transitions),
         action_space=ACTIONS,
         observation_space=space_of(transitions),
         algorithm_name="surgicai-vision demonstrations",
@@ -136,14 +156,74 @@ def _write_minari(transitions: Transitions, out: Path) -> Path:
     return folder
 
 
+def _write_robomimic(transitions: Transitions, out: Path) -> Path:
+    import h5py
+
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        data = file.create_group("data")
+        data.attrs["total"] = len(transitions)
+        spec = spec_of(transitions)
+        data.attrs["env_args"] = json.dumps(
+            {"env_name": spec.id, "type": ROBOMIMIC_GYM, "env_kwargs": spec.kwargs}
+        )
+        data.attrs["demos"] = transitions.demos
+        masks: dict[str, list[bytes]] = {"train": [], "valid": []}
+        for index, rows in enumerate(_rows(transitions)):
+            name = f"demo_{index}"
+            demo = data.create_group(name)
+            demo.attrs["num_samples"] = rows.stop - rows.start
+            demo.attrs["seed"] = int(transitions.seeds[index])
+            demo["actions"] = transitions.action[rows]
+            demo["rewards"] = transitions.reward[rows]
+            demo["dones"] = ends(transitions)[rows].astype(np.int64)
+            for part, values in (
+                ("obs", transitions.observation),
+                ("next_obs", transitions.next_observation),
+            ):
+                for key, column in values.items():
+                    shown = key if transitions.is_goal else ROBOMIMIC_FLAT
+                    demo[f"{part}/{shown}"] = column[rows]
+            is_held_out = index % VALID_EVERY == VALID_EVERY - 1
+            masks["valid" if is_held_out else "train"].append(name.encode())
+        for mask, demos in masks.items():
+            if demos:
+                file[f"mask/{mask}"] = np.array(demos)
+    path = out / "demo.hdf5"
+    write_bytes(path, content.getvalue())
+    return path
+
+
 FORMATS: Mapping[str, Callable[[Transitions, Path], Path]] = MappingProxyType(
-    {"npz": _write_npz, "sb3": _write_sb3, "d3rlpy": _write_d3rlpy, "minari": _write_minari}
+    {
+        "npz": _write_npz,
+        "sb3": _write_sb3,
+        "d3rlpy": _write_d3rlpy,
+        "minari": _write_minari,
+        "robomimic": _write_robomimic,
+    }
 )
 """Format → what writes it."""
 PACKAGES: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"npz": (), "sb3": ("stable_baselines3",), "d3rlpy": ("d3rlpy",), "minari": ("minari",)}
+    {
+        "npz": (),
+        "sb3": ("stable_baselines3",),
+        "d3rlpy": ("d3rlpy",),
+        "minari": ("minari",),
+        "robomimic": ("h5py",),
+    }
 )
 """Format → what must be installed."""
+
+
+def spec_of(transitions: Transitions) -> EnvSpec:
+    """Return the gymnasium spec of the env that transitions are of, with its arguments."""
+    spec = copy.deepcopy(gymnasium.spec(env_id(transitions.config.task)))
+    options = to_mapping(transitions.config)
+    del options["task"], options["max_steps"]
+    spec.kwargs.update(options, obs_type=transitions.obs_type)
+    spec.max_episode_steps = transitions.config.max_steps
+    return spec
 
 
 def space_of(transitions: Transitions) -> spaces.Space[object]:

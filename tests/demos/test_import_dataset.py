@@ -11,6 +11,7 @@ import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from scipy.spatial.transform import Rotation
 
 from surgicai_vision import envs
 from surgicai_vision.commands.main import main
@@ -172,8 +173,6 @@ def test_a_frame_of_theirs_is_given_in_the_arm_s_base(demos: list[Demo], tmp_pat
         row: list[float] = []
         for arm in names.ARMS:
             pose = poses.square(env.simulation.tip_in_base(arm))
-            from scipy.spatial.transform import Rotation
-
             turn = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
             row += [*pose[:3, 3].tolist(), *turn, 2.0 * env.simulation.jaw(arm)]
         local.append(row)
@@ -195,7 +194,7 @@ def test_a_frame_of_theirs_is_given_in_the_arm_s_base(demos: list[Demo], tmp_pat
     [
         (lambda rows: {**rows, names.STATE: [[np.nan] * 16] * len(rows["phase"])}, "finite"),
         (lambda rows: {**rows, names.STATE: [[0.1] * 16] * len(rows["phase"])}, "unit quaternion"),
-        (lambda rows: {**rows, names.STATE: [[0.1] * 3] * len(rows["phase"])}, "fewer elements"),
+        (lambda rows: {**rows, names.STATE: [[0.1] * 3] * len(rows["phase"])}, "fewer than named"),
     ],
 )
 def test_damaged_numbers_are_refused(

@@ -267,7 +267,8 @@ class DatasetFiles:
         stored = table.column("timestamp").to_numpy().astype(np.float64)
         is_even = bool((np.abs(stored - stored[0] - (even - even[0])) < JITTER_S).all())
         seconds = even - even[0] if is_even else stored - stored[0]
-        return np.round(seconds * 1e9).astype(np.int64)
+        times: NDArray[np.int64] = np.round(seconds * 1e9).astype(np.int64)
+        return times
 
 
 def _number(table: pa.Table) -> int:
@@ -323,7 +324,7 @@ def _labels(table: pa.Table, tasks: Mapping[int, str]) -> NDArray[np.str_] | Non
     if names.PHASE in there:
         phases = table.column(names.PHASE).to_numpy()
         if (phases >= 0).all():
-            return phases.astype(str)
+            return np.array(phases, dtype=str)
     if TEXT in there:
         return np.array(table.column(TEXT).to_pylist(), dtype=str)
     if "task_index" in there and tasks:
