@@ -291,6 +291,8 @@ class LeRobotAgent(Agent):
         self.cameras = inputs.cameras
         self.image_size = inputs.image_size
         self.action_mode = inputs.action_mode
+        # Both arms' poses are asked of the env itself (`_state`); no driver tells them yet.
+        self.privileged = inputs.action_mode == names.ABSOLUTE
         self._shown = inputs.shown
         self._policy, self._before, self._after = _load(folder, weights)
         self._text = text

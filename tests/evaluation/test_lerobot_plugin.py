@@ -4,6 +4,7 @@ LeRobot's commands run in this process through their own `main`: importing them 
 time here.
 """
 
+import dataclasses
 import importlib.metadata
 import json
 import shutil
@@ -167,8 +168,6 @@ def test_lerobot_finds_the_distribution_by_its_name() -> None:
 
 
 def test_env_has_every_field_of_the_task_config_and_follows_a_dataset(dataset: Path) -> None:
-    import dataclasses
-
     from lerobot_env_surgicai import SurgicaiEnv
 
     own = {field.name for field in dataclasses.fields(SurgicaiEnv)}
@@ -791,3 +790,56 @@ def test_an_episode_is_told_by_its_seeds_sentence() -> None:
         vector.reset(seed=[seed])
         assert vector.call("task_description") == (draw_instruction("grasp", "train", seed),)
     vector.close()
+
+
+# -- the field's layout ----------------------------------------------------------------------------
+
+
+def test_act_trained_on_both_arms_poses_is_evaluated(
+    dataset: Path, tmp_path: Path, command
+) -> None:
+    """Stock `lerobot-train` on layout "open-h"; its policy acts by set-points in `evaluate`."""
+    from surgicai_vision.evaluation.hierarchical import HierarchicalAgent
+    from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
+    from surgicai_vision.evaluation.policy_spec import open_policy
+    from surgicai_vision.evaluation.rollout import evaluate
+    from surgicai_vision.evaluation.slot import Slot
+
+    views = ("endo_left", "wrist_psm1")
+    root = tmp_path / "open-h"
+    render_demos(
+        dataset.parent / "demos",
+        root,
+        views=views,
+        size=SIZE,
+        frame_stride=10,
+        layout="open-h",
+        context=RunContext(0),
+    )
+    settings = ["type=act", "device=cpu", "push_to_hub=false", "pretrained_backbone_weights=null"]
+    command(
+        "lerobot_train",
+        "--dataset.repo_id=local/open-h",
+        f"--dataset.root={root}",
+        *(f"--policy.{setting}" for setting in (*settings, *TINY["act"])),
+        "--batch_size=2",
+        "--steps=1",
+        "--num_workers=0",
+        f"--output_dir={tmp_path / 'act'}",
+    )
+    spec = open_policy(tmp_path / "act")
+    assert (spec.config.task, spec.config.action_repeat) == (TASK, 10)
+    agent = spec.make_agent()
+    assert (agent.action_mode, agent.cameras, agent.image_size) == (names.ABSOLUTE, views, SIZE)
+    short = dataclasses.replace(spec.config, max_steps=40)
+    (episode,) = evaluate(spec.make_agent, short, [names.TEST_SEED], workers=1)
+    assert not episode.row.error
+    assert episode.row.steps == 40
+    with pytest.raises(InputError, match="set-points of both arms"):
+        Slot(0, agent, spec.config, upset=True)
+    with pytest.raises(InputError, match="by increments"):
+        HierarchicalAgent(HierarchicalConfig(), [spec.make_agent] * 5)
+    seven = {names.STATE: {"type": "STATE", "shape": [7]}}
+    found = tmp_path / "act" / CHECKPOINT
+    with pytest.raises(InputError, match="7 of both or 16 of both"):
+        open_policy(changed(found, tmp_path / "mixed", input_features=seven))

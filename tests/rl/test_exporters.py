@@ -112,7 +112,7 @@ def test_robomimic_reads_it(exported):
         seq_length=1,
         hdf5_cache_mode=None,
         hdf5_use_swmr=False,
-        hdf5_filter_by_attribute="train",
+        filter_by_attribute="train",
         load_next_obs=True,
     )
     assert len(dataset) == len(found)
