@@ -1,6 +1,7 @@
 """Sweeps over algorithms: the runs of the shipped files, and one sweep from demonstrations on."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -9,10 +10,11 @@ from surgicai_vision.commands.sweep import grid_file, read_experiment
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.core.executor import RunContext
-from surgicai_vision.evaluation.storage import read_evaluation
+from surgicai_vision.evaluation.storage import GRID_FILE, read_evaluation
 from surgicai_vision.experiments.sweep.driver import run_sweep
 from surgicai_vision.experiments.sweep.plan import CACHED, Jobs, plan, read_experiment_of, run_key
 from surgicai_vision.experiments.sweep.rl_grid import RLGrid
+from surgicai_vision.rl import train as training
 from surgicai_vision.rl.algorithms import ALGORITHMS
 
 SHIPPED = {
@@ -74,6 +76,37 @@ def test_tasks_algorithms_and_seeds_may_be_added_later():
     larger = replace(small, seed=(0, 1), algo=("iql", "bc"), task=("grasp", "insert"))
     assert larger.extends(small.table()) and not small.extends(larger.table())
     assert not replace(larger, updates=5).extends(small.table())
+
+
+def test_a_killed_sweep_goes_on_inside_the_training(tmp_path, monkeypatch):
+    grid = RLGrid(
+        ("grasp",),
+        ("bc",),
+        demonstrations=(1,),
+        change={"bc": ["batch_size=16"]},
+        updates=6,
+        validation=0,
+        save_every=2,
+        episodes=1,
+    )
+    whole = run_sweep(grid, tmp_path / "whole", RunContext(0))
+    shutil.copytree(tmp_path / "whole" / "data", tmp_path / "killed" / "data")
+    shutil.copy(tmp_path / "whole" / GRID_FILE, tmp_path / "killed" / GRID_FILE)
+    saved = []
+    original = training._save
+
+    def save(learner, *arguments):
+        original(learner, *arguments)
+        saved.append(learner.done)
+        if saved == [2]:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(training, "_save", save)
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep(grid, tmp_path / "killed", RunContext(0))
+    again = run_sweep(grid, tmp_path / "killed", RunContext(0))
+    assert saved == [2, 4]  # not from the beginning
+    assert again["done"] == 1 and again["digest"] == whole["digest"]
 
 
 def test_a_sweep_trains_counts_and_is_not_done_twice(tmp_path):

@@ -8,14 +8,17 @@ import torch
 from stable_baselines3 import SAC, TD3
 
 from surgicai_vision import envs
+from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.store import list_demos
 from surgicai_vision.rl import extractor as extractors
+from surgicai_vision.rl import train as training
 from surgicai_vision.rl.buffers import DEMAND, HindsightBuffer, MixedBuffer, demonstrations_of
 from surgicai_vision.rl.export import fill
 from surgicai_vision.rl.extractor import FeatureMemo, RelativeExtractor
 from surgicai_vision.rl.nair import DemonstrationTD3, cloning_loss
 from surgicai_vision.rl.rlpd import LayerNormPolicy
+from surgicai_vision.rl.settings import Request
 from surgicai_vision.rl.transitions import of_demos
 from surgicai_vision.rl.vec_env import SuturingVecEnv
 
@@ -179,6 +182,13 @@ def test_a_share_of_every_batch_is_demonstrations(goal_demos):
     # Demonstrations keep the goals they reached.
     assert (batch.observations["desired_goal"][70:, DEMAND] == 1).all()
     env.close()
+
+
+def test_a_constant_input_is_divided_by_one(goal_demos):
+    request = Request("td3-her-bc", TaskConfig("grasp"), env_steps=300, demonstrations=1)
+    mean, std = training._statistics(request, goal_demos["grasp"])
+    asked = names.RELATIVE_NAMES.index("demanded")
+    assert (mean[asked], std[asked]) == (1.0, 1.0) and (std >= training.SMALLEST_STD).all()
 
 
 # -- networks --------------------------------------------------------------------------------------
