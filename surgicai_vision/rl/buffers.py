@@ -144,8 +144,11 @@ def demonstrations_of(transitions: Transitions) -> ReplayBuffer:
     and with four of five relabelled a batch hardly had one.
     """
     space = space_of(transitions)
-    kind = DictReplayBuffer if isinstance(space, spaces.Dict) else ReplayBuffer
-    buffer = kind(len(transitions), space, ACTIONS, device="cpu")
+    buffer: ReplayBuffer
+    if isinstance(space, spaces.Dict):
+        buffer = DictReplayBuffer(len(transitions), space, ACTIONS, device="cpu")
+    else:
+        buffer = ReplayBuffer(len(transitions), space, ACTIONS, device="cpu")
     fill(buffer, transitions)
     return buffer
 
