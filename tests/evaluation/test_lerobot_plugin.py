@@ -838,7 +838,10 @@ def test_act_trained_on_both_arms_poses_is_evaluated(
     with pytest.raises(InputError, match="set-points of both arms"):
         Slot(0, agent, spec.config, upset=True)
     with pytest.raises(InputError, match="by increments"):
-        HierarchicalAgent(HierarchicalConfig(), [spec.make_agent] * 5)
+        HierarchicalAgent(
+            HierarchicalConfig("order", *["act"] * 5, termination="privileged"),
+            [lambda: agent] * 5,
+        )
     seven = {names.STATE: {"type": "STATE", "shape": [7]}}
     found = tmp_path / "act" / CHECKPOINT
     with pytest.raises(InputError, match="7 of both or 16 of both"):
