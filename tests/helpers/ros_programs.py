@@ -24,17 +24,28 @@ while True:
     time.sleep(1.0)
 """
 COMMAND = "from surgicai_vision.commands.main import main\nsys.exit(main())\n"
+CRTK = ("OperatingState", "StringStamped")
+"""Messages of crtk_msgs, of which there are no wheels."""
+STAND_IN = """
+import types
+from std_msgs.msg import String
+package, module = types.ModuleType("crtk_msgs"), types.ModuleType("crtk_msgs.msg")
+module.OperatingState = module.StringStamped = String  # never sent
+sys.modules |= {"crtk_msgs": package, "crtk_msgs.msg": module}
+"""
 ECHO = """
 import json, time
 from example_messages import EXAMPLES
 from surgicai_vision.robot import topics
 from surgicai_vision.robot.transport import open_transport
 
-name, domain = sys.argv[1], int(sys.argv[2])
+name, domain, left_out = sys.argv[1], int(sys.argv[2]), sys.argv[3:]
 with open_transport(name, domain=domain) as transport:
     same = {}
     for message in EXAMPLES:
         kind = type(message).__name__
+        if kind in left_out:
+            continue
         topic = topics.Topic(f"/test/{kind}", type(message), topics.EVENT)
         publish = transport.publisher(topic)
         inbox = transport.inbox(topic)
@@ -66,7 +77,7 @@ def missing_rospy():
 
 def missing_rclpy(*packages):
     """Return why rclpy cannot be used here, or ""."""
-    imports = ", ".join(("rclpy", "numpy", "cyclopts", "surgicai_vision.robot.ros2", *packages))
+    imports = ", ".join(("rclpy", "numpy", "sensor_msgs.msg", "surgicai_vision.robot", *packages))
     probe = run_ros("rclpy", f"import {imports}")
     return (
         ""

@@ -7,7 +7,17 @@ import sys
 import numpy as np
 import pytest
 from example_messages import EXAMPLES
-from ros_programs import COMMAND, ECHO, master, missing_rclpy, missing_rospy, run_ros, running
+from ros_programs import (
+    COMMAND,
+    CRTK,
+    ECHO,
+    STAND_IN,
+    master,
+    missing_rclpy,
+    missing_rospy,
+    run_ros,
+    running,
+)
 from served import DOMAIN
 
 from surgicai_vision import envs
@@ -119,8 +129,19 @@ def test_a_real_rospy_without_a_master_is_refused(monkeypatch):
     assert "No master answers" in served.stderr
 
 
-def test_a_real_rclpy_carries_every_message_and_a_driven_episode(tmp_path):
-    """With ROS 2 itself, on the loopback."""
+def test_a_real_rclpy_carries_every_message_that_is_not_crtks():
+    """With ROS 2 itself, on the loopback; its wheels have no crtk_msgs."""
+    if problem := missing_rclpy():
+        pytest.skip(problem)
+    echo = run_ros("rclpy", STAND_IN + ECHO, "rclpy", DOMAIN % 200 + 5, *CRTK)
+    assert echo.returncode == 0, echo.stderr
+    said = json.loads(echo.stdout.splitlines()[-1])
+    assert len(said["same"]) == len(EXAMPLES) - len(CRTK)
+    assert all(said["same"].values()), said
+
+
+def test_a_real_rclpy_carries_crtks_messages_and_a_driven_episode(tmp_path):
+    """With ROS 2 itself and crtk_msgs, on the loopback."""
     if problem := missing_rclpy("crtk_msgs.msg"):
         pytest.skip(problem)
     domain = DOMAIN % 200 + 3
