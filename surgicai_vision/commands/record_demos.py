@@ -55,6 +55,8 @@ class Options:
         perturb_start_fraction: Share of episodes that start with a push that is not recorded.
         upset_fraction: Share of episodes in which something goes wrong once: the needle is pushed,
             or jaws open (docs/demos.md).
+        late: Most control steps by which --demonstrator recover notices a loss late; each episode
+            draws its own.
         learner: A checkpoint, or released:NAME, that acts until a step drawn at random; labels
             stay the expert's (DAgger).
         post_success_steps: Control steps that an episode goes on after its success.
@@ -75,6 +77,7 @@ class Options:
     ] = None
     perturb_start_fraction: Annotated[float, FRACTION] = 0.0
     upset_fraction: Annotated[float, FRACTION] = 0.0
+    late: Annotated[int, NOT_NEGATIVE] = 0
     learner: Annotated[Path | None, DIRECTORY] = None
     post_success_steps: Annotated[int, NOT_NEGATIVE] = 0
     workers: Annotated[int, COUNT] = folders.CORES
@@ -115,6 +118,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             options.perturb_start_fraction,
             options.noise_from,
             options.upset_fraction,
+            options.late,
         ),
         post_success_steps=options.post_success_steps,
         demos=demos,

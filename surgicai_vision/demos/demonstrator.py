@@ -23,7 +23,14 @@ if TYPE_CHECKING:
 
 
 class Demonstrator(ABC):
-    """Labels the states of one episode; made anew for every episode."""
+    """Labels the states of one episode; made anew for every episode.
+
+    Attributes:
+        late: control steps by which it notices late that something was lost, for one that goes back
+            to it (`Disturbance.late`).
+    """
+
+    late: int = 0
 
     @property
     def persists(self) -> bool:

@@ -30,12 +30,15 @@ class Disturbance:
         noise_from: lowest deviation; each episode draws its own between this and `noise`. None
             takes `noise` throughout.
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
+        late: most control steps by which a demonstrator that goes back notices a loss late; each
+            episode draws its own. It shows what a policy looks like that has not noticed yet.
     """
 
     noise: float = 0.0
     perturb_start_fraction: float = 0.0
     noise_from: float | None = None
     upset_fraction: float = 0.0
+    late: int = 0
 
     def __post_init__(self) -> None:
         if self.noise_from is not None and not 0.0 <= self.noise_from <= self.noise:
@@ -51,6 +54,9 @@ class Disturbance:
             raise InputError(
                 f"upset_fraction is {self.upset_fraction:g}; it must be within 0 and 1."
             )
+
+        if self.late < 0:
+            raise InputError(f"late is {self.late}; it must be at least 0 control steps.")
 
     def perturb_start(self, env: "SuturingEnv", rng: np.random.Generator) -> bool:
         """Move the tool away with the given probability; return False if that ended the episode."""
@@ -69,6 +75,10 @@ class Disturbance:
             return self.noise
         return float(rng.uniform(self.noise_from, self.noise))
 
+    def draw_late(self, rng: np.random.Generator) -> int:
+        """Return by how many control steps a loss is noticed late in an episode."""
+        return int(rng.integers(0, self.late, endpoint=True)) if self.late else 0
+
     @staticmethod
     def disturb(
         action: NDArray[np.float32], deviation: float, rng: np.random.Generator
@@ -80,3 +90,19 @@ class Disturbance:
 
 
 UNDISTURBED = Disturbance()
+
+RETURNING_DEMONSTRATORS = ("recover",)
+"""Those that go back to what was lost, and so can notice it late."""
+
+
+def check_late(demonstrator: str, disturbance: Disturbance) -> None:
+    """Refuse a late notice of a demonstrator that notices no loss.
+
+    Raises:
+        InputError: such a demonstrator is to be late.
+    """
+    if disturbance.late and demonstrator not in RETURNING_DEMONSTRATORS:
+        raise InputError(
+            f"late is {disturbance.late}, and demonstrator '{demonstrator}' goes back to nothing; "
+            f"leave it out or take demonstrator {', '.join(RETURNING_DEMONSTRATORS)}."
+        )

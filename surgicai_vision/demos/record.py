@@ -37,7 +37,7 @@ from surgicai_vision.demos.demonstrator import (
     BehaviourPolicy,
     make_demonstrator,
 )
-from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance
+from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance, check_late
 from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import (
     MARKER,
@@ -94,6 +94,7 @@ def record_into(
     perturb_start_fraction: float = 0.0,
     noise_from: float | None = None,
     upset_fraction: float = 0.0,
+    late: int = 0,
     post_success_steps: int = 0,
     demos: Sequence[str] = (),
     source: str = "",
@@ -105,7 +106,7 @@ def record_into(
         make_demonstrator(demonstrator, env, demos, source),
         seed,
         demonstrator,
-        Disturbance(noise, perturb_start_fraction, noise_from, upset_fraction),
+        Disturbance(noise, perturb_start_fraction, noise_from, upset_fraction, late),
         post_success_steps,
         behaviour,
     )
@@ -168,6 +169,7 @@ def record(
             f"source is '{source}', and demonstrator '{demonstrator}' chooses no demonstration; "
             f"leave it out or take demonstrator {choosing}."
         )
+    check_late(demonstrator, disturbance)
     if disturbance.upset_fraction:
         check_upset_task(config.task)
     # What decides the result: a finished folder of the same request is left as it is.

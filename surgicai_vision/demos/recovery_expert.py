@@ -14,6 +14,11 @@ it, or goes on inserting where the tip is in the tissue already. So a grasp need
 always in the middle of the range from which goals are drawn, since no image shows the goal. The
 phases of a recording go down where it goes back.
 
+With `late` it notices a loss so many control steps later, and does until then what it would do with
+the needle in its jaws. A high-level policy that learns from it sees what an arm looks like that has
+lost the needle and goes on (`training.visits` says from where on going back is due); a low-level
+policy should not learn from it.
+
 It gives up (`gives_up`) where no rule leads on: PSM2 cannot reach a needle that has come to rest
 (on its face, on edge, behind the ridge), or a grasp takes `PATIENCE` steps. Everything else is
 `Expert`'s, whose labels in an undisturbed procedure differ in the grasp's goal alone.
@@ -160,11 +165,12 @@ class RecoveryExpert(Demonstrator):
         is_inside = 0 < passed < hole_crossing.OUT
         if phase == GRASP and self._held >= DWELL:
             return INSERT if is_inside and self._is_on_path() else PLACE
-        if phase in (PLACE, INSERT) and self._lost >= LOST:
+        is_lost = self._lost >= LOST + self.late
+        if phase in (PLACE, INSERT) and is_lost:
             return GRASP
         if phase == HANDOFF and passed < 2 and not self._env.simulation.holds(names.PSM2):
             return GRASP
-        if phase == PULLOUT and self._lost >= LOST and passed == 2:
+        if phase == PULLOUT and is_lost and passed == 2:
             return HANDOFF
         return phase
 

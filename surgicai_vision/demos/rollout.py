@@ -155,6 +155,7 @@ def rollout(
     if not disturbance.perturb_start(env, rng):
         env.reset(seed=seed)  # the perturbation ended it; this start stays as it was
     deviation = disturbance.draw_deviation(rng)
+    demonstrator.late = disturbance.draw_late(rng)
     observation = env.observe() if behaviour else None
     if behaviour:
         behaviour.reset(env, seed, rng)

@@ -12,7 +12,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, TaskConfig, check_frame_stride
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.demos.demonstrator import SCRIPTED_DEMONSTRATORS
-from surgicai_vision.demos.disturbance import Disturbance
+from surgicai_vision.demos.disturbance import Disturbance, check_late
 
 SEEDS_EACH = 20_000
 """Start seeds that belong to one training seed."""
@@ -36,6 +36,7 @@ class Demonstrations:
         demonstrator: who demonstrates.
         noise: how much what the demonstrator executes is disturbed.
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
+        late: most control steps by which a demonstrator that goes back notices a loss late.
         post_success_steps: control steps an episode goes on after its success.
         frame_stride: control steps from frame to frame.
         env: fields of `TaskConfig` in the place of the plan's: a world that varies more than the
@@ -51,11 +52,12 @@ class Demonstrations:
     post_success_steps: int = 0
     frame_stride: int = 5
     upset_fraction: float = 0.0
+    late: int = 0
     env: Mapping[str, JSON] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_name("demonstrator", self.demonstrator, SCRIPTED_DEMONSTRATORS)
-        Disturbance(self.noise, upset_fraction=self.upset_fraction)  # refuses wrong shares
+        check_late(self.demonstrator, self.disturbance)
         check_frame_stride(self.frame_stride)
         if self.episodes < 1:
             raise InputError(
@@ -69,7 +71,7 @@ class Demonstrations:
     @property
     def disturbance(self) -> Disturbance:
         """What goes wrong in them."""
-        return Disturbance(self.noise, upset_fraction=self.upset_fraction)
+        return Disturbance(self.noise, upset_fraction=self.upset_fraction, late=self.late)
 
     @property
     def manner(self) -> str:
@@ -78,6 +80,7 @@ class Demonstrations:
         parts = [f"by the scripted {self.demonstrator}"]
         parts += [f"executed with noise {self.noise:g}"] if self.noise else []
         parts += [f"upset in {self.upset_fraction:.0%}"] if self.upset_fraction else []
+        parts += [f"noticed up to {self.late} steps late"] if self.late else []
         parts += [f"going on for {after} steps after their success"] if after else []
         parts += [f"a frame every {self.frame_stride} steps"] if self.frame_stride > 1 else []
         return ", ".join(parts)

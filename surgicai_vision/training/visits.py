@@ -72,18 +72,22 @@ def subtasks_due(
     step: NDArray[np.int64],
     episode_index: NDArray[np.int64],
     ahead: int = AHEAD,
+    contact: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.int64]:
     """Return the subtask that is due at every frame: the phase `ahead` control steps later.
 
     It is never taken from another episode, nor from beyond the end of a visit that was broken off:
     before an upset nothing shows that a return is near. With the first frame after it the label is
-    the phase that was returned to.
+    the phase that was returned to, and before where `contact` shows that the needle was lost and
+    the demonstrator had not noticed.
 
     Args:
         phase: (N,) recorded phases.
         step: (N,) control steps since each episode's beginning, rising in it.
         episode_index: (N,) episode of every frame, rising.
         ahead: control steps.
+        contact: (N,) whether the jaws hold the needle after each frame's action; None where it is
+            not known.
 
     Returns:
         (N,) int64, indices in `names.SUBTASKS`.
@@ -98,6 +102,12 @@ def subtasks_due(
     time = episode * (int(step.max()) + ahead + 1) + step
     later = np.searchsorted(time, time + ahead)
     due: NDArray[np.int64] = phase[np.minimum(later, limit[found.number])]
+    if contact is not None:
+        for visit in np.flatnonzero(~found.is_finished):
+            end = found.last[visit] + 1
+            held = np.flatnonzero(contact[found.first[visit] : end])
+            if len(held):
+                due[found.first[visit] + held[-1] + 1 : end] = phase[end]
     return due
 
 
@@ -163,6 +173,7 @@ def stages(
             "from the procedures themselves. Leave the subtask (--subtask) out."
         )
     success = np.asarray(columns[names.SUCCESS], bool)
-    due = subtasks_due(phase, step, episode_index)
+    contact = np.asarray(columns[names.CONTACT], bool) if names.CONTACT in columns else None
+    due = subtasks_due(phase, step, episode_index, contact=contact)
     share = progress(phase, step, episode_index, success)
     return np.stack([due, share], axis=1).astype(np.float32)

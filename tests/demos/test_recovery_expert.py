@@ -16,10 +16,11 @@ from surgicai_vision.demos.demonstrator import make_demonstrator
 from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.record import record
-from surgicai_vision.demos.recovery_expert import RecoveryExpert
+from surgicai_vision.demos.recovery_expert import LOST, RecoveryExpert
 from surgicai_vision.demos.rollout import Rollout, rollout
 from surgicai_vision.demos.store import read_demo, read_marker
 from surgicai_vision.envs.upset import UpsetPlan
+from surgicai_vision.training.visits import find_visits, subtasks_due
 
 SUTURE = TaskConfig(names.SUTURE)
 
@@ -121,6 +122,46 @@ def test_recordings_say_what_went_wrong_and_repeat_themselves(tmp_path):
     assert 0 < upset <= 3 + len(marker["skipped"])
     assert read_demo(paths[0]).executed is not None
     assert json.dumps(marker["upsets"])
+
+
+def test_late_it_goes_on_with_nothing_in_its_jaws_and_the_label_says_to_go_back(tmp_path):
+    """Frames between the loss and the way back are labelled with what is due, not what is done."""
+    late = {}
+    for steps in (0, 40):
+        wrong = Disturbance(noise=0.2, upset_fraction=1.0, late=steps)
+        request = {"episodes": 3, "demonstrator": "recover", "disturbance": wrong, "seed": 60}
+        found = []
+        for path in record(SUTURE, out=tmp_path / str(steps), **request):
+            demo = read_demo(path)
+            found.append(frames_without_needle(demo))
+        late[steps] = found
+        assert read_marker(tmp_path / str(steps))["request"].get("late", 0) == steps
+    lengths = {steps: [len(due) for due in found] for steps, found in late.items()}
+    assert max(lengths[0]) <= LOST < max(lengths[40]) <= LOST + 40
+    for due in late[40]:
+        assert set(due) <= {0}, "not every frame without the needle asks for a grasp"
+
+
+def frames_without_needle(demo):
+    """Return what is due in the frames of a broken-off placing or insertion after the loss."""
+    phase = demo.phase.astype(int)
+    episode = np.zeros(len(phase), int)
+    due = subtasks_due(phase, np.arange(len(phase)), episode, contact=demo.contact)
+    found = find_visits(phase, episode)
+    rows = []
+    for visit in np.flatnonzero(~found.is_finished):
+        if phase[found.first[visit]] in (1, 2):
+            whole = np.arange(found.first[visit], found.last[visit] + 1)
+            rows.extend(whole[np.flatnonzero(demo.contact[whole])[-1] + 1 :])
+    return due[rows]
+
+
+def test_who_goes_back_to_nothing_is_never_late(tmp_path):
+    with pytest.raises(InputError, match="late is 9, and demonstrator 'expert'"):
+        record(SUTURE, episodes=1, out=tmp_path / "a", disturbance=Disturbance(late=9))
+    with pytest.raises(InputError, match="late is -1"):
+        Disturbance(late=-1)
+    assert not (tmp_path / "a").exists()
 
 
 def test_upsets_are_refused_before_any_work(tmp_path):

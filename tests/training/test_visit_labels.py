@@ -57,6 +57,21 @@ def test_progress_rises_from_0_to_1_where_the_success_first_held() -> None:
             assert mine[-1] == pytest.approx(1 - 1 / len(mine)), "the last frame precedes it"
 
 
+def test_going_back_is_due_from_the_loss_on_and_not_from_where_it_is_noticed() -> None:
+    columns, index = joined(RECOVERY)
+    plain = stages(columns, index)
+    held = np.ones(len(index), bool)
+    held[58:70] = False  # the last twelve steps of the placing that was broken off
+    held[20:24] = False  # a grasp that flickers; it was not broken off
+    lost = stages(columns | {names.CONTACT: held}, index)
+    assert (lost[58:70, 0] == 0).all() and (plain[58:70, 0] == 1).all()
+    np.testing.assert_array_equal(
+        np.delete(lost, np.s_[58:70], 0), np.delete(plain, np.s_[58:70], 0)
+    )
+    never = stages(columns | {names.CONTACT: np.zeros(len(index), bool)}, index)
+    np.testing.assert_array_equal(never, plain)
+
+
 def test_an_env_holds_a_success_as_long_as_progress_says() -> None:
     """Count the steps as `envs.suture` does: the step that fills the dwell is the visit's last."""
     length = 40
