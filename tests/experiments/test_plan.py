@@ -19,6 +19,7 @@ from surgicai_vision.commands.console import QuietConsole
 from surgicai_vision.commands.main import main
 from surgicai_vision.commands.sweep import read_experiment
 from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.files import configs_folder
@@ -313,13 +314,20 @@ def test_a_plan_of_a_single_seed_may_say_so_and_lists_no_conditions():
     assert {name for name, _ in built._evaluated.values()} == {*names.SUBTASKS, names.SUTURE}
 
 
-@pytest.mark.parametrize("name", ["procedure", "endoscope"])
+@pytest.mark.parametrize("name", ["procedure", "procedure-moved", "endoscope"])
 def test_a_shipped_headline_is_a_whole_plan_of_three_seeds(name):
     built = read_experiment(configs_folder() / "sweep" / f"{name}.yaml")
     assert built.seed == (0, 1, 2) and names.SUTURE in built.names
     standing = [run for run in built.runs if run.condition == "standing"]
     assert {run.task for run in standing} == set(names.TASKS)
     assert {run.starts.seeds for run in standing} == {range(900_000, 900_100)}
-    moved = next(run for run in built.runs if run.condition == "moved").env.randomisation
-    assert (moved.phantom_shift, moved.phantom_turn) == (10.0, 15.0)
-    assert (moved.camera_shift, moved.camera_turn, moved.kinematic_error) == (2.5, 2.5, 0.25)
+    assert all(run.env.randomisation == RandomisationConfig() for run in standing)
+
+
+def test_the_shipped_headline_of_a_moved_world_is_trained_and_counted_in_it():
+    built = read_experiment(configs_folder() / "sweep" / "procedure-moved.yaml")
+    worlds = [dataset.env.randomisation for dataset in built.datasets.values()]
+    worlds += [run.env.randomisation for run in built.runs if run.condition == "moved"]
+    for moved in worlds:
+        assert (moved.phantom_shift, moved.phantom_turn) == (10.0, 15.0)
+        assert (moved.camera_shift, moved.camera_turn, moved.kinematic_error) == (2.5, 2.5, 0.25)
