@@ -203,8 +203,9 @@ class Plan:
         _check_different("seed", self.seed)
         for seed in self.seed:
             first_seed(seed)
-        for name, number in (("episodes", self.episodes), ("size", self.size)):
-            if number < 1:
+        numbers = {"episodes": self.episodes, "size": self.size, "epochs": self.epochs}
+        for name, number in numbers.items():
+            if number is not None and number < 1:
                 raise InputError(f"{name} is {number}; it must be at least 1.")
         for recorded in self.demonstrations:
             self.recorded_env(recorded)
@@ -507,32 +508,20 @@ class Plan:
         episodes: int | None = None,
         size: int | None = None,
     ) -> "Plan":
-        """Return the plan with other numbers, to try it in minutes; see `Experiment.smaller`.
-
-        Raises:
-            InputError: a number below 1.
-        """
-        given = {
-            "demonstrations": demonstrations,
-            "epochs": epochs,
-            "episodes": episodes,
-            "size": size,
-        }
-        for name, number in given.items():
-            if number is not None and number < 1:
-                raise InputError(f"{name} is {number}; it must be at least 1.")
+        """Return the plan with other numbers, to try it in minutes; see `Experiment.smaller`."""
+        recorded = self.demonstrations
+        if demonstrations is not None:
+            recorded = tuple(replace(each, episodes=demonstrations) for each in recorded)
+        conditions = self.conditions
+        if episodes is not None:
+            conditions = tuple(replace(each, episodes=episodes) for each in conditions)
         return replace(
             self,
-            demonstrations=tuple(
-                replace(each, episodes=demonstrations or each.episodes)
-                for each in self.demonstrations
-            ),
-            conditions=tuple(
-                replace(each, episodes=episodes or each.episodes) for each in self.conditions
-            ),
-            epochs=epochs or self.epochs,
-            episodes=episodes or self.episodes,
-            size=size or self.size,
+            demonstrations=recorded,
+            conditions=conditions,
+            epochs=self.epochs if epochs is None else epochs,
+            episodes=self.episodes if episodes is None else episodes,
+            size=self.size if size is None else size,
         )
 
     @property

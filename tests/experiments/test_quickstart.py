@@ -1,7 +1,9 @@
 """The whole flow, tiny: quickstart and sweep from nothing, and once more without work."""
 
+import io
 import json
 import os
+from contextlib import redirect_stdout
 
 import PIL.Image
 import pyarrow.parquet as pq
@@ -44,13 +46,26 @@ def folder(tmp_path_factory):
     return path
 
 
-def run(folder, monkeypatch, capsys, *arguments):
+QUICKSTART = ("quickstart", "--config", "tiny.yaml", "--out", "out")
+
+
+@pytest.fixture(scope="module")
+def first(folder):
+    """What the first quickstart returned; its folder is `out`."""
+    code, result = run(folder, *QUICKSTART)
+    assert code == 0
+    return result
+
+
+def run(folder, *arguments):
     """Run a command in `folder`; return its exit code and its JSON result."""
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("SURGICAI_VISION_CACHE", str(folder / "cache"))
-    monkeypatch.setenv("SURGICAI_VISION_RELEASED", str(folder / "nothing"))
-    code = main([*arguments, "--json"])
-    return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+    told = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(told):
+        patch.chdir(folder)
+        patch.setenv("SURGICAI_VISION_CACHE", str(folder / "cache"))
+        patch.setenv("SURGICAI_VISION_RELEASED", str(folder / "nothing"))
+        code = main([*arguments, "--json"])
+    return code, json.loads(told.getvalue().splitlines()[-1])
 
 
 def times(folder):
@@ -63,11 +78,7 @@ def times(folder):
     }
 
 
-def test_quickstart_runs_and_runs_again_without_work(folder, monkeypatch, capsys):
-    code, first = run(
-        folder, monkeypatch, capsys, "quickstart", "--config", "tiny.yaml", "--out", "out"
-    )
-    assert code == 0
+def test_quickstart_runs_and_runs_again_without_work(folder, first):
     assert [result["policy"] for result in first["results"]] == [
         "imagenet-lite-back",
         "proprioception",
@@ -80,15 +91,13 @@ def test_quickstart_runs_and_runs_again_without_work(folder, monkeypatch, capsys
     assert 'src="data:video/mp4;base64,' in page and 'poster="data:image/jpeg;base64,' in page
     assert page.split('<h1 id="headline">')[1].startswith("Grasp, by the paper&#39;s recipe: ")
     before = times(folder / "out")
-    code, second = run(
-        folder, monkeypatch, capsys, "quickstart", "--config", "tiny.yaml", "--out", "out"
-    )
+    code, second = run(folder, *QUICKSTART)
     assert code == 0
     assert second["results"] == first["results"]
     assert times(folder / "out") == before
 
 
-def test_the_first_act_is_a_whole_procedure_by_whom_the_page_names(folder):
+def test_the_first_act_is_a_whole_procedure_by_whom_the_page_names(folder, first):
     sewn = json.loads((folder / "out/procedure/procedure.json").read_text())
     assert sewn["success"] and [row["subtask"] for row in sewn["subtasks"]] == list(names.SUBTASKS)
     assert sewn["policy"] == "expert" and "no policy is released" in sewn["why"]
@@ -109,43 +118,41 @@ def test_a_first_act_by_what_cannot_sew_is_refused_before_any_work(folder, monke
     assert not (folder / "never").exists()
 
 
-def test_a_checkpoint_of_it_is_evaluated_to_the_same_result(folder, monkeypatch, capsys):
+def test_a_checkpoint_of_it_is_evaluated_to_the_same_result(folder, first):
     stored = json.loads(
         (folder / "out/evaluations/imagenet-lite-back/evaluation.json").read_text()
     )["summary"]
     policy = "out/policies/imagenet-lite-back"
-    _, again = run(
-        folder, monkeypatch, capsys, "evaluate", policy, "--episodes", "2", "--workers", "2"
-    )
+    _, again = run(folder, "evaluate", policy, "--episodes", "2", "--workers", "2")
     assert {key: again[key] for key in stored} == stored
 
 
-def test_a_checkpoint_is_not_evaluated_on_another_task(folder, monkeypatch, capsys):
+def test_a_checkpoint_is_not_evaluated_on_another_task(folder, first, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main(["evaluate", "out/policies/proprioception", "--task", "place"]) == 2
     assert "trained for 'grasp'" in capsys.readouterr().err
 
 
-def test_quickstart_refuses_the_folder_of_another_plan(folder, monkeypatch, capsys):
+def test_quickstart_refuses_the_folder_of_another_plan(folder, first, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main(["quickstart", "--config", "tiny.yaml", "--out", "out", "--episodes", "3"]) == 2
     assert "other options" in capsys.readouterr().err
 
 
-def test_sweep_runs_reports_and_resumes(folder, monkeypatch, capsys):
-    code, first = run(folder, monkeypatch, capsys, "sweep", "grid.yaml", "--out", "sweep")
+def test_sweep_runs_reports_and_resumes(folder):
+    code, made = run(folder, "sweep", "grid.yaml", "--out", "sweep")
     assert code == 0
-    counts = {name: first[name] for name in ("runs", "done", "cached", "failed", "not_run")}
+    counts = {name: made[name] for name in ("runs", "done", "cached", "failed", "not_run")}
     assert counts == {"runs": 4, "done": 2, "cached": 0, "failed": 0, "not_run": 2}
     assert pq.read_table(folder / "sweep/episodes.parquet").num_rows == 4
     before = times(folder / "sweep")
-    code, second = run(folder, monkeypatch, capsys, "sweep", "grid.yaml", "--out", "sweep")
-    assert (second["done"], second["cached"], second["digest"]) == (0, 2, first["digest"])
+    code, second = run(folder, "sweep", "grid.yaml", "--out", "sweep")
+    assert (second["done"], second["cached"], second["digest"]) == (0, 2, made["digest"])
     after = times(folder / "sweep")
     assert {path for path in after if after[path] != before.get(path)} == {
         str(folder / "sweep/episodes.parquet")
     }
-    code, _ = run(folder, monkeypatch, capsys, "report", "sweep")
+    code, _ = run(folder, "report", "sweep")
     assert code == 0
     page = (folder / "sweep/report.html").read_text()
     assert page.split('id="missing"')[1].split('id="origin"')[0].count("r3m on back") == 1
