@@ -25,6 +25,7 @@ It gives up (`gives_up`) where no rule leads on: PSM2 cannot reach a needle that
 """
 
 import math
+from collections import deque
 from typing import final
 
 import numpy as np
@@ -59,15 +60,17 @@ from surgicai_vision.scene.rotations import matrix_to_rotvec, rotvec_to_matrix
 GRASP, PLACE, INSERT, HANDOFF, PULLOUT = range(len(names.SUBTASKS))
 
 LOST = 3
-"""Control steps without both pads on the needle after which it is lost: contact flickers."""
+"""Control steps without both pads on the needle after which it is lost; contact flickers."""
 STANDING = 0.0025
+"""Jaws that stand on the phantom are nearer to their grasp than this [m], …"""
 STILL = 0.0003
+"""… and their distance from it has changed by less than this [m] …"""
 STALLED = 12
-"""Jaws nearer to their grasp than the first [m], whose distance changed by less than the second in
-so many control steps, stand on the phantom."""
+"""… in so many control steps."""
 ON_PATH = 0.002
+"""A needle in the tissue that is off its path by less than this [m] …"""
 ON_PATH_ANGLE = math.radians(15.0)
-"""A needle in the tissue that is off its path by less [m, rad] is driven on, else drawn out."""
+"""… and this [rad] is driven on, else drawn out."""
 FLAT = math.cos(math.radians(10.0))
 """Cosine of the lean up to which a needle counts as lying flat."""
 UPRIGHT_SHARES = (1.0, 0.5, 0.0)
@@ -75,8 +78,9 @@ UPRIGHT_SHARES = (1.0, 0.5, 0.0)
 BESIDE = np.array([-5.0, 0.0, 5.0, 10.0])
 """Other angles tried beside the middle [deg]."""
 MOVED = 0.002
+"""The grasp of a needle that has moved further than this [m] …"""
 MOVED_ANGLE = math.radians(8.0)
-"""A needle that moved further than this [m, rad] is looked at anew."""
+"""… or turned further than this [rad] is chosen anew."""
 PATIENCE = 250
 """Control steps of a grasp after which it is given up; the expert takes 54 to 95."""
 
@@ -107,17 +111,20 @@ class RecoveryExpert(Demonstrator):
         self._env = env
         self._expert = Expert(env)
         self._phase = -1
+        # Of the present visit: its control steps, and those since the needle was taken or let go.
         self._steps = 0
         self._held = 0
         self._lost = 0
-        self._offs: list[float] = []
+        # Of its grasp: the jaws' last distances from it [m], whether they close, where it is in the
+        # needle (T_needle_tip), and the needle's pose when it was chosen (T_world_needle).
+        self._distances: deque[float] = deque(maxlen=STALLED)
         self._closes = False
         self._hold: Matrix | None = None
-        self._seen = np.eye(4)
+        self._chosen_at = np.eye(4)
 
     @property
     def gives_up(self) -> str:
-        """Return why it can go on no more, or ""."""
+        """Return why no rule leads on, or ""."""
         if self._steps > PATIENCE:
             return f"no way on from {names.SUBTASKS[self._env.phase]} in {PATIENCE} steps"
         if self._env.phase == PULLOUT and self._env.simulation.task_state.holes_passed < 2:
@@ -154,7 +161,7 @@ class RecoveryExpert(Demonstrator):
         self._steps = 0
         self._held = 0
         self._lost = 0
-        self._offs = []
+        self._distances.clear()
         self._closes = False
         self._hold = None
 
@@ -188,15 +195,16 @@ class RecoveryExpert(Demonstrator):
 
         Jaws that come no nearer, because they stand on the phantom, close where they are.
         """
-        if self._hold is None or _has_moved(self._seen, world.needle):
+        if self._hold is None or _has_moved(self._chosen_at, world.needle):
             self._hold = choose_grasp(world)
-            self._seen = world.needle.copy()
+            self._chosen_at = world.needle.copy()
             self._closes = False
         goal = world.needle @ self._hold
-        off = float(np.linalg.norm(world.tip[:3, 3] - goal[:3, 3]))
-        self._offs = [*self._offs[1 - STALLED :], off]
-        stands = len(self._offs) == STALLED and max(self._offs) - min(self._offs) < STILL
-        self._closes = off < STANDING and (self._closes or stands)
+        distance = float(np.linalg.norm(world.tip[:3, 3] - goal[:3, 3]))
+        self._distances.append(distance)
+        change = max(self._distances) - min(self._distances)
+        stands = len(self._distances) == STALLED and change < STILL
+        self._closes = distance < STANDING and (self._closes or stands)
         if self._closes:
             return ToolTarget(world.command, 0.0)
         is_flat = float(world.needle[2, 2]) > FLAT
@@ -242,12 +250,11 @@ def turned_upright(
     down = np.array([0.0, 0.0, -1.0])
     across = np.cross(axis, down)
     size = float(np.linalg.norm(across))
-    if size < 1e-9:
+    if size < 1e-9:  # it points down already, or up
         return grasp
-    way = math.atan2(size, float(axis @ down))
-    turn = (
-        needle_pose[:3, :3].T @ rotvec_to_matrix(share * way * across / size) @ needle_pose[:3, :3]
-    )
+    lean = math.atan2(size, float(axis @ down))
+    turn_in_world = rotvec_to_matrix(share * lean * across / size)
+    turn = needle_pose[:3, :3].T @ turn_in_world @ needle_pose[:3, :3]
     point = grasp[:3, 3] + GRASP_DEPTH * grasp[:3, 2]
     turned = np.eye(4)
     turned[:3, :3] = turn @ grasp[:3, :3]
@@ -262,11 +269,12 @@ def _above(tip: Matrix) -> Matrix:
     return above
 
 
-def _has_moved(seen: Matrix, now: Matrix) -> bool:
-    """Return True if the needle has moved or turned since its grasp was chosen."""
-    moved = float(np.linalg.norm(seen[:3, 3] - now[:3, 3]))
-    return moved > MOVED or _angle_between(seen, now) > MOVED_ANGLE
+def _has_moved(then: Matrix, now: Matrix) -> bool:
+    """Return True if the needle has moved or turned from one pose to the other, T_world_needle."""
+    moved = float(np.linalg.norm(then[:3, 3] - now[:3, 3]))
+    return moved > MOVED or _angle_between(then, now) > MOVED_ANGLE
 
 
 def _angle_between(a: Matrix, b: Matrix) -> float:
+    """Return the angle of the turn from one pose to the other [rad]."""
     return float(np.linalg.norm(matrix_to_rotvec(a[:3, :3].T @ b[:3, :3])))

@@ -36,6 +36,8 @@ from surgicai_vision.envs.grasp import REACH, SPREAD_X
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.phantom import ORIGIN, SIZE
 
+JAW = names.ACTION_NAMES.index("jaw")
+"""Place of the jaws in an action."""
 UPSET_STREAM = 0x0B5E7
 """Sets an upset's random numbers apart from the start's and the noise's, of the same seed."""
 PUSH = 0.005
@@ -58,7 +60,8 @@ WAITS: Mapping[str, tuple[int, int]] = MappingProxyType(
     {"push": (0, 60), "drop": (0, 75), "insertion": (0, 45), "handoff": (0, 12)}
 )
 """Kind → fewest and most control steps from when it can happen to when it does. The expert takes
-54 to 95 steps to its grasp, 65 to 70 from there to the entry, and 45 to 50 through the tissue."""
+54 to 95 steps to its grasp, 65 to 70 from there to the entry, and 45 to 50 through the tissue.
+"""
 TASK_KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "grasp": ("push",),
@@ -136,13 +139,14 @@ class Upset:
 
     @property
     def kind(self) -> str:
-        """Return what happened, one of `KINDS`, or "" where nothing has."""
+        """What happened, one of `KINDS`, or "" where nothing has."""
         return self._plan.kind if self._plan is not None and self.step >= 0 else ""
 
     def before_step(self) -> bool:
         """Let it happen where it is due; return True if the needle was pushed.
 
-        To be called before every control step, and before anybody looks at the state.
+        To be called before every control step, and before anybody looks at the state. A push that
+        finds no room is tried again at the next step.
         """
         plan = self._plan
         if plan is None or self.step >= 0:
@@ -153,14 +157,12 @@ class Upset:
         self._waited += 1
         if self._waited <= plan.wait and not is_late:
             return False
-        if plan.kind == "push":
-            if not _push(self._env, plan.heading):
-                return False
-            self.step = self._env.simulation.task_state.steps
-            return True
+        is_push = plan.kind == "push"
+        if is_push and not _push(self._env, plan.heading):
+            return False
+        self._opening = 0 if is_push else OPENING_STEPS
         self.step = self._env.simulation.task_state.steps
-        self._opening = OPENING_STEPS
-        return False
+        return is_push
 
     def altered(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return what is executed in the place of `action`, (7,): jaws that open, or itself."""
@@ -168,12 +170,12 @@ class Upset:
             return action
         self._opening -= 1
         opened = np.zeros_like(action)
-        opened[6] = 1.0
+        opened[JAW] = 1.0
         return opened
 
 
 def _can_push(env: SuturingEnv) -> tuple[bool, bool]:
-    """Return whether a needle lies free before its grasp, and whether the jaws are near it."""
+    """Return whether a needle lies free before its grasp, and whether jaws are about to take it."""
     arm = env.subtask.arm
     simulation = env.simulation
     if env.subtask.name != "grasp" or any(simulation.touching(arm)):
@@ -216,7 +218,7 @@ _POSSIBLE = MappingProxyType(
         "handoff": _can_open_handing,
     }
 )
-"""Kind → whether it can happen now, and whether it must before it is too late."""
+"""Kind → whether it can happen now, and whether it must, for soon it no longer can."""
 
 
 def _push(env: SuturingEnv, heading: float) -> bool:

@@ -21,6 +21,8 @@ from surgicai_vision.core.config import JSON, to_mapping
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.hierarchical_config import (
+    CONFIDENCES,
+    PATIENCES,
     HierarchicalConfig,
     hierarchical_yaml,
     read_hierarchical,
@@ -31,9 +33,10 @@ from surgicai_vision.evaluation.storage import Row
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.training.run_config import Starts
 
-CHOSEN, MARK = "hierarchical.yaml", "ends.json"
-CONFIDENCES = (0.5, 0.7, 0.9)
-PATIENCES = (1, 2, 3)
+CHOSEN = "hierarchical.yaml"
+"""File with the best pair, in the sweep's folder."""
+MARK = "ends.json"
+"""File that says what the folder is a sweep of."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class Ends:
     delay_s: float | None
 
     def rank(self) -> tuple[float, float, float]:
-        """Return what is the least for the best."""
+        """Return what the best pair has the least of, the first counting most."""
         late = float("inf") if self.delay_s is None else self.delay_s
         return -self.successes, self.false_ends, late
 
@@ -105,10 +108,11 @@ def sweep_ends(
         dataclasses.replace(given, confidence=confidence, patience=patience)
         for confidence, patience in itertools.product(confidences, patiences)
     ]
-    owner = {**to_mapping(given), "confidence": None, "patience": None}
-    mine = {"hierarchical": owner, "env": dict(env or {}), "starts": to_mapping(starts)}
-    files.claim(out / MARK, mine, "the ends")
-    tried = {}
+    # Whatever pairs are tried: a later call may try others in the same folder.
+    policy = {**to_mapping(given), "confidence": None, "patience": None}
+    owner = {"hierarchical": policy, "env": dict(env or {}), "starts": to_mapping(starts)}
+    files.claim(out / MARK, owner, "the ends")
+    tried: dict[HierarchicalConfig, Ends] = {}
     for config in configs:
         name = f"confidence-{config.confidence:g}-patience-{config.patience}"
         file = out / f"{name}.yaml"

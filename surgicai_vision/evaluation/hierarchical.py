@@ -53,14 +53,14 @@ GRASP = names.SUBTASKS.index("grasp")
 
 
 @dataclass
-class _Progress:
-    """Where one episode stands.
+class _EpisodeState:
+    """Where one episode stands; made anew with every decision.
 
     Attributes:
         subtask: the one that is on; -1 before the first decision.
         steps: control steps it has taken.
-        decisions: decisions taken.
-        named: the other subtask that the high-level policy named last.
+        decisions: decisions taken in the episode.
+        named: the other subtask that the high-level policy named last; -1 where it named none.
         times: how often in a row it has.
     """
 
@@ -82,10 +82,10 @@ class _Choice:
 class _Ends(Protocol):
     """When a subtask ends."""
 
-    def is_asked(self, state: _Progress, robot: Robot) -> bool:
+    def is_asked(self, state: _EpisodeState, robot: Robot) -> bool:
         """Return True if the high-level policy is asked now."""
 
-    def believes(self, state: _Progress, choice: _Choice) -> bool:
+    def believes(self, state: _EpisodeState, choice: _Choice) -> bool:
         """Return True if what it says is a decision."""
 
 
@@ -100,14 +100,14 @@ class _PrivilegedEnds:
     def __init__(self, grasp_hold: int):
         self._grasp_hold = grasp_hold
 
-    def is_asked(self, state: _Progress, robot: Robot) -> bool:
-        """Return True if the env has gone on, which a grasp that has held long enough makes it."""
+    def is_asked(self, state: _EpisodeState, robot: Robot) -> bool:
+        """Let the env go on from a grasp that has held long enough; return True if it went on."""
         env = _suture(robot)
         if state.subtask == env.phase == GRASP and env.dwell >= self._grasp_hold:
             env.enter(GRASP + 1)
         return env.phase != state.subtask
 
-    def believes(self, state: _Progress, choice: _Choice) -> bool:
+    def believes(self, state: _EpisodeState, choice: _Choice) -> bool:
         """Return True: the subtask has ended, whatever comes next."""
         return True
 
@@ -123,11 +123,11 @@ class _LearnedEnds:
     def __init__(self, config: HierarchicalConfig):
         self._config = config
 
-    def is_asked(self, state: _Progress, robot: Robot) -> bool:
+    def is_asked(self, state: _EpisodeState, robot: Robot) -> bool:
         """Return True every so many steps."""
         return state.steps % self._config.decide_every == 0
 
-    def believes(self, state: _Progress, choice: _Choice) -> bool:
+    def believes(self, state: _EpisodeState, choice: _Choice) -> bool:
         """Return True once the same other subtask was named often enough in a row."""
         if choice.subtask == state.subtask or choice.probability < self._config.confidence:
             state.named, state.times = -1, 0
@@ -177,15 +177,16 @@ class HierarchicalAgent(Agent):
             raise InputError(
                 f"The policies see images of {sorted(sizes)} pixels; give policies of one size."
             )
-        self.image_size = sizes.pop() if sizes else 224
-        self._slots: dict[int, _Progress] = {}
+        if sizes:
+            self.image_size = sizes.pop()
+        self._slots: dict[int, _EpisodeState] = {}
         self._features: FeatureTable = {}
         for agent in self._agents:
             agent.share(self._features)
 
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Forget the slot's last episode."""
-        self._slots[slot] = _Progress()
+        self._slots[slot] = _EpisodeState()
         for agent in self._low:
             agent.reset(slot, robot, seed)
 
@@ -214,18 +215,25 @@ class HierarchicalAgent(Agent):
             state.steps += 1
         return actions
 
-    def _may_act(self, state: _Progress) -> bool:
+    def _may_act(self, state: _EpisodeState) -> bool:
         """Return True if a decision is still being carried out; else both arms hold still."""
         return state.decisions <= self.config.decisions
 
     def _decide(
         self,
         slots: Sequence[int],
-        states: list[_Progress],
+        states: list[_EpisodeState],
         robots: Sequence[Robot],
         observations: Sequence[Observation],
     ) -> None:
-        """Ask the high-level policy wherever it is due, and begin what it says."""
+        """Ask the high-level policy wherever it is due, and begin what it says.
+
+        Args:
+            slots: the running slots.
+            states: theirs; replaced in place where a subtask begins.
+            robots: theirs.
+            observations: theirs.
+        """
         due = [
             self._ends.is_asked(state, robot) or self._is_over(state)
             for state, robot in zip(states, robots, strict=True)
@@ -237,14 +245,15 @@ class HierarchicalAgent(Agent):
         for row, choice in zip(asked, chosen, strict=True):
             state = states[row]
             if self._is_over(state) or self._ends.believes(state, choice):
-                states[row] = self._slots[slots[row]] = _Progress(
+                # In the caller's list too: it acts by the new subtask in this very step.
+                states[row] = self._slots[slots[row]] = _EpisodeState(
                     choice.subtask, decisions=state.decisions + 1
                 )
                 self._low[choice.subtask].restart(slots[row])
             if self._may_act(states[row]):
                 robots[row].enter(states[row].subtask)
 
-    def _is_over(self, state: _Progress) -> bool:
+    def _is_over(self, state: _EpisodeState) -> bool:
         """Return True if no subtask is on, or it has taken all its steps."""
         return state.subtask < 0 or state.steps >= self.config.steps
 
@@ -265,5 +274,5 @@ class HierarchicalAgent(Agent):
 
 
 def _suture(robot: Robot) -> "Suture":
-    """Return the env of a hierarchical policy that is privileged."""
+    """Return the env that a privileged hierarchical policy is given as its robot."""
     return cast("Suture", robot)

@@ -23,6 +23,10 @@ ORDER = "order"
 SUFFIXES = (".yaml", ".yml")
 MAX_STEPS = 2000
 """Control steps of an episode: ten subtasks of full length."""
+CONFIDENCES = (0.5, 0.7, 0.9)
+"""Values of `HierarchicalConfig.confidence` that a sweep of the ends tries by default."""
+PATIENCES = (1, 2, 3)
+"""Likewise of `HierarchicalConfig.patience`."""
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from policies.base import Policy
 
 FOLDER = "progress"
+"""Folder of the progress policy in the checkpoint of the policy that is fed by it."""
 ROWS = 1024
 """Frames that are asked about at a time."""
 PROGRESS_AT = len(names.SUBTASKS)
@@ -49,11 +50,11 @@ def check_progress_policy(checkpoint: Checkpoint, dataset: Dataset) -> None:
         raise InputError(
             f"{folder} says no progress; train one with --policy hlp --recipe high-level."
         )
-    known = (dataset.config.task, names.SUTURE)
-    if checkpoint.task.task not in known:
+    allowed = dict.fromkeys((dataset.config.task, names.SUTURE))
+    if checkpoint.task.task not in allowed:
         raise InputError(
             f"{folder} says the progress of '{checkpoint.task.task}'; allowed here: "
-            f"{', '.join(dict.fromkeys(known))}."
+            f"{', '.join(allowed)}."
         )
     if checkpoint.views and checkpoint.image_size != dataset.image_size:
         raise InputError(
@@ -73,17 +74,17 @@ def with_progress(
         features: of the dataset's frames as the policy sees them, one entry a view.
     """
     arms = np.asarray(dataset.columns()[names.BOTH_ARMS], np.float32)
-    said = []
+    progress = []
     for at in range(0, dataset.length, ROWS):
         rows = slice(at, at + ROWS)
         seen = [np.asarray(entry.rows[rows], np.float32) for entry in features]
         answers = policy.act(np.concatenate(seen, axis=1) if seen else None, arms[rows])
-        said.append(answers[:, PROGRESS_AT:])
+        progress.append(answers[:, PROGRESS_AT:])
     return DatasetSubset(
         dataset,
         np.arange(dataset.length),
         {"progress": policy.checkpoint.policy_sha256},
-        added={names.PROGRESS: np.concatenate(said)},
+        added={names.PROGRESS: np.concatenate(progress)},
     )
 
 

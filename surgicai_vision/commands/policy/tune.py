@@ -21,6 +21,7 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON
+from surgicai_vision.evaluation.hierarchical_config import CONFIDENCES, PATIENCES
 from surgicai_vision.features.encoders import WeightsSource
 
 if TYPE_CHECKING:
@@ -50,8 +51,8 @@ class Options:
     """
 
     policy: Annotated[Path, Parameter(metavar="FILE")] = field(kw_only=False)
-    confidence: Annotated[tuple[float, ...], UNIQUE, Parameter(metavar="P[,P]")] = (0.5, 0.7, 0.9)
-    patience: Annotated[tuple[int, ...], UNIQUE, Parameter(metavar="N[,N]")] = (1, 2, 3)
+    confidence: Annotated[tuple[float, ...], UNIQUE, Parameter(metavar="P[,P]")] = CONFIDENCES
+    patience: Annotated[tuple[int, ...], UNIQUE, Parameter(metavar="N[,N]")] = PATIENCES
     episodes: Annotated[int, COUNT] = 20
     seed: Annotated[int, NOT_NEGATIVE] = names.VALIDATION_SEED
     workers: EvaluationWorkers = None
