@@ -14,8 +14,9 @@ app = App(
     name="submit",
     help_epilogue="""\
 example:
-  surgicai-vision evaluate outputs/train/mine --episodes 100 --out outputs/evaluate/mine
-  surgicai-vision submit outputs/evaluate/mine --name "My policy" --by "Jane Doe" --minutes 25""",
+  surgicai-vision submit outputs/evaluate/mine --name "My policy" --by "Jane Doe" --minutes 25
+the evaluation that it takes:
+  surgicai-vision evaluate outputs/train/mine --episodes 100 --out outputs/evaluate/mine""",
 )
 
 

@@ -105,6 +105,8 @@ def _check_order(
     """Check the index columns and the ends of the episodes."""
     if not np.array_equal(columns["index"], np.arange(dataset.length)):
         problems.append("index: not 0, 1, 2, … over the dataset.")
+    if dataset.task_index.any():
+        problems.append("task_index: not 0 in every frame.")
     bounds = dataset.bounds()
     if [int(dataset.episode_index[start]) for start, _ in bounds] != list(range(len(bounds))):
         problems.append("episode_index: episodes are not 0, 1, 2, … in order.")

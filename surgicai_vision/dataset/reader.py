@@ -111,6 +111,11 @@ class RenderedDataset:
         return total.hexdigest()
 
     @functools.cached_property
+    def task_index(self) -> NDArray[np.int64]:
+        """LeRobot's number of every frame's task, (N,) int64; a dataset of ours has one task, 0."""
+        return self._column("task_index").astype(np.int64, copy=False)
+
+    @functools.cached_property
     def episode_index(self) -> NDArray[np.int64]:
         """Episode of every frame, (N,) int64."""
         return self._column("episode_index").astype(np.int64, copy=False)

@@ -109,7 +109,9 @@ def table(groups: Sequence[Group]) -> list[Row]:
     found: dict[tuple[str, str], dict[str, Group]] = {}
     for item in groups:
         condition = item.condition
-        is_actor = condition.trained_by in ALGORITHMS and condition.plain
+        # Cloning from images is called "bc", too; an actor's run names its algorithm.
+        is_actor = any(result.run.algo for result in item.results) and condition.plain
+        is_actor = is_actor and condition.trained_by in ALGORITHMS
         if item.episodes and is_actor and condition.task in names.SUBTASKS and not condition.place:
             by_task = found.setdefault((condition.trained_by, _label(item)), {})
             by_task[condition.task] = item

@@ -68,7 +68,8 @@ def test_state_policy_sees_the_observation_of_obs_type_state() -> None:
         seen.append(vectors.copy())
         return np.full((len(vectors), 7), 0.3, np.float32)
 
-    agent = PolicyAgent("state", SimpleNamespace(act=act), None, (), 224, names.PRIVILEGED_STATE)
+    fed = (names.PRIVILEGED_STATE,)
+    agent = PolicyAgent("state", SimpleNamespace(act=act), None, (), 224, fed)
     evaluate(lambda: agent, TaskConfig("grasp", max_steps=3), [names.TEST_SEED], workers=1)
     env = envs.make(TaskConfig("grasp", max_steps=3), obs_type="state")
     observation, _ = env.reset(seed=names.TEST_SEED)

@@ -14,7 +14,7 @@ class LinearPolicy(Policy):
     """One layer without an activation."""
 
     def __init__(self, recipe: Recipe, visual: tuple[tuple[int, ...], ...]):
-        super().__init__(Inputs(visual, names.STATE if recipe.proprioception else None))
+        super().__init__(Inputs(visual, (names.STATE,) if recipe.proprioception else ()))
         self.layer = nn.Linear(self.inputs.dim, ACTIONS)
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
