@@ -32,18 +32,20 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnreachablePose
 from surgicai_vision.envs import poses
-from surgicai_vision.envs.control import JAW_OPEN, Command, StepSize, in_workspace
+from surgicai_vision.envs.control import (
+    JAW_OPEN,
+    Command,
+    StepSize,
+    in_workspace,
+    moved_towards,
+)
 from surgicai_vision.envs.simulation import Simulation
 from surgicai_vision.scene import kinematics
 from surgicai_vision.scene.cameras import ENDOSCOPE, ENDOSCOPE_DIRECTION, look_at
 from surgicai_vision.scene.kinematics import Pose
 from surgicai_vision.scene.rotations import (
     matrix_to_quaternion_flat,
-    matrix_to_rotvec_flat,
-    multiply_flat,
     quaternion_to_matrix_flat,
-    rotvec_to_matrix_flat,
-    transpose_flat,
 )
 
 SIZE = len(names.ABSOLUTE_STATE_NAMES)
@@ -164,27 +166,10 @@ def _toward(present: Command, pose: Pose, jaw: float, base: Pose, instrument: st
     """Return the command that follows `present` on the way to a pose and a finger's angle."""
     jaw = min(max(jaw, 0.0), JAW_OPEN)
     jaw = min(max(jaw, present.jaw - LEAP.jaw), present.jaw + LEAP.jaw)
-    aim = _leap(present.pose, pose)
+    aim = moved_towards(present.pose, pose, LEAP)
     if in_workspace(aim, base):
         try:
             return Command(aim, jaw, kinematics.inverse_flat(aim, instrument, present.joints))
         except UnreachablePose:
             pass
     return present._replace(jaw=jaw)
-
-
-def _leap(start: Pose, goal: Pose) -> Pose:
-    """Return `goal`, or where one `LEAP` from `start` towards it ends."""
-    far = poses.distance(start, goal) / LEAP.translation
-    turn = matrix_to_rotvec_flat(
-        multiply_flat(poses.rotation(goal), transpose_flat(poses.rotation(start)))
-    )
-    share = max(far, math.hypot(*turn) / LEAP.rotation)
-    if share <= 1.0:
-        return goal
-    x, y, z = (
-        a + (b - a) / share
-        for a, b in zip(poses.position(start), poses.position(goal), strict=True)
-    )
-    u, v, w = (angle / share for angle in turn)
-    return (x, y, z, *multiply_flat(rotvec_to_matrix_flat(u, v, w), poses.rotation(start)))

@@ -17,7 +17,12 @@ from surgicai_vision.core.config import STEPS
 from surgicai_vision.core.errors import UnreachablePose
 from surgicai_vision.envs import poses
 from surgicai_vision.scene.kinematics import Joints, Pose, inverse_flat
-from surgicai_vision.scene.rotations import multiply_flat, rotvec_to_matrix_flat
+from surgicai_vision.scene.rotations import (
+    matrix_to_rotvec_flat,
+    multiply_flat,
+    rotvec_to_matrix_flat,
+    transpose_flat,
+)
 
 JAW_OPEN = 1.0
 """Largest commanded jaw angle [rad]; 0 is closed."""
@@ -81,6 +86,26 @@ def moved(pose: Pose, action: list[float], step: StepSize) -> Pose:
         turn = step.rotation
         rotation = multiply_flat(rotvec_to_matrix_flat(a * turn, b * turn, c * turn), rotation)
     return (px + x * shift, py + y * shift, pz + z * shift, *rotation)
+
+
+def moved_towards(start: Pose, goal: Pose, step: StepSize) -> Pose:
+    """Return `goal`, or where one step from `start` on the straight way towards it ends.
+
+    Translation and rotation take the same share of their ways, so that both arrive together.
+    """
+    far = poses.distance(start, goal) / step.translation
+    turn = matrix_to_rotvec_flat(
+        multiply_flat(poses.rotation(goal), transpose_flat(poses.rotation(start)))
+    )
+    share = max(far, math.hypot(*turn) / step.rotation)
+    if share <= 1.0:
+        return goal
+    x, y, z = (
+        a + (b - a) / share
+        for a, b in zip(poses.position(start), poses.position(goal), strict=True)
+    )
+    u, v, w = (angle / share for angle in turn)
+    return (x, y, z, *multiply_flat(rotvec_to_matrix_flat(u, v, w), poses.rotation(start)))
 
 
 def follow(

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.envs import poses
-from surgicai_vision.envs.control import JAW_OPEN, StepSize, moved
+from surgicai_vision.envs.control import JAW_OPEN, StepSize, moved, moved_towards
 from surgicai_vision.envs.simulation import RELEASE_JAW, RELEASE_SHIFT
 from surgicai_vision.robot.arm import JAW_NAME
 from surgicai_vision.robot.driven import RELEASED, Command, DrivenRobot
@@ -33,13 +33,6 @@ from surgicai_vision.robot.guards import (
     problem_of_inputs,
 )
 from surgicai_vision.robot.messages import Header, JointState
-from surgicai_vision.scene.kinematics import Pose
-from surgicai_vision.scene.rotations import (
-    matrix_to_rotvec_flat,
-    multiply_flat,
-    rotvec_to_matrix_flat,
-    transpose_flat,
-)
 
 RELEASE_OPEN = 0.5
 """Finger's angle to which PSM2 opens when it lets go [rad] (`Simulation._let_go`)."""
@@ -158,7 +151,7 @@ class Setpoints:
             if not all(map(math.isfinite, (*target.pose, target.jaw))):
                 return {}, "the policy's set points are not finite"
             told = self._present(arm)
-            pose = _toward(told.pose, target.pose, self._step_size)
+            pose = moved_towards(told.pose, target.pose, self._step_size)
             jaw = min(max(target.jaw, 0.0), JAW_OPEN)
             limit = self._step_size.jaw
             jaw = min(max(jaw, told.jaw - limit), told.jaw + limit)
@@ -230,20 +223,3 @@ class Setpoints:
             self._robot.release_steps -= 1
         if self._is_stepped:
             self._client.step(sent, stamp)
-
-
-def _toward(start: Pose, goal: Pose, step: StepSize) -> Pose:
-    """Return `goal`, or where one step from `start` towards it ends."""
-    far = poses.distance(start, goal) / step.translation
-    turn = matrix_to_rotvec_flat(
-        multiply_flat(poses.rotation(goal), transpose_flat(poses.rotation(start)))
-    )
-    share = max(far, math.hypot(*turn) / step.rotation)
-    if share <= 1.0:
-        return goal
-    x, y, z = (
-        a + (b - a) / share
-        for a, b in zip(poses.position(start), poses.position(goal), strict=True)
-    )
-    u, v, w = (angle / share for angle in turn)
-    return (x, y, z, *multiply_flat(rotvec_to_matrix_flat(u, v, w), poses.rotation(start)))
