@@ -59,19 +59,10 @@ and what one unit of a joint moves [m, rad]: leaders' joints go from -100 to 100
 100, so that a whole turn of a joint is 100 mm, or 180°."""
 MOST_WAITING = 25.0
 """Steps that a leader may be ahead of the tip; what is more is left out."""
-_POSE = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
-POSITIONS = tuple(
-    f"{name}.pos"
-    for arm in names.ARMS
-    for name in (*(f"{arm}_pose.{part}" for part in _POSE), f"{arm}_jaw")
-)
+POSITIONS = tuple(f"{name}.pos" for name in names.ABSOLUTE_STATE_NAMES)
 """What is observed where the action is "absolute": both arms' tips in the frame of their
 `measured_cp`, quaternion x y z w, and the angle between the fingers."""
-TARGETS = tuple(
-    f"{name}.pos"
-    for arm in names.ARMS
-    for name in (*(f"{arm}_sp.{part}" for part in _POSE), f"{arm}_jaw_sp")
-)
+TARGETS = tuple(f"{name}.pos" for name in names.ABSOLUTE_ACTION_NAMES)
 """The same of the set points: an absolute action."""
 
 Values = Mapping[str, float]

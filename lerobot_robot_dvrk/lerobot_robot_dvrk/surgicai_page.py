@@ -6,7 +6,7 @@ this process saw last (`board`). → or Enter asks a served simulation for its n
 same again.
 
 The actions are the increments of `dvrk` in the active arm's base. Keys mean the endoscope's axes
-(`robot.frames.T_WORLD_VIEW`); its place over the arms is the simulation's.
+(`envs.absolute.T_WORLD_VIEW`); its place over the arms is the simulation's.
 """
 
 import logging
@@ -24,8 +24,8 @@ from lerobot_robot_dvrk.board import BOARD
 from lerobot_robot_dvrk.config_surgicai_page import SurgicaiPageConfig
 from lerobot_robot_dvrk.dvrk import NEXT, RESET, SAME
 from surgicai_vision.envs import poses
+from surgicai_vision.envs.absolute import T_WORLD_VIEW
 from surgicai_vision.envs.control import StepSize
-from surgicai_vision.robot.frames import T_WORLD_VIEW
 from surgicai_vision.robot.simulated import PSM_NAMES
 from surgicai_vision.scene import kinematics
 from surgicai_vision.teleoperation.input_map import CLOSE_ABOVE, FINE, OPENED

@@ -17,12 +17,13 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.imports.rosbag.config import Frames as BagFrames
 from surgicai_vision.envs import observation, poses
+from surgicai_vision.envs.absolute import T_WORLD_VIEW
 from surgicai_vision.envs.simulation import RELEASE_STEPS
 from surgicai_vision.envs.suture import PULLOUT_PHASE
 from surgicai_vision.evaluation.agent import Observation
 from surgicai_vision.robot.arm import FINGER_SHARE
 from surgicai_vision.robot.client import Client
-from surgicai_vision.robot.frames import T_WORLD_VIEW, VIEW, WORLD, read_pose
+from surgicai_vision.robot.frames import VIEW, WORLD, read_pose
 from surgicai_vision.robot.guards import BASE
 from surgicai_vision.robot.messages import (
     CompressedImage,

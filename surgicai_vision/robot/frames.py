@@ -17,8 +17,8 @@ from collections.abc import Mapping
 
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.envs import poses
+from surgicai_vision.envs.absolute import T_WORLD_VIEW
 from surgicai_vision.robot.messages import Header, PoseStamped
-from surgicai_vision.scene.cameras import ENDOSCOPE, ENDOSCOPE_DIRECTION, look_at
 from surgicai_vision.scene.kinematics import Pose, forward_flat
 from surgicai_vision.scene.rotations import (
     matrix_to_quaternion_flat,
@@ -36,21 +36,10 @@ STEP = 1e-5
 """Time over which a velocity is the difference of two poses [s]; its error is of second order."""
 
 
-def _endoscope_axes() -> tuple[Pose, Pose]:
-    """Return T_world_ECM and T_world_view of the endoscope, which stands still."""
-    camera = look_at(ENDOSCOPE_DIRECTION, (0.0, 0.0, 1.0))  # x right, y down, z forward
-    right, down, forward = (camera[:, axis].tolist() for axis in range(3))
-    left = [-value for value in right]
-    up = [-value for value in down]
-
-    def pose(x: list[float], y: list[float], z: list[float]) -> Pose:
-        return (*ENDOSCOPE, x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2])
-
-    return pose(forward, left, up), pose(left, up, forward)
-
-
-T_WORLD_ECM, T_WORLD_VIEW = _endoscope_axes()
-"""The endoscope's optical frame and its view in world (`scene.cameras.ENDOSCOPE`)."""
+T_VIEW_ECM: Pose = (0.0, 0.0, 0.0, *(0.0, 1.0, 0.0), *(0.0, 0.0, 1.0), *(1.0, 0.0, 0.0))
+"""The endoscope's optical frame in its view: x is the view's z, y its x, z its y."""
+T_WORLD_ECM = poses.compose(T_WORLD_VIEW, T_VIEW_ECM)
+"""The endoscope's optical frame in world."""
 
 
 def base_frame(name: str) -> str:

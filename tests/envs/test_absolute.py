@@ -20,7 +20,6 @@ from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import Demo
 from surgicai_vision.envs import SuturingEnv, absolute, poses
-from surgicai_vision.robot.frames import T_WORLD_VIEW
 
 
 def absolute_env(config: TaskConfig) -> SuturingEnv:
@@ -57,10 +56,6 @@ def test_setpoints_of_a_demonstration_replay_it(task: str) -> None:
     assert info["is_success"]
     turns = np.array(actions)[:, [*range(3, 7), *range(11, 15)]]
     assert np.abs(np.diff(turns, axis=0)).max() < 0.05, "a quaternion changed its sign"
-
-
-def test_the_frame_is_the_one_that_the_served_robot_reports_in() -> None:
-    np.testing.assert_allclose(absolute.T_WORLD_VIEW, T_WORLD_VIEW, atol=1e-12)
 
 
 def test_measured_values_are_the_world_s(env: SuturingEnv) -> None:

@@ -22,9 +22,9 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.envs import poses
+from surgicai_vision.envs.absolute import T_WORLD_VIEW
 from surgicai_vision.envs.control import JAW_OPEN, StepSize
 from surgicai_vision.robot import topics
-from surgicai_vision.robot.frames import T_WORLD_VIEW
 from surgicai_vision.robot.guards import GuardConfig
 from surgicai_vision.robot.messages import Header, StringStamped
 from surgicai_vision.teleoperation.inputs import JAW, START, Input

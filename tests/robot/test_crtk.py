@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnknownName
-from surgicai_vision.envs import poses
+from surgicai_vision.envs import absolute, poses
 from surgicai_vision.robot import arm as arms
 from surgicai_vision.robot import frames, topics
 from surgicai_vision.robot.arm import ArmState, Endoscope, Psm
@@ -135,7 +135,7 @@ def test_vectors_of_different_length_are_refused():
 
 def test_the_view_is_what_a_surgeon_sees():
     """X left, y up, z away (dvrk_simulator_base/cartesian_frames.py)."""
-    from_world = poses.invert(frames.T_WORLD_VIEW)
+    from_world = poses.invert(absolute.T_WORLD_VIEW)
     origin = poses.transform(from_world, ENDOSCOPE)
     assert np.allclose(origin, 0.0)
     needle_home = (0.0, 0.05, 0.075)
@@ -151,7 +151,7 @@ def test_the_view_is_what_a_surgeon_sees():
 
 
 def test_optical_frame_and_view_differ_by_the_contracts_rotation():
-    turn = np.array(poses.relative(frames.T_WORLD_ECM, frames.T_WORLD_VIEW)[3:]).reshape(3, 3)
+    turn = np.array(poses.relative(frames.T_WORLD_ECM, absolute.T_WORLD_VIEW)[3:]).reshape(3, 3)
     assert np.allclose(turn, [[0, 0, 1], [1, 0, 0], [0, 1, 0]])
     assert np.linalg.det(turn) == pytest.approx(1.0)
 

@@ -13,7 +13,7 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError
-from surgicai_vision.envs import poses
+from surgicai_vision.envs import absolute, poses
 from surgicai_vision.envs.control import JAW_OPEN, StepSize, moved
 from surgicai_vision.robot import frames, topics
 from surgicai_vision.robot.arm import FINGER_SHARE, JOINT_NAMES
@@ -107,7 +107,7 @@ def test_what_is_measured_is_what_the_simulation_reports(client):
         assert np.allclose(local, simulation.tip_in_base(arm), atol=1e-9)
         seen = said[f"/{name}/measured_cp"][0]
         assert seen.header.frame == "ECM_view"
-        in_world = poses.compose(frames.T_WORLD_VIEW, frames.read_pose(seen))
+        in_world = poses.compose(absolute.T_WORLD_VIEW, frames.read_pose(seen))
         assert np.allclose(in_world, simulation.tip(arm), atol=1e-9)
         jaw = said[f"/{name}/jaw/measured_js"][0].position[0]
         assert jaw * FINGER_SHARE == pytest.approx(simulation.jaw(arm))
