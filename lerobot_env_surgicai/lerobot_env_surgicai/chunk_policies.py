@@ -59,6 +59,22 @@ class LeRobotChunks(ChunkPolicy, abc.ABC):
     def build(self, recipe: ChunkRecipe) -> PreTrainedPolicy:
         """Return LeRobot's policy for this recipe."""
 
+    @abc.abstractmethod
+    def _batch(self, visual: torch.Tensor, vector: torch.Tensor) -> Batch:
+        """Return what LeRobot's policy sees; arguments as in `plan_normalised`."""
+
+    def chunk_loss(
+        self,
+        visual: torch.Tensor,
+        vector: torch.Tensor,
+        actions: torch.Tensor,
+        is_pad: torch.Tensor,
+    ) -> torch.Tensor:
+        """Return LeRobot's own loss of a batch (scalar)."""
+        batch = {**self._batch(visual, vector), ACTION: actions, IS_PAD: is_pad}
+        loss: torch.Tensor = self.network(batch)[0]
+        return loss
+
     def state_features(self) -> dict[str, PolicyFeature]:
         """Return what LeRobot is told of the inputs: the state, and the features in its place."""
         return {
@@ -73,7 +89,10 @@ class LeRobotChunks(ChunkPolicy, abc.ABC):
 
 @final
 class Act(LeRobotChunks):
-    """LeRobot's Action Chunking Transformer."""
+    """LeRobot's Action Chunking Transformer.
+
+    Its loss is L1, and the weighted divergence of the latent in training.
+    """
 
     normalisation = "mean_std"
 
@@ -91,18 +110,6 @@ class Act(LeRobotChunks):
         )
         return ACTPolicy(config)
 
-    def chunk_loss(
-        self,
-        visual: torch.Tensor,
-        vector: torch.Tensor,
-        actions: torch.Tensor,
-        is_pad: torch.Tensor,
-    ) -> torch.Tensor:
-        """Return LeRobot's loss: L1, and the weighted divergence of the latent in training."""
-        batch = {**self._batch(visual, vector), ACTION: actions, IS_PAD: is_pad}
-        loss: torch.Tensor = self.network(batch)[0]
-        return loss
-
     def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
         """Return the chunk of the latent's mean."""
         self.network.eval()
@@ -115,7 +122,10 @@ class Act(LeRobotChunks):
 
 @final
 class Diffusion(LeRobotChunks):
-    """LeRobot's Diffusion Policy with its convolutional U-Net."""
+    """LeRobot's Diffusion Policy with its convolutional U-Net.
+
+    Its loss is the squared error of the noise.
+    """
 
     def build(self, recipe: ChunkRecipe) -> PreTrainedPolicy:
         """Return `DiffusionPolicy`."""
@@ -130,18 +140,6 @@ class Diffusion(LeRobotChunks):
             do_mask_loss_for_padding=True,
         )
         return DiffusionPolicy(config)
-
-    def chunk_loss(
-        self,
-        visual: torch.Tensor,
-        vector: torch.Tensor,
-        actions: torch.Tensor,
-        is_pad: torch.Tensor,
-    ) -> torch.Tensor:
-        """Return LeRobot's loss: the squared error of the noise."""
-        batch = {**self._batch(visual, vector), ACTION: actions, IS_PAD: is_pad}
-        loss: torch.Tensor = self.network(batch)[0]
-        return loss
 
     def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
         """Return a chunk that is denoised from random numbers."""
