@@ -41,6 +41,8 @@ class Demonstrations:
         frame_stride: control steps from frame to frame.
         env: fields of `TaskConfig` in the place of the plan's: a world that varies more than the
             one policies are evaluated in.
+        visits_of: name of demonstrations of the whole procedure, whose visits of this task
+            (`demos.cut`) are rendered beside these.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Demonstrations:
     upset_fraction: float = 0.0
     late: int = 0
     env: Mapping[str, JSON] = field(default_factory=dict)
+    visits_of: str = ""
 
     def __post_init__(self) -> None:
         check_name("demonstrator", self.demonstrator, SCRIPTED_DEMONSTRATORS)
@@ -83,6 +86,7 @@ class Demonstrations:
         parts += [f"noticed up to {self.late} steps late"] if self.late else []
         parts += [f"going on for {after} steps after their success"] if after else []
         parts += [f"a frame every {self.frame_stride} steps"] if self.frame_stride > 1 else []
+        parts += [f"with the visits in '{self.visits_of}'"] if self.visits_of else []
         return ", ".join(parts)
 
 
@@ -96,6 +100,7 @@ class DatasetConfig:
         size: height and width of the images [px].
         depth: render depth beside RGB.
         first_seed: start seed of the first demonstration.
+        visited: the whole procedures whose visits are rendered too, where `demonstrations` says so.
     """
 
     env: TaskConfig
@@ -103,6 +108,7 @@ class DatasetConfig:
     size: int = 224
     depth: bool = False
     first_seed: int = names.TRAIN_SEED
+    visited: "DatasetConfig | None" = None
 
 
 def first_seed(training_seed: int) -> int:

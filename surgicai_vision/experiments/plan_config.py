@@ -214,6 +214,7 @@ class Plan:
                     f"demonstrations {recorded.name}: episodes is {recorded.episodes}; "
                     f"allowed: 1 to {MOST_EPISODES}."
                 )
+            self._check_visits(recorded)
         for policy in self.policies:
             self._check_policy(policy)
         for condition in self.conditions:
@@ -223,6 +224,14 @@ class Plan:
                 f"The plan has {len(self.runs)} runs, {len(set(self.runs))} of them different; "
                 "leave out policies that differ in nothing but their names."
             )
+
+    def _check_visits(self, recorded: Demonstrations) -> None:
+        """Refuse visits of what is no subtask, or in what is not recorded as a whole procedure."""
+        if not recorded.visits_of:
+            return
+        whole = [each.name for each in self.demonstrations if each.task == names.SUTURE]
+        check_name("demonstrations of the whole procedure", recorded.visits_of, whole)
+        check_name("task that is visited", recorded.task, names.SUBTASKS)
 
     def _check_policy(self, policy: PlannedPolicy) -> None:
         """Refuse a policy of what is not recorded, or not rendered."""
@@ -292,8 +301,14 @@ class Plan:
 
     def dataset(self, recorded: Demonstrations, seed: int) -> DatasetConfig:
         """Return the dataset of demonstrations for a training seed."""
-        env = self.recorded_env(recorded)
-        return DatasetConfig(env, recorded, self.size, first_seed=first_seed(seed))
+        visited = [each for each in self.demonstrations if each.name == recorded.visits_of]
+        return DatasetConfig(
+            self.recorded_env(recorded),
+            recorded,
+            self.size,
+            first_seed=first_seed(seed),
+            visited=self.dataset(visited[0], seed) if visited else None,
+        )
 
     def training(self, policy: PlannedPolicy, seed: int) -> RunConfig:
         """Return the training of a policy."""
@@ -309,7 +324,7 @@ class Plan:
             pool=(policy.pool or self.pool) if policy.view else "global",
             recipe=policy.recipe or self.recipe,
             changes=with_epochs(changes, self.epochs),
-            demonstrations=recorded.episodes,
+            demonstrations=None if recorded.visits_of else recorded.episodes,
             demonstrator=recorded.demonstrator,
             noise=recorded.noise,
             post_success_steps=recorded.post_success_steps,

@@ -1,16 +1,18 @@
 """Prepare: a task's demonstrations and its dataset in one folder, each made where it is missing."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset.render import render_demos
+from surgicai_vision.demos.cut import cut_demos
 from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance
 from surgicai_vision.demos.record import record
 from surgicai_vision.envs.upset import check_upset_task
-from surgicai_vision.experiments.dataset_config import DatasetConfig
+from surgicai_vision.experiments.dataset_config import DatasetConfig, Demonstrations
 
 
 def check_dataset(dataset: DatasetConfig) -> None:
@@ -26,10 +28,14 @@ def check_dataset(dataset: DatasetConfig) -> None:
 def make_dataset(dataset: DatasetConfig, folder: Path, context: RunContext) -> Path:
     """Record and render what `dataset` says, into `folder`/demos and `folder`/dataset.
 
+    Visits in whole procedures lie in `folder`/visits; the procedures themselves are recorded into
+    the folder beside `folder` that has their name, where they are not there yet.
+
     Returns:
         The dataset's folder; that of the demonstrations where nothing is rendered.
     """
     recorded = dataset.demonstrations
+    beside = [] if dataset.visited is None else [_cut(dataset.visited, recorded, folder, context)]
     return prepare_dataset(
         dataset.env,
         folder,
@@ -43,7 +49,18 @@ def make_dataset(dataset: DatasetConfig, folder: Path, context: RunContext) -> P
         disturbance=recorded.disturbance,
         post_success_steps=recorded.post_success_steps,
         seed=dataset.first_seed,
+        beside=beside,
     )
+
+
+def _cut(
+    visited: DatasetConfig, recorded: Demonstrations, folder: Path, context: RunContext
+) -> Path:
+    """Cut the visits of a task out of whole procedures; return their folder."""
+    alone = replace(visited, demonstrations=replace(visited.demonstrations, view=()))
+    whole = make_dataset(alone, folder.parent / visited.demonstrations.name, context)
+    cut_demos(whole, recorded.task, out=folder / "visits", stage=context.stage)
+    return folder / "visits"
 
 
 def prepare_dataset(
@@ -60,10 +77,11 @@ def prepare_dataset(
     disturbance: Disturbance = UNDISTURBED,
     post_success_steps: int = 0,
     seed: int = names.TRAIN_SEED,
+    beside: Sequence[Path] = (),
 ) -> Path:
     """Record demonstrations into `folder`/demos and render them into `folder`/dataset.
 
-    Without views nothing is rendered.
+    Without views nothing is rendered. Folders of demonstrations in `beside` are rendered with them.
 
     Returns:
         The dataset's folder; that of the demonstrations where nothing is rendered.
@@ -81,7 +99,7 @@ def prepare_dataset(
     if not views:
         return folder / "demos"
     render_demos(
-        folder / "demos",
+        [folder / "demos", *beside],
         folder / "dataset",
         views=views,
         size=size,

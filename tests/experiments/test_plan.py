@@ -62,6 +62,7 @@ TABLE = {
             "view": ["back"],
             "noise": 0.3,
             "env": VARIED,
+            "visits_of": "whole",
         },
     ],
     "policies": [
@@ -179,6 +180,7 @@ def test_a_policy_is_trained_on_what_the_plan_says(quiet, tiny):
     assert trained["place"].run.recipe == "paper" and trained["insert"].run.recipe == "best"
     assert trained["place"].run.noise == 0.3 and trained["insert"].run.noise == 0.6
     assert {card.run.env.randomisation.phantom_shift for card in trained.values()} == {3.0}
+    assert trained["place"].run.demonstrations == 2 + 2, "its own, and the visits of two procedures"
     assert tiny.suture["grasp"].name == "first" and not tiny.suture["grasp"].acts
     privileged = next(run for run in tiny.runs if run.condition == "privileged")
     assert "handoff" not in tiny.parts(privileged), "the expert is in its place"
@@ -289,6 +291,19 @@ def test_a_file_is_tried_small_beside_the_whole(tmp_path, monkeypatch, capsys):
             "within 0 and 1",
         ),
         ({"demonstrations": [{**TABLE["demonstrations"][0], "episodes": 9999}]}, "1 to 4000"),
+        (
+            {
+                "demonstrations": [
+                    TABLE["demonstrations"][0],
+                    {**TABLE["demonstrations"][1], "visits_of": "hole"},
+                ]
+            },
+            "'whole'",
+        ),
+        (
+            {"demonstrations": [{**TABLE["demonstrations"][0], "visits_of": "whole"}]},
+            "task that is visited",
+        ),
         ({"policies": [{**TABLE["policies"][0], "view": ["front"]}]}, "'front'"),
         ({"policies": [{**TABLE["policies"][0], "part": "grsp"}]}, "'grasp'"),
         ({"policies": [TABLE["policies"][0], {**TABLE["policies"][0], "name": "a"}]}, "each once"),

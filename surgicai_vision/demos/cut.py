@@ -1,0 +1,129 @@
+"""Cut: the visits of a subtask in recordings of whole procedures, as demonstrations of its own.
+
+    cut_demos(Path("demos/recover"), "grasp", out=Path("demos/grasp-visits"))
+
+A visit is a run of control steps of one phase. A procedure that goes back to a subtask
+(`demos.recovery_expert`) visits it more than once, and begins it where no start of the subtask on
+its own does: over a needle that was dropped, with a needle that is in the tissue already. Rendered
+together with demonstrations of the subtask's own (`render-demos --demos A,B`), visits teach its
+policy what to do there.
+
+What is left out of a visit that was broken off: everything after the jaws last touched the needle,
+for there the demonstrator had not noticed the loss yet (`record-demos --late`); and visits of fewer
+than `SHORTEST` steps.
+
+The folder is written whole; the same request finds it finished.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.files import check_output, whole_folder
+from surgicai_vision.core.progress import Stage, silent_stage
+from surgicai_vision.demos.record import finished
+from surgicai_vision.demos.store import (
+    MARKER,
+    Demo,
+    demos_digest,
+    list_demos,
+    read_demo,
+    read_marker,
+    write_demo,
+    write_marker,
+)
+
+SHORTEST = 5
+"""Control steps of the shortest visit that is kept: one frame, at the stride policies see."""
+
+
+def cut_demos(demos: Path, subtask: str, *, out: Path, stage: Stage = silent_stage) -> list[Path]:
+    """Write a subtask's visits in whole procedures as demonstrations; return their files.
+
+    Args:
+        demos: folder of demonstrations of the whole procedure.
+        subtask: one of `names.SUBTASKS`.
+        out: folder to make; the same request finds it finished.
+        stage: shows progress.
+
+    Raises:
+        UnknownName: no subtask of that name.
+        InputError: demonstrations of a single subtask, or without a visit of this one.
+        BadFile: `demos` holds no readable demonstrations.
+        OutputExists: `out` holds something else.
+    """
+    check_name("subtask", subtask, names.SUBTASKS)
+    marker = read_marker(demos)
+    if marker["task"] != names.SUTURE:
+        raise InputError(f"{demos} shows '{marker['task']}'; visits are cut from '{names.SUTURE}'.")
+    paths = list_demos(demos)
+    request = {"subtask": subtask, "demos": demos_digest(paths)}
+    check_output(out, may_resume=MARKER)
+    if finished(out, request):
+        return list_demos(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with whole_folder(out) as folder, stage(f"visits of {subtask}", "procedures") as progress:
+        count = 0
+        for done, path in enumerate(paths, 1):
+            for visit in visits(read_demo(path), subtask):
+                write_demo(folder, count, visit)
+                count += 1
+            progress(done, len(paths))
+        if not count:
+            raise InputError(f"{demos} holds no visit of '{subtask}'.")
+        details = {"request": request, "episodes": count}
+        write_marker(folder, subtask, marker["demonstrator"], **details)
+    return list_demos(out)
+
+
+def visits(demo: Demo, subtask: str) -> list[Demo]:
+    """Return a subtask's visits in a whole procedure, each as a demonstration of the subtask.
+
+    A visit's configuration is the procedure's, with the subtask's name and step limit.
+    """
+    config = dataclasses.replace(demo.config, task=subtask, max_steps=TaskConfig(subtask).max_steps)
+    number = names.SUBTASKS.index(subtask)
+    found = [
+        (first, _kept_end(demo, first, last))
+        for first, last in _runs(demo.phase.tolist())
+        if demo.phase[first] == number
+    ]
+    return [
+        dataclasses.replace(
+            demo,
+            config=config,
+            state=demo.state[first : end + 1],
+            action=demo.action[first:end],
+            phase=demo.phase[first:end],
+            reward=demo.reward[first:end],
+            success=demo.success[first:end],
+            contact=demo.contact[first:end],
+            executed=None if demo.executed is None else demo.executed[first:end],
+        )
+        for first, end in found
+        if end - first >= SHORTEST
+    ]
+
+
+def _runs(phase: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Yield the first and the last step of every run of equal phases."""
+    at = 0
+    for _, group in itertools.groupby(phase):
+        length = len(list(group))
+        yield at, at + length - 1
+        at += length
+
+
+def _kept_end(demo: Demo, first: int, last: int) -> int:
+    """Return the step after the last that is kept of a visit."""
+    is_broken_off = last + 1 < len(demo) and demo.phase[last + 1] < demo.phase[last]
+    if not is_broken_off:
+        return last + 1
+    touching = np.flatnonzero(demo.contact[first : last + 1])
+    return first + int(touching[-1]) + 1 if len(touching) else first
