@@ -34,7 +34,7 @@ from surgicai_vision.features.devices import find_device
 from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.rl.high_level_config import DECISIONS, SAVE_EVERY, HighLevelRequest
 from surgicai_vision.training import policies
-from surgicai_vision.training.checkpoint import Checkpoint, read_checkpoint
+from surgicai_vision.training.checkpoint import REQUEST, Checkpoint, read_checkpoint
 from surgicai_vision.training.run_config import RunConfig, with_budget
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     policies.check_progress_from(policies.recipe_of(run), options.progress_from)
     label = f"{options.subtask}-of-{task}" if options.subtask else task
     out = options.out or folders.train_folder(label, run.name, run.seed)
-    folders.check_folder(out, "training.json")
+    folders.check_folder(out, REQUEST)
     dataset: Dataset = folders.open_dataset(options.dataset, task, run.views)
     if options.subtask:
         from surgicai_vision.dataset.subset import of_subtask
@@ -292,7 +292,7 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
     ]
     if options.out and options.seeds > 1:
         raise InputError("--out names one folder; leave it out where --seeds trains several.")
-    from surgicai_vision.rl.train import REQUEST, run_of, train_seeds
+    from surgicai_vision.rl.train import run_of, train_seeds
 
     outs = []
     for request in requests:
@@ -345,7 +345,6 @@ def _high_level(options: Options, low: Path, console: Console) -> dict[str, obje
         for index in range(options.seeds)
     ]
     from surgicai_vision.rl.high_level import run_of, train_high_level
-    from surgicai_vision.rl.train import REQUEST
 
     outs = []
     for request in requests:

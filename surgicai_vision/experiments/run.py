@@ -27,10 +27,11 @@ from surgicai_vision.features.cache import Features, encode
 from surgicai_vision.features.devices import AUTO, CPU, find_device
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training import policies
+from surgicai_vision.training.checkpoint import REQUEST
 from surgicai_vision.training.chunks import timeline_of, with_chunks
 from surgicai_vision.training.progress_input import check_progress_policy, with_progress
 from surgicai_vision.training.run_config import RunConfig
-from surgicai_vision.training.train import REQUEST, epochs_within, train
+from surgicai_vision.training.train import epochs_within, train
 
 
 def train_run(

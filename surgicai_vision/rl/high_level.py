@@ -16,8 +16,6 @@ the same command gives the same result; the folder is that of `rl.train`.
 
 import dataclasses
 import functools
-import io
-import pickle
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,8 +33,8 @@ from policies.base import Policy, Recipe
 from surgicai_vision import __version__
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, to_mapping
-from surgicai_vision.core.errors import OutputExists, PhysicsError
-from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
+from surgicai_vision.core.errors import PhysicsError
+from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.envs.suture import Suture
 from surgicai_vision.evaluation.agent import Agent
@@ -49,13 +47,9 @@ from surgicai_vision.evaluation.slot import env_of
 from surgicai_vision.rl.extractor import StandardExtractor
 from surgicai_vision.rl.high_level_config import HighLevelRequest
 from surgicai_vision.rl.learner import linear, random_state, set_random_state
-from surgicai_vision.rl.train import CURVE, EVALUATED_AT_ONCE, IMAGE_SIZE, REQUEST, STATE
-from surgicai_vision.training.checkpoint import (
-    CARD,
-    Checkpoint,
-    read_checkpoint,
-    write_checkpoint,
-)
+from surgicai_vision.rl.train import CURVE, EVALUATED_AT_ONCE, IMAGE_SIZE
+from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
+from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
 from surgicai_vision.training.policies import policy_plugin
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
@@ -188,26 +182,19 @@ def train_high_level(
         InputError: policies of other subtasks, or of different scenes.
         OutputExists: `out` holds something else.
     """
-    check_output(out, may_resume=REQUEST)
     spec = hierarchical_policy(request.low)
     low = [open_policy(path, task=task) for task, path in request.low.low.items()]
     acting = [one.about.get("checkpoint") or one.name for one in low]
     wanted = {"code_version": __version__, "request": to_mapping(request), "low": acting}
-    if (out / REQUEST).exists() and read_json(out / REQUEST) != wanted:
-        raise OutputExists(
-            f"--out {out} holds another training; give a folder that does not exist yet."
-        )
-    if (out / CARD).exists():
-        return read_checkpoint(out)
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / REQUEST, wanted)
+    if done := begin(out, wanted):
+        return done
     with torch.random.fork_rng(devices=[]), one_thread():
         env = DecisionEnv(request.low, spec.config, [one.make_agent() for one in low])
         try:
             checkpoint = _run(request, spec.config, env, out, progress or silent)
         finally:
             env.close()
-    (out / STATE).unlink(missing_ok=True)
+    remove_state(out)
     return checkpoint
 
 
@@ -233,7 +220,7 @@ def _run(
         curve.append(_evaluate(request, task, model, env, minutes))
         write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
         if model.num_timesteps < request.decisions:
-            _save(model, env, curve, out / STATE)
+            _save(model, env, curve, out)
     progress(request.decisions, request.decisions)
     return _write(request, task, model, env, out)
 
@@ -282,9 +269,8 @@ def _statistics(env: DecisionEnv) -> tuple[list[float], list[float]]:
 # -- the state -------------------------------------------------------------------------------------
 
 
-def _save(model: PPO, env: DecisionEnv, curve: Sequence[Point], path: Path) -> None:
+def _save(model: PPO, env: DecisionEnv, curve: Sequence[Point], out: Path) -> None:
     """Write the training state, whole."""
-    content = io.BytesIO()
     state = {
         "parameters": model.get_parameters(),
         "decisions": model.num_timesteps,
@@ -293,15 +279,13 @@ def _save(model: PPO, env: DecisionEnv, curve: Sequence[Point], path: Path) -> N
         "random": random_state(),
         "curve": [dataclasses.asdict(point) for point in curve],
     }
-    torch.save(state, content)
-    write_bytes(path, content.getvalue())
+    write_state(out, state)
 
 
 def _resume(model: PPO, env: DecisionEnv, out: Path) -> list[Point]:
     """Go on from the training state, if there is a whole one; return the curve so far."""
-    try:
-        state = torch.load(out / STATE, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
+    state = read_state(out)
+    if state is None:
         return []
     model.set_parameters(state["parameters"], exact_match=True)
     model.num_timesteps = state["decisions"]

@@ -7,8 +7,6 @@ the folder.
 
 import dataclasses
 import functools
-import io
-import pickle
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,8 +22,8 @@ from policies.base import Policy
 from surgicai_vision import __version__, envs
 from surgicai_vision.core import names, processes
 from surgicai_vision.core.config import to_mapping
-from surgicai_vision.core.errors import InputError, OutputExists
-from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.envs.relative import relative_features
 from surgicai_vision.evaluation.agents import PolicyAgent
@@ -35,18 +33,12 @@ from surgicai_vision.rl.learner import Learner
 from surgicai_vision.rl.settings import Request, read_by
 from surgicai_vision.rl.transitions import Transitions, of_demos
 from surgicai_vision.scene.kinematics import base_in_world
-from surgicai_vision.training.checkpoint import (
-    CARD,
-    Checkpoint,
-    read_checkpoint,
-    write_checkpoint,
-)
+from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
+from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
 from surgicai_vision.training.policies import policy_plugin
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
 
-REQUEST = "training.json"
-STATE = "training_state.pt"
 CURVE = "curve.json"
 IMAGE_SIZE = 224
 """Of a checkpoint without images; nothing reads it."""
@@ -107,23 +99,16 @@ def train(
         OutputExists: `out` holds something else.
     """
     check_extra(f"--algo {request.algo}", *_packages(request))
-    check_output(out, may_resume=REQUEST)
     wanted = {"algo": request.algo, "code_version": __version__, "request": to_mapping(request)}
-    if (out / REQUEST).exists() and read_json(out / REQUEST) != wanted:
-        raise OutputExists(
-            f"--out {out} holds another training; give a folder that does not exist yet."
-        )
-    if (out / CARD).exists():
-        return read_checkpoint(out)
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / REQUEST, wanted)
+    if done := begin(out, wanted):
+        return done
     with torch.random.fork_rng(devices=[]), one_thread():
         learner = _learner(request, demos, workers)
         try:
             checkpoint = _run(request, learner, out, progress, tensorboard)
         finally:
             learner.close()
-    (out / STATE).unlink(missing_ok=True)
+    remove_state(out)
     return checkpoint
 
 
@@ -262,26 +247,23 @@ def _run(
         log.draw(curve[-1], losses)
         write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
         if learner.done < request.total:
-            _save(learner, curve, out / STATE)
+            _save(learner, curve, out)
         if progress:
             progress(min(learner.done, request.total), request.total)
     log.close()
     return _write(request, learner, out)
 
 
-def _save(learner: Learner, curve: Sequence[Point], path: Path) -> None:
+def _save(learner: Learner, curve: Sequence[Point], out: Path) -> None:
     """Write the training state, whole."""
-    content = io.BytesIO()
     points = [dataclasses.asdict(point) for point in curve]
-    torch.save({"learner": learner.get_state(), "curve": points}, content)
-    write_bytes(path, content.getvalue())
+    write_state(out, {"learner": learner.get_state(), "curve": points})
 
 
 def _resume(learner: Learner, out: Path) -> list[Point]:
     """Go on from the training state, if there is a whole one; return the curve so far."""
-    try:
-        state = torch.load(out / STATE, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
+    state = read_state(out)
+    if state is None:
         return []
     learner.set_state(state["learner"])
     return [Point(**point) for point in state["curve"]]

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 FORMAT = 2
 CARD = "checkpoint.json"
+REQUEST = "training.json"
+"""Marks the folder of a training that was begun; written first."""
 WEIGHTS = "policy.safetensors"
 
 
@@ -177,11 +179,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     """
     folder = Path(folder)
     if not (folder / CARD).is_file():
-        hint = (
-            "its training has not ended"
-            if (folder / "training.json").exists()
-            else f"no {CARD} in it"
-        )
+        hint = "its training has not ended" if (folder / REQUEST).exists() else f"no {CARD} in it"
         raise BadFile(
             f"{folder} is not a checkpoint ({hint}); make one with 'surgicai-vision train'."
         )

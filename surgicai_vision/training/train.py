@@ -23,9 +23,7 @@ machine.
 
 import ctypes
 import functools
-import io
 import json
-import pickle
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -41,30 +39,26 @@ from policies.base import Plugin, Policy, Recipe, visual_shapes
 from surgicai_vision import __version__
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, digest, to_mapping
-from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
-from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
+from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
 from surgicai_vision.training.augment import with_noise, with_shift
 from surgicai_vision.training.averages import MovingAverage
 from surgicai_vision.training.checkpoint import (
-    CARD,
     Checkpoint,
     EncoderRecord,
     StageErrors,
-    read_checkpoint,
     write_checkpoint,
 )
 from surgicai_vision.training.chunks import earlier_rows
 from surgicai_vision.training.data import column, cuts, over_places, split
+from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
 from surgicai_vision.training.progress_input import copy_progress_policy
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.stage_errors import stage_errors
 from surgicai_vision.training.threads import one_thread
 
-REQUEST = "training.json"
-STATE = "training_state.pt"
 STATE_EVERY = 5  # epochs between training states: a broken-off training loses at most these
 TRIM_THRESHOLD = -1  # of malloc.h, as is the next
 MMAP_THRESHOLD = -3
@@ -122,21 +116,13 @@ def train(
     task = _Task(dataset, tuple(features), policy, recipe, seed, run, progress_policy)
     out = Path(out)
     _check(task)
-    request = _request(task, start)
-    check_output(out, may_resume=REQUEST)
-    if (out / REQUEST).exists() and read_json(out / REQUEST) != request:
-        raise OutputExists(
-            f"--out {out} holds another training; give a folder that does not exist yet."
-        )
-    if (out / CARD).exists():
-        return read_checkpoint(out)
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / REQUEST, request)
+    if done := begin(out, _request(task, start)):
+        return done
     _keep_memory()
     where = torch.device(device)
     with torch.random.fork_rng(devices=_cuda(where)), one_thread():
         checkpoint = _Training(task, start, where).run(out, save_every, progress, log)
-    (out / STATE).unlink(missing_ok=True)
+    remove_state(out)
     return checkpoint
 
 
@@ -306,7 +292,7 @@ class _Training:
     ) -> Checkpoint:
         """Train all epochs; return the last one's checkpoint."""
         epochs = self.task.recipe.epochs
-        self._resume(out / STATE)
+        self._resume(out)
         if progress:
             progress(len(self.losses), epochs)
         while len(self.losses) < epochs:
@@ -320,7 +306,7 @@ class _Training:
             if save_every and done % save_every == 0 and done < epochs:
                 self._write(out / "epochs" / f"epoch_{done:04d}")
             if done % STATE_EVERY == 0 and done < epochs:
-                self._save(out / STATE)
+                self._save(out)
             if progress:
                 progress(done, epochs)
         return self._write(out, self._conclude())
@@ -500,9 +486,8 @@ class _Training:
                 total += self.policy.loss(observed, target).item() * len(rows)
         return total / len(self.held_rows)
 
-    def _save(self, path: Path) -> None:
+    def _save(self, out: Path) -> None:
         """Write what the next epoch needs."""
-        content = io.BytesIO()
         state = {
             "policy": self.policy.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -514,14 +499,12 @@ class _Training:
             "held_losses": self.held_losses,
             "average": self.average.state() if self.average else {},
         }
-        torch.save(state, content)
-        write_bytes(path, content.getvalue())
+        write_state(out, state)
 
-    def _resume(self, path: Path) -> None:
+    def _resume(self, out: Path) -> None:
         """Go on from a training state, if there is a whole one."""
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-        except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
+        state = read_state(out)
+        if state is None:
             return
         self.policy.load_state_dict(state["policy"])
         self.optimiser.load_state_dict(state["optimiser"])

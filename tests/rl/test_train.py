@@ -21,6 +21,7 @@ from surgicai_vision.rl import train as training
 from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.rl.settings import Request, Settings, settings_of
 from surgicai_vision.rl.train import train
+from surgicai_vision.training.folder import STATE
 from surgicai_vision.training.policies import load_policy
 
 SMALL = {"hidden": [16, 16], "batch_size": 16}
@@ -81,7 +82,7 @@ def test_every_algorithm_leaves_a_policy_that_acts_as_the_librarys(algo, demos, 
     assert set(checkpoint.recipe["settings"]) == set(ALGORITHMS[algo].settings)
     spec = open_policy(tmp_path / "out")
     assert spec.run == checkpoint.run and spec.config == request.env
-    assert not (tmp_path / "out" / training.STATE).exists()
+    assert not (tmp_path / "out" / STATE).exists()
 
 
 def library_actions(learner, seen):
@@ -123,7 +124,7 @@ def test_a_killed_training_ends_as_if_it_had_not_been_killed(algo, demos, tmp_pa
 
     with pytest.raises(Killed):
         train(request, paths, tmp_path / "killed", progress=kill, tensorboard=False)
-    assert (tmp_path / "killed" / training.STATE).exists()
+    assert (tmp_path / "killed" / STATE).exists()
     started = []
     resumed = train(
         request,
