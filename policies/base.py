@@ -27,7 +27,7 @@ from torch import nn
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import CLOCK_SIZE
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_name, check_positive
 
 if TYPE_CHECKING:
     from surgicai_vision.training.checkpoint import Checkpoint
@@ -108,8 +108,7 @@ class Recipe:
         check_name("split", self.split, ("episode", "transition"))
         check_name("schedule", self.schedule, ("constant", "one_cycle"))
         check_name("map_head", self.map_head, ("softmax", "convolutions"))
-        if self.frame_stride < 1:
-            raise InputError(f"frame_stride is {self.frame_stride}; it must be at least 1.")
+        check_at_least(1, frame_stride=self.frame_stride)
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(
                 f"hidden is {self.hidden}; give at least one layer of width 1 or more."
@@ -118,8 +117,7 @@ class Recipe:
             raise InputError(
                 f"epochs is {self.epochs}, batch_size {self.batch_size}; at least 1 and 2."
             )
-        if not self.learning_rate > 0:
-            raise InputError(f"learning_rate is {self.learning_rate}; it must be above 0.")
+        check_positive(learning_rate=self.learning_rate)
         if self.setpoint and (self.privileged or not self.proprioception):
             raise InputError("setpoint goes with proprioception; switch it on, and privileged off.")
         if self.clock and (self.privileged or not self.proprioception):
@@ -129,8 +127,7 @@ class Recipe:
                 "progress_input goes with proprioception, in the place of the clock; switch "
                 "proprioception on, clock and privileged off."
             )
-        if not self.weight_decay >= 0:
-            raise InputError(f"weight_decay is {self.weight_decay}; it must be at least 0.")
+        check_at_least(0, weight_decay=self.weight_decay)
         if not self.proprioception_noise >= 0 or self.map_shift < 0:
             raise InputError(
                 f"proprioception_noise is {self.proprioception_noise}, map_shift {self.map_shift}; "

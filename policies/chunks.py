@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from policies.base import ACTIONS, Inputs, Policy, Recipe, fed_vector
 from policies.layers import FeatureHeads
 from surgicai_vision.core.config import JSON
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_name
 
 NORMALISATIONS = ("mean_std", "min_max")
 SMALLEST_RANGE = 1e-6
@@ -69,8 +69,7 @@ class ChunkRecipe(Recipe):
         super().__post_init__()
         if not 1 <= self.execute <= self.chunk:
             raise InputError(f"execute is {self.execute}; allowed: 1 to chunk, {self.chunk}.")
-        if self.history < 1:
-            raise InputError(f"history is {self.history}; it must be at least 1.")
+        check_at_least(1, history=self.history)
         if not 0 <= self.ema < 1:
             raise InputError(f"ema is {self.ema}; allowed: 0 to below 1.")
         if not (self.clip_gradient >= 0 and self.minutes >= 0):

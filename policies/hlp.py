@@ -26,7 +26,7 @@ from torch import nn
 from policies.base import Inputs, Plugin, Policy, Recipe
 from policies.layers import FeatureMLP
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, check_at_least
 
 CLASSES = len(names.SUBTASKS)
 TEMPERATURES = (0.1, 10.0)
@@ -48,8 +48,7 @@ class HLPRecipe(Recipe):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.progress >= 0:
-            raise InputError(f"progress is {self.progress}; it must be at least 0.")
+        check_at_least(0, progress=self.progress)
         if self.privileged:
             raise InputError("Policy 'hlp' sees both arms and images; leave 'privileged' off.")
 

@@ -67,3 +67,29 @@ def check_name(kind: str, given: str, allowed: Iterable[str]) -> str:
     if given not in names:
         raise UnknownName(kind, given, names)
     return given
+
+
+def check_at_least(least: int, **numbers: float | None) -> None:
+    """Refuse numbers below `least`; None is no number.
+
+    Args:
+        least: the smallest that is allowed.
+        numbers: what each is called, and its value.
+
+    Raises:
+        InputError: a number below, or none at all (NaN).
+    """
+    for name, number in numbers.items():
+        if number is not None and not number >= least:
+            raise InputError(f"{name} is {number}; it must be at least {least}.")
+
+
+def check_positive(**numbers: float) -> None:
+    """Refuse numbers that are not above 0.
+
+    Raises:
+        InputError: a number that is 0, below, or none at all (NaN).
+    """
+    for name, number in numbers.items():
+        if not number > 0:
+            raise InputError(f"{name} is {number}; it must be above 0.")

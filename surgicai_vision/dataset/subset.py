@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, digest
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.dataset.protocol import Dataset, episode_bounds
 
 
@@ -55,8 +55,7 @@ def with_frame_stride(dataset: Dataset, frame_stride: int) -> Dataset:
     Raises:
         InputError: the dataset was rendered with fewer frames.
     """
-    if frame_stride < 1:
-        raise InputError(f"frame_stride is {frame_stride}; it must be at least 1.")
+    check_at_least(1, frame_stride=frame_stride)
     held = names.FPS // dataset.fps
     if frame_stride % held:
         raise InputError(

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from surgicai_vision.core.config import JSON, RandomisationConfig, TaskConfig
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, check_at_least
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,7 @@ class Variants:
 
     def __post_init__(self) -> None:
         RandomisationConfig(appearance=self.appearance, distractors=self.distractors)
-        if self.count < 1:
-            raise InputError(f"variants is {self.count}; it must be at least 1.")
+        check_at_least(1, variants=self.count)
         if not (self.appearance or self.distractors):
             raise InputError(
                 f"{self.count} variants are asked without a look to draw; give an appearance "

@@ -15,7 +15,7 @@ import yaml
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import DWELL, from_mapping, to_mapping
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.core.files import read_yaml
 from surgicai_vision.training.run_config import TERMINATIONS
 
@@ -71,16 +71,14 @@ class HierarchicalConfig:
 
     def __post_init__(self) -> None:
         check_name("termination", self.termination, TERMINATIONS)
-        limits = {
-            "steps": self.steps,
-            "decisions": self.decisions,
-            "max_steps": self.max_steps,
-            "patience": self.patience,
-            "decide_every": self.decide_every,
-        }
-        for name, limit in limits.items():
-            if limit < 1:
-                raise InputError(f"{name} is {limit}; it must be at least 1.")
+        check_at_least(
+            1,
+            steps=self.steps,
+            decisions=self.decisions,
+            max_steps=self.max_steps,
+            patience=self.patience,
+            decide_every=self.decide_every,
+        )
         if not 1 <= self.grasp_hold <= DWELL:
             raise InputError(f"grasp_hold is {self.grasp_hold}; allowed: 1 to {DWELL}.")
         if not 0.0 <= self.confidence < 1.0:

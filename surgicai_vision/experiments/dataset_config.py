@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, TaskConfig, check_frame_stride
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.demos.demonstrator import SCRIPTED_DEMONSTRATORS
 from surgicai_vision.demos.disturbance import Disturbance, check_late
 
@@ -62,14 +62,8 @@ class Demonstrations:
         check_name("demonstrator", self.demonstrator, SCRIPTED_DEMONSTRATORS)
         check_late(self.demonstrator, self.disturbance)
         check_frame_stride(self.frame_stride)
-        if self.episodes < 1:
-            raise InputError(
-                f"demonstrations {self.name}: episodes is {self.episodes}; it must be at least 1."
-            )
-        if self.post_success_steps < 0:
-            raise InputError(
-                f"post_success_steps is {self.post_success_steps}; it must be at least 0."
-            )
+        check_at_least(1, **{f"demonstrations {self.name}: episodes": self.episodes})
+        check_at_least(0, post_success_steps=self.post_success_steps)
 
     @property
     def disturbance(self) -> Disturbance:

@@ -46,7 +46,7 @@ from pathlib import Path
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.evaluation.robustness.axes import AXES
@@ -203,10 +203,7 @@ class Plan:
         _check_different("seed", self.seed)
         for seed in self.seed:
             first_seed(seed)
-        numbers = {"episodes": self.episodes, "size": self.size, "epochs": self.epochs}
-        for name, number in numbers.items():
-            if number is not None and number < 1:
-                raise InputError(f"{name} is {number}; it must be at least 1.")
+        check_at_least(1, episodes=self.episodes, size=self.size, epochs=self.epochs)
         for recorded in self.demonstrations:
             self.recorded_env(recorded)
             if recorded.episodes > MOST_EPISODES:
@@ -255,11 +252,7 @@ class Plan:
             check_name("policy that is evaluated", name, evaluated)
         for seed in condition.seed:
             check_name("training seed", str(seed), [str(seed) for seed in self.seed])
-        if condition.episodes is not None and condition.episodes < 1:
-            raise InputError(
-                f"condition {condition.name}: episodes is {condition.episodes}; "
-                "it must be at least 1."
-            )
+        check_at_least(1, **{f"condition {condition.name}: episodes": condition.episodes})
         for key in ("task", "advance"):
             if key in {**self.env, **condition.env}:
                 raise InputError(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from surgicai_vision.core.config import TaskConfig, check_frame_stride
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.features import encoders
 from surgicai_vision.training.run_config import RunConfig
 
@@ -68,14 +68,9 @@ class Quickstart:
                 encoders.check_encoder_name(run.encoder)
             for view in run.views:
                 check_name("rendered view", view, self.view)
-        numbers = {
-            "demonstrations": self.demonstrations,
-            "size": self.size,
-            "episodes": self.episodes,
-        }
-        for name, number in numbers.items():
-            if number < 1:
-                raise InputError(f"{name} is {number}; it must be at least 1.")
+        check_at_least(
+            1, demonstrations=self.demonstrations, size=self.size, episodes=self.episodes
+        )
 
     @property
     def runs(self) -> list[RunConfig]:

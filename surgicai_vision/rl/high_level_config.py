@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import final
 
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, check_positive
 from surgicai_vision.evaluation.hierarchical_config import ORDER, HierarchicalConfig
 
 DECISIONS = 1500
@@ -36,9 +36,12 @@ class HighLevelSettings:
     entropy: float = 0.01
 
     def __post_init__(self) -> None:
-        for name in ("learning_rate", "rollout", "batch_size", "epochs"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be above 0.")
+        check_positive(
+            learning_rate=self.learning_rate,
+            rollout=self.rollout,
+            batch_size=self.batch_size,
+            epochs=self.epochs,
+        )
         if not 0 < self.gamma < 1 or self.entropy < 0:
             raise InputError(
                 f"gamma is {self.gamma}, entropy {self.entropy}; allowed: between 0 and 1, and at "

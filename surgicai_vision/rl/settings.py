@@ -6,7 +6,7 @@ from typing import final
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping
-from surgicai_vision.core.errors import InputError, UnknownName, check_name
+from surgicai_vision.core.errors import InputError, UnknownName, check_name, check_positive
 from surgicai_vision.core.tasks import load_subtask
 from surgicai_vision.rl.algorithms import ALGORITHMS, Algorithm
 
@@ -80,10 +80,18 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_name("relabel_demand", self.relabel_demand, DEMANDS)
-        positive = ("learning_rate", "batch_size", "envs", "train_every", "updates", "critics")
-        for name in (*positive, "policy_delay", "goals", "rollout", "samples"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be above 0.")
+        check_positive(
+            learning_rate=self.learning_rate,
+            batch_size=self.batch_size,
+            envs=self.envs,
+            train_every=self.train_every,
+            updates=self.updates,
+            critics=self.critics,
+            policy_delay=self.policy_delay,
+            goals=self.goals,
+            rollout=self.rollout,
+            samples=self.samples,
+        )
         for name in ("gamma", "tau", "demo_share", "bc_weight"):
             if not 0 < getattr(self, name) < 1:
                 raise InputError(

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Protocol, Self
 
 from surgicai_vision.core.config import JSON
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.experiments.dataset_config import DatasetConfig
 from surgicai_vision.training.run_config import RunConfig
 
@@ -114,3 +115,17 @@ class Experiment(Protocol):
             episodes: starts of each evaluation.
             size: height and width of the images [px].
         """
+
+
+def check_runs(runs: Sequence[RunConfig]) -> None:
+    """Refuse a grid without runs, and one in which a run stands twice.
+
+    Raises:
+        InputError: so many runs, so many of them different.
+    """
+    different = len(set(runs))
+    if not runs or different != len(runs):
+        raise InputError(
+            f"The grid has {len(runs)} runs, {different} of them different; give at least one "
+            "value of each axis, and each value once."
+        )

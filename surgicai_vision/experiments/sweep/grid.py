@@ -15,11 +15,11 @@ from surgicai_vision.core.config import (
     check_frame_stride,
     to_mapping,
 )
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.demos.demonstrator import SCRIPTED_DEMONSTRATORS
 from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.experiments.dataset_config import DatasetConfig, Demonstrations
-from surgicai_vision.experiments.sweep.experiment import Evaluated, Training
+from surgicai_vision.experiments.sweep.experiment import Evaluated, Training, check_runs
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
 from surgicai_vision.training.run_config import (
@@ -180,10 +180,7 @@ class Grid:
         for name in self.hierarchical:
             check_name("termination", name, TERMINATIONS)
         self._check_numbers()
-        if not self.runs or len(set(self.runs)) != len(self.runs):
-            raise InputError(
-                f"The grid has {len(self.runs)} runs, {len(set(self.runs))} of them different."
-            )
+        check_runs(self.runs)
         if self.hierarchical and not any(run.is_hierarchical for run in self.runs):
             raise InputError(
                 f"hierarchical adds no run here; it needs task: {names.SUTURE}, an encoder and "
@@ -192,22 +189,13 @@ class Grid:
 
     def _check_numbers(self) -> None:
         """Refuse numbers out of range."""
-        if self.post_success_steps < 0:
-            raise InputError(
-                f"post_success_steps is {self.post_success_steps}; it must be at least 0."
-            )
+        check_at_least(0, post_success_steps=self.post_success_steps)
         if not self.demonstrations:
             raise InputError("demonstrations is empty; give at least one number.")
-        numbers = [
-            ("episodes", self.episodes),
-            ("size", self.size),
-            ("steps", self.steps),
-            ("batch", self.batch),
-            *(("demonstrations", number) for number in self.demonstrations),
-        ]
-        for name, number in numbers:
-            if number < 1:
-                raise InputError(f"{name} is {number}; it must be at least 1.")
+        check_at_least(
+            1, episodes=self.episodes, size=self.size, steps=self.steps, batch=self.batch
+        )
+        check_at_least(1, demonstrations=min(self.demonstrations))
         for ablation in self.ablation:
             count = ablation.demonstrations
             if count is not None and not 1 <= count <= self.recorded:

@@ -24,10 +24,10 @@ from dataclasses import dataclass, field, replace
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, read_changes, to_mapping
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.demos.disturbance import Disturbance
 from surgicai_vision.experiments.dataset_config import DatasetConfig, Demonstrations
-from surgicai_vision.experiments.sweep.experiment import Evaluated, Training
+from surgicai_vision.experiments.sweep.experiment import Evaluated, Training, check_runs
 from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.rl.high_level_config import DECISIONS
 from surgicai_vision.rl.settings import OBSERVATIONS, settings_of
@@ -91,28 +91,22 @@ class RLGrid:
         check_name("observation", self.observation, OBSERVATIONS)
         check_name("bank of starts", self.starts, BANKS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
-        numbers = [
-            ("env_steps", self.env_steps),
-            ("updates", self.updates),
-            ("save_every", self.save_every),
-            ("decisions", self.decisions),
-            ("episodes", self.episodes),
-            *(("demonstrations", number) for number in self.demonstrations),
-        ]
-        for name, number in numbers:
-            if number < 1:
-                raise InputError(f"{name} is {number}; it must be at least 1.")
-        if self.validation < 0:
-            raise InputError(f"validation is {self.validation}; it must be at least 0.")
+        check_at_least(
+            1,
+            env_steps=self.env_steps,
+            updates=self.updates,
+            save_every=self.save_every,
+            decisions=self.decisions,
+            episodes=self.episodes,
+            demonstrations=min(self.demonstrations, default=None),
+        )
+        check_at_least(0, validation=self.validation)
         if self.hierarchical and set(self.task) != set(names.SUBTASKS):
             raise InputError(
                 f"hierarchical needs all of {', '.join(names.SUBTASKS)}; task is "
                 f"{', '.join(self.task)}."
             )
-        if not self.runs or len(set(self.runs)) != len(self.runs):
-            raise InputError(
-                f"The grid has {len(self.runs)} runs, {len(set(self.runs))} of them different."
-            )
+        check_runs(self.runs)
 
     def _changes(self, algo: str) -> tuple[str, ...]:
         """Return the changed settings of an algorithm."""

@@ -1,0 +1,21 @@
+"""Errors: what the checks let through, and that their message says what was given and allowed."""
+
+import math
+
+import pytest
+
+from surgicai_vision.core.errors import InputError, check_at_least, check_positive
+
+
+def test_numbers_at_the_limit_and_no_number_pass():
+    check_at_least(1, episodes=1, size=224, epochs=None)
+    check_at_least(0, **{"condition dark: episodes": 0})
+    check_positive(learning_rate=1e-9)
+
+
+@pytest.mark.parametrize("number", [0, -1, math.nan])
+def test_the_number_that_is_wrong_is_named(number):
+    with pytest.raises(InputError, match=f"^size is {number}; it must be at least 1.$"):
+        check_at_least(1, episodes=2, size=number)
+    with pytest.raises(InputError, match=f"^size is {number}; it must be above 0.$"):
+        check_positive(episodes=2, size=number)
