@@ -222,7 +222,8 @@ def _tokens(argument: Argument, key: str, value: object, path: Path) -> list[Tok
     where = f"{path}: {key}"
     hint = argument.resolved_hint
     if value is None and type(None) in typing.get_args(argument.hint):
-        return []
+        is_default = argument.field_info.default is None
+        return [] if is_default else [Token(keyword=key, implicit_value=None)]
     if _is_list(argument):
         if isinstance(value, str):
             texts = _parts(value, where)

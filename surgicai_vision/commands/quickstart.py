@@ -29,7 +29,8 @@ class Options:
     """Options of `quickstart`.
 
     Attributes:
-        procedure: Who sews the whole procedure of the first act.
+        procedure: Who sews the whole procedure of the first act; null in a --config file leaves
+            the act out.
         task: The task of the second act.
         demonstrations: Expert demonstrations.
         noise: How much what the expert executes is disturbed.

@@ -314,6 +314,12 @@ def test_shipped_quickstart_is_the_default():
     assert quickstart.plan_of(shipped) == quickstart.plan_of(default)
 
 
+def test_null_in_a_file_is_none_whatever_the_default(tmp_path):
+    path = write(tmp_path / "a.yaml", "procedure: null")
+    assert quickstart.plan_of(read_options(quickstart.Options, config=path)).procedure is None
+    assert read_options(quickstart.Options, ["--procedure", "expert"], path).procedure == "expert"
+
+
 @pytest.mark.parametrize(
     "path", sorted((configs_folder() / "sweep").glob("*.yaml")), ids=lambda path: path.stem
 )
