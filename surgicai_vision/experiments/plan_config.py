@@ -116,7 +116,10 @@ class Condition:
         name: how tables call it.
         policies: the policies of the plan that are evaluated so, the whole procedure as `suture`;
             none named are all that act.
-        env: fields of `TaskConfig` in the place of the plan's.
+        env: fields of `TaskConfig` in the place of the plan's. A field stands whole in its place:
+            `randomisation: {camera_shift: 2}` has that axis alone, whatever the plan's has, and
+            `randomisation: {}` none. A field that is not named is the plan's, not what some
+            demonstrations alone have (`Plan.evaluated_env`).
         procedure: fields of `HierarchicalConfig` in the place of the plan's; `place: expert` puts
             the expert in for a policy.
         upset: let one thing go wrong in every episode (`envs.upset`).
@@ -166,7 +169,8 @@ class Plan:
         conditions: what is evaluated how.
         procedure: when a subtask of the whole procedure ends, as `HierarchicalConfig` has it.
         epochs: passes over the frames, of every policy; None takes the recipes'.
-        env: fields of `TaskConfig` that differ from the default's, in every task.
+        env: fields of `TaskConfig` that differ from the default's, in every task: in what is
+            recorded and what is evaluated, each as far as these name no such field themselves.
         starts: the bank of the evaluations' starts, one of `BANKS`.
         expert: evaluate the expert beside the policies, in every condition.
         accept_licence: accept weights under a non-commercial licence.

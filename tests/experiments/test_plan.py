@@ -144,6 +144,22 @@ def test_training_seeds_share_no_demonstration_and_meet_no_evaluation(quiet):
             first_seed(seed)
 
 
+def test_a_field_of_an_env_stands_whole_in_the_place_of_the_plans_and_the_others_stay():
+    standing = {"name": "standing", "env": {"randomisation": {}}}
+    turned = {"name": "turned", "env": {"randomisation": {"camera_turn": 1.0}}}
+    dense = {"name": "dense", "env": {"reward": "dense"}}
+    env = {"tolerance": "released", "randomisation": {"phantom_shift": 2.0}}
+    plan = plan_of({**TABLE, "env": env, "conditions": [standing, turned, dense]}, "a test")
+    worlds = {condition.name: plan.task_config("place", condition) for condition in plan.conditions}
+    assert {world.tolerance for world in worlds.values()} == {"released"}
+    assert worlds["standing"].randomisation == RandomisationConfig()
+    assert worlds["turned"].randomisation == RandomisationConfig(camera_turn=1.0)
+    assert worlds["dense"].randomisation == RandomisationConfig(phantom_shift=2.0)
+    recorded = plan.recorded_env(plan.demonstrations[0])
+    assert recorded.randomisation == RandomisationConfig(phantom_shift=3.0), "its own"
+    assert recorded.tolerance == "released"
+
+
 def test_everything_is_built_once_and_evaluated_on_the_same_starts(quiet, tiny):
     out, result = quiet
     assert counts(result) == (RUNS, RUNS, 0, 0, 0, 0), result["problems"]
