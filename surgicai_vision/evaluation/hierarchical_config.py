@@ -98,7 +98,12 @@ class HierarchicalConfig:
     @property
     def advance(self) -> str:
         """Who takes the env to its next subtask: `TaskConfig.advance`."""
-        return "told" if self.termination == "learned" else "success"
+        return advance_of(self.termination)
+
+
+def advance_of(termination: str) -> str:
+    """Return who takes the env to its next subtask where subtasks end so: `TaskConfig.advance`."""
+    return "told" if termination == "learned" else "success"
 
 
 def read_hierarchical(path: Path) -> HierarchicalConfig:

@@ -31,6 +31,7 @@ from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import write_bytes, write_json
 from surgicai_vision.core.names import TEST_SEED
 from surgicai_vision.core.tasks import task_names
+from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS, advance_of
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, shifted_config
 from surgicai_vision.evaluation.statistics import clopper_pearson, mcnemar
 from surgicai_vision.evaluation.storage import read_evaluation, read_rows
@@ -180,12 +181,20 @@ def read_row(path: Path) -> Row:
         raise BadFile(f"{path} cannot be read ({told}).") from None
 
 
+def default_config(run: RunConfig) -> TaskConfig:
+    """Return the env that a row must have; a hierarchical policy's is its own."""
+    env = TaskConfig(run.task)
+    if run.termination is None:
+        return env
+    return replace(env, max_steps=MAX_STEPS, advance=advance_of(run.termination))
+
+
 def problem(row: Row) -> str:
     """Return why a row is not taken, in a sentence; "" where it is."""
     if row.sealed().digest != row.digest:
         return "its digest is not that of its content; it was changed after it was made."
     env = row.run.env
-    default = TaskConfig(env.task)
+    default = default_config(row.run)
     shift = row.run.shift
     if shift is None:
         wanted = default
@@ -295,12 +304,19 @@ def _table(rows: Sequence[Row]) -> list[dict[str, JSON]]:
                 "minutes": row.entry.minutes,
                 "hardware": row.entry.hardware,
                 "note": row.entry.note,
-                "reads_state": row.run.privileged,
+                "told": _told(row.run),
                 "command": row.command,
                 "digest": row.digest[:12],
             }
         )
     return lines
+
+
+def _told(run: RunConfig) -> str:
+    """Return what a policy is told that no robot knows; "" where that is nothing."""
+    if run.privileged:
+        return "sees the state with the goal"
+    return "ends told by the simulator" if run.termination == "privileged" else ""
 
 
 def _against(row: Row, best: Row) -> str:

@@ -13,6 +13,7 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, shifted_config
 from surgicai_vision.evaluation.storage import write_evaluation
 from surgicai_vision.report.leaderboard import (
@@ -97,6 +98,24 @@ def test_the_shifted_condition_is_one_of_its_own(row: Row, tmp_path: Path) -> No
         write_row(each, tmp_path / f"{number}.json")
     text = write_leaderboard(tmp_path, tmp_path / "page.html").page.read_text(encoding="utf-8")
     assert "handoff, clean" in text and "handoff, shifted" in text
+
+
+@pytest.mark.parametrize(
+    ("termination", "advance", "told"),
+    [("learned", "told", False), ("privileged", "success", True)],
+)
+def test_a_whole_procedure_has_the_env_of_its_policy(
+    termination: str, advance: str, told: bool, row: Row, tmp_path: Path
+) -> None:
+    env = replace(TaskConfig("suture"), max_steps=MAX_STEPS, advance=advance)
+    run = replace(row.run, env=env, policy="bc", parts="ab" * 32, termination=termination)
+    whole = replace(row, run=run).sealed()
+    assert problem(whole) == ""
+    write_row(whole, tmp_path / "row.json")
+    text = write_leaderboard(tmp_path, tmp_path / "page.html").page.read_text(encoding="utf-8")
+    assert ("ends told by the simulator" in text) == told
+    other = replace(run, env=replace(env, max_steps=10 * MAX_STEPS))
+    assert "max_steps" in problem(replace(row, run=other).sealed())
 
 
 def test_the_page_pairs_rows_and_escapes_what_it_is_given(row: Row, tmp_path: Path) -> None:
