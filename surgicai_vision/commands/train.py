@@ -200,7 +200,15 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     label = f"{options.subtask}-of-{task}" if options.subtask else task
     out = options.out or folders.train_folder(label, run.name, run.seed)
     folders.check_folder(out, REQUEST)
-    dataset: Dataset = folders.open_dataset(options.dataset, task, run.views)
+    rendered = folders.open_dataset(options.dataset, task, run.views)
+    is_high_level = policies.policy_plugin(run.policy).target == names.STAGE
+    if rendered.late and not is_high_level:
+        console.note(
+            f"warning: demonstrations of {rendered.path} notice a loss up to {rendered.late} "
+            "control steps late (record-demos --late) and act until then as if they held the "
+            f"needle; '{run.policy}' learns that too. `cut-demos` takes a subtask's visits without."
+        )
+    dataset: Dataset = rendered
     if options.subtask:
         from surgicai_vision.dataset.subset import of_subtask
 
@@ -222,7 +230,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         )
     console.say(f"checkpoint: {out}")
     _tell_errors(read_checkpoint(out), console)
-    if policies.policy_plugin(run.policy).target != names.STAGE:
+    if not is_high_level:
         console.say(f"next: surgicai-vision evaluate {out}")
     return {"checkpoint": str(out)}
 

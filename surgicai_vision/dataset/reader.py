@@ -68,6 +68,8 @@ class RenderedDataset:
         fps: frames per second of simulated time; `names.FPS` divided by the frame stride.
         variants: episodes that show one demonstration, one behind the other in different looks.
         video: codec of the RGB views, None where they are lossless images.
+        late: most control steps by which its demonstrators noticed a loss late
+            (`demos.disturbance.Disturbance`).
     """
 
     def __init__(self, path: Path):
@@ -83,9 +85,11 @@ class RenderedDataset:
             self.fps = int(self.meta["fps"])
             self.variants = int(self.meta.get("variants", 1))
             self.video: str | None = self.meta.get("video")
+            requests = [asked or {} for asked in self.meta.get("demos_requests", ())]
+            self.late = max((int(asked.get("late", 0)) for asked in requests), default=0)
             self.has_depth = bool(self.meta["depth"])
             self.has_segmentation = bool(self.meta["segmentation"])
-        except (KeyError, TypeError, ValueError, InputError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, InputError) as error:
             raise BadFile(f"{file} is damaged ({error}).") from None
         self._paths = sorted(self.path.glob("data/chunk-*/file-*.parquet"))
         self._files = [_open(path) for path in self._paths]

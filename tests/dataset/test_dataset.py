@@ -31,7 +31,7 @@ from surgicai_vision.dataset import (
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
 from surgicai_vision.dataset.subset import with_frame_stride
 from surgicai_vision.demos.record import record
-from surgicai_vision.demos.store import list_demos, read_demo
+from surgicai_vision.demos.store import list_demos, read_demo, read_marker
 from surgicai_vision.evaluation.policy_spec import open_policy
 
 CONFIG = TaskConfig(max_steps=12)
@@ -339,6 +339,20 @@ def test_images_are_lossless(shape):
     np.testing.assert_array_equal(codecs.decode(codecs.encode(rgb), "x")[..., : shape[2]], rgb)
     depth = rng.random((20, 30, 1), dtype=np.float32)
     np.testing.assert_array_equal(codecs.decode(codecs.encode(depth), "x"), depth)
+
+
+def test_a_dataset_knows_how_late_its_demonstrators_noticed_a_loss(tmp_path, fake, demos):
+    render(demos, tmp_path / "set")
+    assert open_dataset(tmp_path / "set").late == 0
+    meta = tmp_path / "set" / names.META_FILE
+    content = json.loads(meta.read_text())
+    assert content["demos_requests"] == [read_marker(demos).get("request")]
+    for requests, late in (([{"late": 40}, None, {"late": 5}], 40), ([], 0)):
+        meta.write_text(json.dumps({**content, "demos_requests": requests}))
+        assert open_dataset(tmp_path / "set").late == late
+    meta.write_text(json.dumps({**content, "demos_requests": ["late"]}))
+    with pytest.raises(BadFile, match="is damaged"):
+        open_dataset(tmp_path / "set")
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,8 @@ class Dataset(FakeData):
     image_size: int = 32
     length: int = 40
     fingerprint: str = "noise"
+    path: Path = Path("noise")
+    late: int = 0
     config: TaskConfig = field(default_factory=lambda: TaskConfig("suture"))
 
     def __post_init__(self) -> None:
@@ -194,6 +196,17 @@ def test_high_level_policy_learns_the_phase(
     kinds = [type(layer).__name__ for layer in policy.network.layers]
     assert kinds == ["BatchNorm1d", "Linear", "ReLU"] * 3 + ["Linear"]
     assert "does not act" in fails(capsys, "evaluate", folder)
+
+
+def test_a_low_level_policy_is_warned_of_what_teaches_a_high_level_one(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ("train", "--task", "suture", "--encoder", "none", "--epochs", "1")
+    for late, policy, is_warned in ((0, "bc", False), (40, "bc", True), (40, "hlp", False)):
+        monkeypatch.setattr(folders, "open_dataset", lambda *_, late=late: Dataset(late=late))
+        assert main([*arguments, "--policy", policy, "--out", f"{policy}{late}"]) == 0
+        said = capsys.readouterr().err
+        assert ("up to 40 control steps late" in said) == is_warned
 
 
 def test_a_subtasks_time_counts_from_the_beginning_of_each_visit() -> None:
