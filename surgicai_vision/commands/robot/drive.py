@@ -30,14 +30,18 @@ from surgicai_vision.commands.robot.network import (
     ros_domain,
 )
 from surgicai_vision.core import names
-from surgicai_vision.core.config import from_mapping
+from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.processes import Terminated
 from surgicai_vision.features.encoders import WeightsSource
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
+    from surgicai_vision.demos.imports.rosbag.config import Frames
+    from surgicai_vision.evaluation.agent import Agent
+    from surgicai_vision.evaluation.policy_spec import PolicySpec
+    from surgicai_vision.robot.driver import DriveConfig, DrivenEpisode, Driver
     from surgicai_vision.robot.transport import Transport
 
 app = App(
@@ -111,16 +115,9 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Drive, and print what was sent, what was held back, and how late it came."""
-    import numpy as np
-
-    from surgicai_vision.core.files import code_version
     from surgicai_vision.demos.imports.rosbag.config import Frames
-    from surgicai_vision.robot.arm import FINGER_SHARE
-    from surgicai_vision.robot.client import Client, ClientConfig
-    from surgicai_vision.robot.driven import DrivenRobot
-    from surgicai_vision.robot.driver import DriveConfig, Driver, check_drivable
+    from surgicai_vision.robot.driver import DriveConfig, check_drivable
     from surgicai_vision.robot.guards import GuardConfig
-    from surgicai_vision.robot.transport import RenamedTransport, open_transport
 
     spec = open_given(
         options.policy,
@@ -136,68 +133,121 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         options.clock == "stepped",
     )
     frames = from_mapping(Frames, options.frames or {}, "frames")
-    jaw_scale = FINGER_SHARE if options.jaw_scale is None else options.jaw_scale
     out = options.out or folders.OUTPUTS / "drive" / f"{spec.config.task}-{spec.name}"
     folders.check_folder(out, LOG)
     agent = spec.make_agent()
     check_drivable(agent, spec.config)
+    with ExitStack() as stack:
+        driver = _driver(options, spec, agent, config, frames, out, stack, console)
+        episodes = _drive(driver, options, spec.config, console)
+    return _told(options, spec, episodes, out / LOG, console)
+
+
+def _driver(
+    options: Options,
+    spec: "PolicySpec",
+    agent: "Agent",
+    config: "DriveConfig",
+    frames: "Frames",
+    out: Path,
+    stack: ExitStack,
+    console: Console,
+) -> "Driver":
+    """Return what drives the robot, connected to it, with its log begun.
+
+    Args:
+        options: the command's.
+        spec: what drives.
+        agent: its agent.
+        config: how it drives.
+        frames: where the robot's frames are, where not as ours.
+        out: the log's folder.
+        stack: closes what is opened.
+        console: told what a dry run would send.
+    """
+    from surgicai_vision.core.files import code_version
+    from surgicai_vision.robot.arm import FINGER_SHARE
+    from surgicai_vision.robot.client import Client, ClientConfig
+    from surgicai_vision.robot.driven import DrivenRobot
+    from surgicai_vision.robot.driver import Driver
+    from surgicai_vision.robot.transport import RenamedTransport, open_transport
+
+    jaw_scale = FINGER_SHARE if options.jaw_scale is None else options.jaw_scale
     views = tuple(agent.cameras)
-    limit = spec.config.max_steps
+    transport = stack.enter_context(
+        open_transport(options.transport, options.interface, ros_domain(options.domain))
+    )
+    dead_man = _dead_man(options, transport, stack)
+    client = Client(
+        RenamedTransport(transport, renamed_topics(options.topics), views),
+        ClientConfig(
+            views=views,
+            is_compressed=options.compressed,
+            is_simulated=options.simulated,
+        ),
+    )
+    client.connect()
+    out.mkdir(parents=True, exist_ok=True)
+    log = stack.enter_context((out / LOG).open("a", buffering=1, encoding="utf-8"))
+    about = {
+        "policy": options.policy,
+        "task": spec.config.task,
+        "guards": asdict(config.guards),
+        "sends": options.send,
+        "code_version": code_version(),
+    }
+    log.write(json.dumps(about) + "\n")
+    robot = DrivenRobot(client, views, spec.config.task, agent.image_size, frames, jaw_scale)
+    return Driver(agent, robot, spec.config, config, dead_man, log, console.note)
+
+
+def _drive(
+    driver: "Driver", options: Options, task: TaskConfig, console: Console
+) -> "list[DrivenEpisode]":
+    """Drive the episodes that are asked for, or until Ctrl-C; return those that ended."""
+    limit = task.max_steps
     if options.seconds is not None:
         limit = max(1, round(options.seconds * names.FPS))
+    if not options.send:
+        console.note("dry run: nothing is sent; --send sends it")
     episodes = []
-    with ExitStack() as stack:
-        transport = stack.enter_context(
-            open_transport(options.transport, options.interface, ros_domain(options.domain))
-        )
-        dead_man = _dead_man(options, transport, stack)
-        client = Client(
-            RenamedTransport(transport, renamed_topics(options.topics), views),
-            ClientConfig(
-                views=views,
-                is_compressed=options.compressed,
-                is_simulated=options.simulated,
-            ),
-        )
-        client.connect()
-        out.mkdir(parents=True, exist_ok=True)
-        log = stack.enter_context((out / LOG).open("a", buffering=1, encoding="utf-8"))
-        about = {
-            "policy": options.policy,
-            "task": spec.config.task,
-            "guards": asdict(config.guards),
-            "sends": options.send,
-            "code_version": code_version(),
-        }
-        log.write(json.dumps(about) + "\n")
-        robot = DrivenRobot(client, views, spec.config.task, agent.image_size, frames, jaw_scale)
-        driver = Driver(agent, robot, spec.config, config, dead_man, log, console.note)
-        if not options.send:
-            console.note("dry run: nothing is sent; --send sends it")
-        try:
-            for number in range(options.episodes if options.simulated else 1):
-                episode = driver.episode(options.seed + number, limit)
-                episodes.append(episode)
-                console.say(
-                    f"{_about(episode.seed, options)}: {episode.ended}; {episode.steps} control "
-                    f"steps, {episode.held} held back"
-                )
-        except KeyboardInterrupt as interrupt:
-            if isinstance(interrupt, Terminated):
-                raise
-            console.note("interrupted: nothing more is sent")
+    try:
+        for number in range(options.episodes if options.simulated else 1):
+            episode = driver.episode(options.seed + number, limit)
+            episodes.append(episode)
+            console.say(
+                f"{_about(episode.seed, options)}: {episode.ended}; {episode.steps} control "
+                f"steps, {episode.held} held back"
+            )
+    except KeyboardInterrupt as interrupt:
+        if isinstance(interrupt, Terminated):
+            raise
+        console.note("interrupted: nothing more is sent")
+    return episodes
+
+
+def _told(
+    options: Options,
+    spec: "PolicySpec",
+    episodes: "Sequence[DrivenEpisode]",
+    log: Path,
+    console: Console,
+) -> dict[str, object]:
+    """Print how late was sent and how many episodes succeeded; return it with each episode."""
+    import numpy as np
+
     late = 1e3 * np.array([value for episode in episodes for value in episode.latencies] or [0.0])
     median, high = float(np.median(late)), float(np.percentile(late, 99))
     console.say(f"from the newest pose to sending: {median:.1f} ms in the median, p99 {high:.1f}.")
     successes = sum(bool(episode.success) for episode in episodes)
     if options.simulated:
         console.say(f"{successes} of {len(episodes)} episodes succeeded.")
-    console.say(f"log: {out / LOG}")
+    console.say(f"log: {log}")
     return {
         "policy": spec.name,
         "task": spec.config.task,
         "sent": options.send,
-        "log": str(out / LOG),
+        "log": str(log),
         "latency_ms_median": median,
         "latency_ms_p99": high,
         "successes": successes if options.simulated else None,
