@@ -1,6 +1,9 @@
 """`release`, tiny, from nothing to the cards; `policies`; and what every released policy keeps."""
 
+import contextlib
+import io
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -37,6 +40,9 @@ PLAN = {
 }
 
 
+COMMAND = ("release", "--plan", "plan.yaml", "--workers", "1")
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A folder for the work, the plan and the released policies of this module's tests."""
@@ -45,12 +51,30 @@ def folder(tmp_path_factory):
     return path
 
 
-@pytest.fixture(autouse=True)
-def here(folder, monkeypatch):
+@contextlib.contextmanager
+def working_in(folder: Path) -> Iterator[None]:
     """Work in the folder, with policies and features of its own."""
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv(released.VARIABLE, str(folder / "released"))
-    monkeypatch.setenv("SURGICAI_VISION_CACHE", str(folder / "cache"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv(released.VARIABLE, str(folder / "released"))
+        patch.setenv("SURGICAI_VISION_CACHE", str(folder / "cache"))
+        yield
+
+
+@pytest.fixture(autouse=True)
+def here(folder):
+    """Work in the folder."""
+    with working_in(folder):
+        yield
+
+
+@pytest.fixture(scope="module")
+def built(folder):
+    """What the command says that builds all policies; they are there from then on."""
+    said = io.StringIO()
+    with working_in(folder), contextlib.redirect_stdout(said):
+        assert main([*COMMAND, "--json"]) == 0
+    return json.loads(said.getvalue().splitlines()[-1])
 
 
 def run(capsys, *arguments):
@@ -66,7 +90,7 @@ def changed(name, **fields):
 
 
 @pytest.fixture
-def as_built():
+def as_built(built):
     """Put the cards back after a test that changes them."""
     cards = list(released.released_folder().glob(f"*/{released.CARD}"))
     before = {path: path.read_bytes() for path in cards}
@@ -75,17 +99,15 @@ def as_built():
         path.write_bytes(content)
 
 
-def test_nothing_is_released_before_it_is_built(capsys):
+def test_nothing_is_released_before_it_is_built(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv(released.VARIABLE, str(tmp_path / "released"))
     with pytest.raises(InputError, match=r"no policy is released .* `surgicai-vision release`"):
         open_policy("released:grasp")
     code, listed = run(capsys, "policies")
     assert code == 0 and listed["policies"] == []
 
 
-def test_one_command_builds_all_and_continues_where_it_was(capsys):
-    command = ("release", "--plan", "plan.yaml", "--workers", "1")
-    code, built = run(capsys, *command)
-    assert code == 0
+def test_one_command_builds_all_and_continues_where_it_was(built, capsys):
     assert [card["name"] for card in built["policies"]] == [*names.SUBTASKS, "hlp", "suture"]
     work = sorted(path for path in Path("outputs/release").rglob("*") if path.is_file())
     times = [path.stat().st_mtime_ns for path in work if path.name != "plan.json"]
@@ -93,12 +115,12 @@ def test_one_command_builds_all_and_continues_where_it_was(capsys):
     whole = json.loads(stored.read_text())
     earlier = {key: whole[key] for key in whole if key in (*PLAN, "env")}
     stored.write_text(json.dumps({**earlier, "seed": 0}))  # before there were conditions
-    code, again = run(capsys, *command)
-    assert again == built
+    code, again = run(capsys, *COMMAND)
+    assert code == 0 and again == built
     assert [path.stat().st_mtime_ns for path in work if path.name != "plan.json"] == times
 
 
-def test_the_list_says_what_is_usable(capsys):
+def test_the_list_says_what_is_usable(built, capsys):
     _, listed = run(capsys, "policies")
     lines = {line["policy"]: line for line in listed["policies"]}
     assert set(lines) == {f"released:{name}" for name in (*names.SUBTASKS, "hlp", "suture")}
@@ -108,7 +130,7 @@ def test_the_list_says_what_is_usable(capsys):
     assert lines["released:hlp"]["successes"] == "–"
 
 
-def test_every_verb_takes_a_released_policy_by_its_name(capsys):
+def test_every_verb_takes_a_released_policy_by_its_name(built, capsys):
     code, result = run(capsys, "evaluate", "released:grasp", "--episodes", "1", "--out", "one")
     assert code == 0 and result["task"] == "grasp"
     stored = json.loads(Path("one/evaluation.json").read_text())
@@ -120,7 +142,7 @@ def test_every_verb_takes_a_released_policy_by_its_name(capsys):
     assert code == 0
 
 
-def test_a_wrong_name_names_the_nearest():
+def test_a_wrong_name_names_the_nearest(built):
     with pytest.raises(UnknownName, match="Did you mean 'grasp'"):
         open_policy("released:grsp")
     with pytest.raises(UnknownName, match="Did you mean 'released:grasp'"):
@@ -166,7 +188,7 @@ def test_files_and_parts_that_differ_from_their_card_are_refused(as_built):
         open_policy("released:suture")
 
 
-def test_wrong_input_is_refused_before_any_work(capsys, monkeypatch):
+def test_wrong_input_is_refused_before_any_work(built, capsys, monkeypatch):
     assert main(["release", "--plan", "plan.yaml", "--only", "graps"]) == 2
     assert "Did you mean 'grasp'" in capsys.readouterr().err
     assert main(["release", "--plan", "missing.yaml"]) == 2
