@@ -34,6 +34,8 @@ Two commands take a plan:
 * `surgicai-vision release --plan PLAN.yaml`: its first training seed alone, counted as trained, as
   the policies that come with the product (`experiments.release`; `configs/release.yaml`).
 
+What it lists is in `plan_parts`, what is refused before any work in `plan_check`.
+
 Everything a seed's policies are made of depends on that seed: `dataset_config.first_seed` gives
 each demonstrations that no other seed has, and none of them is a start of an evaluation.
 """
@@ -46,111 +48,29 @@ from pathlib import Path
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
-from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
-from surgicai_vision.evaluation.robustness.axes import AXES
 from surgicai_vision.experiments.dataset_config import (
-    MOST_EPISODES,
     DatasetConfig,
     Demonstrations,
     first_seed,
 )
+from surgicai_vision.experiments.plan_check import check_plan
+from surgicai_vision.experiments.plan_parts import (
+    AS_TRAINED,
+    PARTS,
+    Condition,
+    NotRun,
+    PlannedPolicy,
+)
 from surgicai_vision.experiments.sweep.experiment import Evaluated, Training
-from surgicai_vision.features import encoders
 from surgicai_vision.training.run_config import (
     BANKS,
     OWN,
     RunConfig,
-    Shift,
     Starts,
     with_epochs,
 )
-
-HLP = "hlp"
-"""Name of the high-level policy, and of its kind."""
-PARTS = (*names.SUBTASKS, HLP)
-"""The parts of the whole procedure."""
-AS_TRAINED = "as trained"
-"""Name of the only condition of a plan that lists none."""
-
-
-@dataclass(frozen=True)
-class PlannedPolicy:
-    """A policy of a plan.
-
-    Attributes:
-        name: its name.
-        demonstrations: name of what it is trained on.
-        subtask: take one subtask's frames of whole procedures.
-        view: what it sees; nothing for proprioception alone.
-        policy: its kind.
-        encoder: its encoder; None takes the plan's. Likewise `pool` and `recipe`.
-        change: what is changed in the recipe, "key=value" each.
-        part: its part in the whole procedure, a subtask or `HLP`; none is what its name says, where
-            no other policy has that part.
-    """
-
-    name: str
-    demonstrations: str
-    subtask: str | None = None
-    view: tuple[str, ...] = ()
-    policy: str = "bc"
-    encoder: str | None = None
-    pool: str | None = None
-    recipe: str | None = None
-    change: tuple[str, ...] = ()
-    part: str = ""
-
-    @property
-    def acts(self) -> bool:
-        """Whether it is evaluated by itself; what has a `part` is judged in the whole alone."""
-        return self.policy != HLP and not self.part
-
-
-@dataclass(frozen=True)
-class Condition:
-    """What differs in an evaluation from the training.
-
-    Attributes:
-        name: how tables call it.
-        policies: the policies of the plan that are evaluated so, the whole procedure as `suture`;
-            none named are all that act.
-        env: fields of `TaskConfig` in the place of the plan's. A field stands whole in its place:
-            `randomisation: {camera_shift: 2}` has that axis alone, whatever the plan's has, and
-            `randomisation: {}` none. A field that is not named is the plan's, not what some
-            demonstrations alone have (`Plan.evaluated_env`).
-        procedure: fields of `HierarchicalConfig` in the place of the plan's; `place: expert` puts
-            the expert in for a policy.
-        upset: let one thing go wrong in every episode (`envs.upset`).
-        seed: training seeds that are evaluated so; all by default.
-        episodes: starts; the plan's by default.
-        shift: an axis of robustness (`evaluation.robustness.AXES`) and its strength, 0 to 1.
-    """
-
-    name: str
-    policies: tuple[str, ...] = ()
-    env: Mapping[str, JSON] = field(default_factory=dict)
-    procedure: Mapping[str, JSON] = field(default_factory=dict)
-    upset: bool = False
-    seed: tuple[int, ...] = ()
-    episodes: int | None = None
-    shift: Shift | None = None
-
-
-@dataclass(frozen=True)
-class NotRun:
-    """Rows of a plan that cannot be run where it was written, and what they need.
-
-    Attributes:
-        policy: what they are of.
-        task: their tasks.
-        needs: what is needed, for the reader.
-    """
-
-    policy: str
-    task: tuple[str, ...]
-    needs: str
 
 
 @dataclass(frozen=True)
@@ -197,80 +117,7 @@ class Plan:
     not_run: tuple[NotRun, ...] = ()
 
     def __post_init__(self) -> None:
-        check_name("bank of starts", self.starts, BANKS)
-        _check_different("demonstrations", [recorded.name for recorded in self.demonstrations])
-        _check_different("policies", [policy.name for policy in self.policies])
-        parts = [policy.part for policy in self.policies if policy.part]
-        if parts:
-            _check_different("parts", parts)
-        _check_different("conditions", [condition.name for condition in self.conditions])
-        _check_different("seed", self.seed)
-        for seed in self.seed:
-            first_seed(seed)
-        check_at_least(1, episodes=self.episodes, size=self.size, epochs=self.epochs)
-        for recorded in self.demonstrations:
-            self.recorded_env(recorded)
-            if recorded.episodes > MOST_EPISODES:
-                raise InputError(
-                    f"demonstrations {recorded.name}: episodes is {recorded.episodes}; "
-                    f"allowed: 1 to {MOST_EPISODES}."
-                )
-            self._check_visits(recorded)
-        for policy in self.policies:
-            self._check_policy(policy)
-        for condition in self.conditions:
-            self._check_condition(condition)
-        if len(set(self.runs)) != len(self.runs):
-            raise InputError(
-                f"The plan has {len(self.runs)} runs, {len(set(self.runs))} of them different; "
-                "leave out policies that differ in nothing but their names."
-            )
-
-    def _check_visits(self, recorded: Demonstrations) -> None:
-        """Refuse visits of what is no subtask, or in what is not recorded as a whole procedure."""
-        if not recorded.visits_of:
-            return
-        whole = [each.name for each in self.demonstrations if each.task == names.SUTURE]
-        check_name("demonstrations of the whole procedure", recorded.visits_of, whole)
-        check_name("task that is visited", recorded.task, names.SUBTASKS)
-
-    def _check_policy(self, policy: PlannedPolicy) -> None:
-        """Refuse a policy of what is not recorded, or not rendered."""
-        known = [recorded.name for recorded in self.demonstrations]
-        check_name("demonstrations", policy.demonstrations, known)
-        if policy.subtask is not None:
-            check_name("subtask", policy.subtask, names.SUBTASKS)
-        for view in policy.view:
-            check_name("rendered view", view, self.recorded(policy).view)
-        if policy.part:
-            check_name("part of the whole procedure", policy.part, PARTS)
-        encoders.check_encoder_name(policy.encoder or self.encoder)
-
-    def _check_condition(self, condition: Condition) -> None:
-        """Refuse a condition of what is not trained, or that no env or procedure can have."""
-        evaluated = [policy.name for policy in self.policies if policy.acts]
-        if names.SUTURE in self.names:
-            evaluated.append(names.SUTURE)
-            self.hierarchical(condition, {})
-        for name in condition.policies:
-            check_name("policy that is evaluated", name, evaluated)
-        for seed in condition.seed:
-            check_name("training seed", str(seed), [str(seed) for seed in self.seed])
-        check_at_least(1, **{f"condition {condition.name}: episodes": condition.episodes})
-        for key in ("task", "advance"):
-            if key in {**self.env, **condition.env}:
-                raise InputError(
-                    f"condition {condition.name}: env has '{key}', which follows from what is "
-                    "evaluated; leave it out."
-                )
-        self.task_config(names.SUTURE, condition)
-        if condition.shift is not None:
-            check_name("axis", condition.shift.axis, AXES)
-            if not 0 <= condition.shift.strength <= 1:
-                raise InputError(
-                    f"condition {condition.name}: strength is {condition.shift.strength}; "
-                    "allowed: 0 to 1."
-                )
+        check_plan(self)
 
     def task_config(self, task: str, condition: Condition | None = None) -> TaskConfig:
         """Return the configuration of a task in the plan's env, or in that of a condition."""
@@ -555,15 +402,6 @@ class Plan:
 
 def _dataset_name(recorded: Demonstrations, seed: int) -> str:
     return f"seed{seed}/{recorded.name}"
-
-
-def _check_different(what: str, values: Sequence[object]) -> None:
-    """Refuse an empty list, and a value that is given twice."""
-    if not values or len(set(values)) != len(values):
-        raise InputError(
-            f"{what}: {', '.join(map(str, values)) or 'nothing'} is given; "
-            "give at least one, each once."
-        )
 
 
 def plan_of(table: Mapping[str, object], where: str) -> Plan:

@@ -31,7 +31,8 @@ from surgicai_vision.evaluation.provenance import command_line
 from surgicai_vision.evaluation.run import evaluate_once
 from surgicai_vision.evaluation.storage import read_rows
 from surgicai_vision.experiments.dataset_config import Demonstrations
-from surgicai_vision.experiments.plan_config import Plan, PlannedPolicy, plan_of
+from surgicai_vision.experiments.plan_config import Plan, plan_of
+from surgicai_vision.experiments.plan_parts import PlannedPolicy
 from surgicai_vision.experiments.prepare import check_dataset, make_dataset
 from surgicai_vision.experiments.run import train_run
 from surgicai_vision.features import encoders

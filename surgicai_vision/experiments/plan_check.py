@@ -1,0 +1,109 @@
+"""Checks of a plan: what is refused before any work; see `plan_config`."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, check_at_least, check_name
+from surgicai_vision.evaluation.robustness.axes import AXES
+from surgicai_vision.experiments.dataset_config import MOST_EPISODES, Demonstrations, first_seed
+from surgicai_vision.experiments.plan_parts import PARTS, Condition, PlannedPolicy
+from surgicai_vision.features import encoders
+from surgicai_vision.training.run_config import BANKS
+
+if TYPE_CHECKING:
+    from surgicai_vision.experiments.plan_config import Plan
+
+
+def check_plan(plan: "Plan") -> None:
+    """Refuse a plan that names what it does not have, or that cannot be run as it says.
+
+    Raises:
+        InputError: what is wrong, and what is allowed.
+    """
+    check_name("bank of starts", plan.starts, BANKS)
+    _check_different("demonstrations", [recorded.name for recorded in plan.demonstrations])
+    _check_different("policies", [policy.name for policy in plan.policies])
+    parts = [policy.part for policy in plan.policies if policy.part]
+    if parts:
+        _check_different("parts", parts)
+    _check_different("conditions", [condition.name for condition in plan.conditions])
+    _check_different("seed", plan.seed)
+    for seed in plan.seed:
+        first_seed(seed)
+    check_at_least(1, episodes=plan.episodes, size=plan.size, epochs=plan.epochs)
+    for recorded in plan.demonstrations:
+        plan.recorded_env(recorded)
+        if recorded.episodes > MOST_EPISODES:
+            raise InputError(
+                f"demonstrations {recorded.name}: episodes is {recorded.episodes}; "
+                f"allowed: 1 to {MOST_EPISODES}."
+            )
+        _check_visits(plan, recorded)
+    for policy in plan.policies:
+        _check_policy(plan, policy)
+    for condition in plan.conditions:
+        _check_condition(plan, condition)
+    if len(set(plan.runs)) != len(plan.runs):
+        raise InputError(
+            f"The plan has {len(plan.runs)} runs, {len(set(plan.runs))} of them different; "
+            "leave out policies that differ in nothing but their names."
+        )
+
+
+def _check_visits(plan: "Plan", recorded: Demonstrations) -> None:
+    """Refuse visits of what is no subtask, or in what is not recorded as a whole procedure."""
+    if not recorded.visits_of:
+        return
+    whole = [each.name for each in plan.demonstrations if each.task == names.SUTURE]
+    check_name("demonstrations of the whole procedure", recorded.visits_of, whole)
+    check_name("task that is visited", recorded.task, names.SUBTASKS)
+
+
+def _check_policy(plan: "Plan", policy: PlannedPolicy) -> None:
+    """Refuse a policy of what is not recorded, or not rendered."""
+    known = [recorded.name for recorded in plan.demonstrations]
+    check_name("demonstrations", policy.demonstrations, known)
+    if policy.subtask is not None:
+        check_name("subtask", policy.subtask, names.SUBTASKS)
+    for view in policy.view:
+        check_name("rendered view", view, plan.recorded(policy).view)
+    if policy.part:
+        check_name("part of the whole procedure", policy.part, PARTS)
+    encoders.check_encoder_name(policy.encoder or plan.encoder)
+
+
+def _check_condition(plan: "Plan", condition: Condition) -> None:
+    """Refuse a condition of what is not trained, or that no env or procedure can have."""
+    evaluated = [policy.name for policy in plan.policies if policy.acts]
+    if names.SUTURE in plan.names:
+        evaluated.append(names.SUTURE)
+        plan.hierarchical(condition, {})
+    for name in condition.policies:
+        check_name("policy that is evaluated", name, evaluated)
+    for seed in condition.seed:
+        check_name("training seed", str(seed), [str(seed) for seed in plan.seed])
+    check_at_least(1, **{f"condition {condition.name}: episodes": condition.episodes})
+    for key in ("task", "advance"):
+        if key in {**plan.env, **condition.env}:
+            raise InputError(
+                f"condition {condition.name}: env has '{key}', which follows from what is "
+                "evaluated; leave it out."
+            )
+    plan.task_config(names.SUTURE, condition)
+    if condition.shift is not None:
+        check_name("axis", condition.shift.axis, AXES)
+        if not 0 <= condition.shift.strength <= 1:
+            raise InputError(
+                f"condition {condition.name}: strength is {condition.shift.strength}; "
+                "allowed: 0 to 1."
+            )
+
+
+def _check_different(what: str, values: Sequence[object]) -> None:
+    """Refuse an empty list, and a value that is given twice."""
+    if not values or len(set(values)) != len(values):
+        raise InputError(
+            f"{what}: {', '.join(map(str, values)) or 'nothing'} is given; "
+            "give at least one, each once."
+        )

@@ -1,0 +1,93 @@
+"""What a plan lists, as data: policies, conditions, rows that are not run; see `plan_config`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from surgicai_vision.core import names
+from surgicai_vision.core.config import JSON
+from surgicai_vision.training.run_config import Shift
+
+HLP = "hlp"
+"""Name of the high-level policy, and of its kind."""
+PARTS = (*names.SUBTASKS, HLP)
+"""The parts of the whole procedure."""
+AS_TRAINED = "as trained"
+"""Name of the only condition of a plan that lists none."""
+
+
+@dataclass(frozen=True)
+class PlannedPolicy:
+    """A policy of a plan.
+
+    Attributes:
+        name: its name.
+        demonstrations: name of what it is trained on.
+        subtask: take one subtask's frames of whole procedures.
+        view: what it sees; nothing for proprioception alone.
+        policy: its kind.
+        encoder: its encoder; None takes the plan's. Likewise `pool` and `recipe`.
+        change: what is changed in the recipe, "key=value" each.
+        part: its part in the whole procedure, a subtask or `HLP`; none is what its name says, where
+            no other policy has that part.
+    """
+
+    name: str
+    demonstrations: str
+    subtask: str | None = None
+    view: tuple[str, ...] = ()
+    policy: str = "bc"
+    encoder: str | None = None
+    pool: str | None = None
+    recipe: str | None = None
+    change: tuple[str, ...] = ()
+    part: str = ""
+
+    @property
+    def acts(self) -> bool:
+        """Whether it is evaluated by itself; what has a `part` is judged in the whole alone."""
+        return self.policy != HLP and not self.part
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What differs in an evaluation from the training.
+
+    Attributes:
+        name: how tables call it.
+        policies: the policies of the plan that are evaluated so, the whole procedure as `suture`;
+            none named are all that act.
+        env: fields of `TaskConfig` in the place of the plan's. A field stands whole in its place:
+            `randomisation: {camera_shift: 2}` has that axis alone, whatever the plan's has, and
+            `randomisation: {}` none. A field that is not named is the plan's, not what some
+            demonstrations alone have (`plan_config.Plan.evaluated_env`).
+        procedure: fields of `HierarchicalConfig` in the place of the plan's; `place: expert` puts
+            the expert in for a policy.
+        upset: let one thing go wrong in every episode (`envs.upset`).
+        seed: training seeds that are evaluated so; all by default.
+        episodes: starts; the plan's by default.
+        shift: an axis of robustness (`evaluation.robustness.AXES`) and its strength, 0 to 1.
+    """
+
+    name: str
+    policies: tuple[str, ...] = ()
+    env: Mapping[str, JSON] = field(default_factory=dict)
+    procedure: Mapping[str, JSON] = field(default_factory=dict)
+    upset: bool = False
+    seed: tuple[int, ...] = ()
+    episodes: int | None = None
+    shift: Shift | None = None
+
+
+@dataclass(frozen=True)
+class NotRun:
+    """Rows of a plan that cannot be run where it was written, and what they need.
+
+    Attributes:
+        policy: what they are of.
+        task: their tasks.
+        needs: what is needed, for the reader.
+    """
+
+    policy: str
+    task: tuple[str, ...]
+    needs: str
