@@ -3,11 +3,12 @@
     with open_transport("cyclonedds") as transport, Server(robot, transport, config) as server:
         server.run(lambda: False)
 
-In real time a control step of 20 ms begins 50 times a second: the state at its beginning is
-published, the commands that have come are obeyed, and the state halfway is published 10 ms later,
-so that states come 100 times a second. Where the client sets the clock (`stepped`), nothing moves
-until a message on `/simulation/step` asks for it; everything published for a step bears one stamp,
-and `/simulation/stepped` says which, last.
+In real time a control step of 20 ms begins 50 times a second: the commands that have come become
+the set points, the state at its beginning is published with them, and the state halfway is
+published 10 ms later, so that states come 100 times a second. A set point that came in time is
+thus published before its sender's next control step begins. Where the client sets the clock
+(`stepped`), nothing moves until a message on `/simulation/step` asks for it; everything published
+for a step bears one stamp, and `/simulation/stepped` says which, last.
 """
 
 import json
@@ -196,17 +197,18 @@ class Server:
             _sleep_until(due)
 
     def _tick(self) -> dict[str, ArmState]:
-        """Publish the present state, obey, and take a step; return the arms' states halfway."""
+        """Obey, publish the present state, and take a step; return the arms' states halfway."""
+        self.poll()
+        self._obey()
         stamp = self._stamp()
         self._publish_all(stamp)
         self._offer_image(stamp)
-        self.poll()
         halfway: dict[str, ArmState] = {}
 
         def read() -> None:
             halfway.update({name: self.robot.state(name) for name in PSM_NAMES})
 
-        self._advance(read)
+        self._move(read)
         return halfway
 
     # -- what comes --------------------------------------------------------------------------------
@@ -278,14 +280,15 @@ class Server:
         if missing:
             self._answer(request, f"no message with that stamp on {', '.join(missing)}")
             return True
-        self._advance(None)
+        self._obey()
+        self._move(None)
         self._answer(request, "")
         return True
 
     # -- what moves --------------------------------------------------------------------------------
 
-    def _advance(self, halfway: Callable[[], None] | None) -> None:
-        """Let the arms obey and take one control step."""
+    def _obey(self) -> None:
+        """Let the arms obey: what they are told becomes their set points."""
         seconds = self.robot.steps * CONTROL_S
         targets: dict[str, Target] = {}
         for name, psm in self._psms.items():
@@ -294,7 +297,11 @@ class Server:
                 targets[name] = target
         if self._recorder is not None:
             self._recorder.before_step()
-        self.robot.step(targets, halfway)
+        self.robot.tell(targets)
+
+    def _move(self, halfway: Callable[[], None] | None) -> None:
+        """Take one control step under the present set points."""
+        self.robot.step(halfway)
         if self._recorder is not None:
             self._recorder.after_step()
         if self.robot.info["physics_error"]:

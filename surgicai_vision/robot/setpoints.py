@@ -4,16 +4,20 @@
     commands, problem = setpoints.of_action(action, now)
     setpoints.send({} if problem else commands)
 
-An action is added to the set point that the robot itself publishes, as the envs add it to theirs,
-and sent as `servo_cp` and `jaw/servo_jp`. A set point is sent in the frame of the robot's own
-`setpoint_cp`: a dVRK reads no other, whatever a header says.
+An action is added to the set point that the robot itself publishes, as the envs add it to theirs;
+where that still is an earlier one of those sent, since the last have not been obeyed or heard of
+yet, it is added to the last one, so that nothing is lost on the way. It is sent as `servo_cp` and
+`jaw/servo_jp`, in the frame of the robot's own `setpoint_cp`: a dVRK reads no other, whatever a
+header says.
 
 Where the pull-out begins, PSM2 lets go, as the envs make it: the jaw opens, then the tool is drawn
 back along its axis.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -38,6 +42,26 @@ RELEASE_OPEN = 0.5
 """Finger's angle to which PSM2 opens when it lets go [rad] (`Simulation._let_go`)."""
 SAME_M = 0.002
 """Distance within which a set point that was sent still is the one that is obeyed [m]."""
+PENDING_S = 0.1
+"""Time in which a set point that was sent must be heard of; later it counts as refused [s]."""
+EQUAL_M = 1e-5
+EQUAL_RAD = 1e-3
+"""Differences within which a published set point is one that was sent [m] [rad]."""
+
+
+@dataclass(frozen=True)
+class _Sent:
+    """A set point that was sent.
+
+    Attributes:
+        time: when [s].
+        heard: what was published then.
+        command: what was sent.
+    """
+
+    time: float
+    heard: Command
+    command: Command
 
 
 @final
@@ -71,7 +95,9 @@ class Setpoints:
         self._dead_man = dead_man
         self._sends = sends
         self._is_stepped = is_stepped
-        self._sent: dict[str, Command] = {}
+        self._sent: dict[str, deque[_Sent]] = {}
+        self._heard: dict[str, Command] = {}
+        self._now = 0.0
 
     def forget(self) -> None:
         """Forget what was sent: an episode begins."""
@@ -123,13 +149,14 @@ class Setpoints:
             moves: arm → seven increments in [-1, 1].
             now: of the control step [s].
         """
+        self._now = now
         robot = self._robot
         commands: dict[str, Command] = {}
         for arm, values in moves.items():
             if len(values) != 7 or not all(map(math.isfinite, values)):
                 return {}, "the policy's action is not seven finite numbers"
             clipped = [min(max(value, -1.0), 1.0) for value in values]
-            told = robot.told(arm) if arm == robot.active else self._present(arm)
+            told = self._present(arm)
             commands[arm] = self._moved(told, clipped)
         if robot.release_steps:
             commands[RELEASED] = self._released()
@@ -146,6 +173,7 @@ class Setpoints:
             targets: arm → where it should be told to be.
             now: of the control step [s].
         """
+        self._now = now
         commands: dict[str, Command] = {}
         for arm, target in targets.items():
             if not all(map(math.isfinite, (*target.pose, target.jaw))):
@@ -162,6 +190,7 @@ class Setpoints:
         self, commands: Mapping[str, Command], now: float
     ) -> tuple[Mapping[str, Command], str]:
         """Return what of set points would be sent at `now` [s], and why it may not be, or ""."""
+        self._now = now
         robot = self._robot
         planned = {}
         for arm, command in commands.items():
@@ -192,15 +221,24 @@ class Setpoints:
         return Command(poses.shifted_along_z(told.pose, -RELEASE_SHIFT), jaw)
 
     def _present(self, arm: str) -> Command:
-        """Return where an arm is told to be: as it was last sent, where that is still obeyed.
+        """Return where an arm is told to be: as published, or as last sent where that is pending.
 
-        What is published is drawn back towards what is measured; the active arm goes on from there.
+        What is published is drawn back towards what is measured; the active arm goes on from there,
+        another one from what was last sent as long as that is near.
         """
         told = self._robot.told(arm)
+        self._heard[arm] = told
         sent = self._sent.get(arm)
-        if arm == self._robot.active or sent is None:
+        if not sent:
             return told
-        return sent if poses.distance(sent.pose, told.pose) < SAME_M else told
+        last = sent[-1].command
+        if arm != self._robot.active:
+            return last if poses.distance(last.pose, told.pose) < SAME_M else told
+        waiting = [entry for entry in sent if entry.time >= self._now - PENDING_S]
+        if not waiting or _is_same(told, last):
+            return told
+        before = [waiting[0].heard, *(entry.command for entry in waiting[:-1])]
+        return last if any(_is_same(told, entry) for entry in before) else told
 
     def send(self, commands: Mapping[str, Command]) -> None:
         """Send commands, and let a clock that is ours go on."""
@@ -218,8 +256,20 @@ class Setpoints:
                 ):
                     self._client.send(topic, message)
                     sent.append(topic)
-                self._sent[arm] = command
+                waiting = self._sent.setdefault(arm, deque())
+                waiting.append(_Sent(self._now, self._heard[arm], command))
+                while waiting[0].time < self._now - PENDING_S:
+                    waiting.popleft()
         if self._robot.release_steps and commands:
             self._robot.release_steps -= 1
         if self._is_stepped:
             self._client.step(sent, stamp)
+
+
+def _is_same(one: Command, other: Command) -> bool:
+    """Return True if two set points differ by rounding alone."""
+    return (
+        poses.distance(one.pose, other.pose) < EQUAL_M
+        and poses.angle(one.pose, other.pose) < EQUAL_RAD
+        and abs(one.jaw - other.jaw) < EQUAL_RAD
+    )

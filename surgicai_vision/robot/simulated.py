@@ -90,15 +90,22 @@ class SimulatedRobot:
             jaw_setpoint=told.jaw / FINGER_SHARE,
         )
 
-    def step(self, targets: Mapping[str, Target], halfway: Callable[[], None] | None) -> None:
-        """Take one control step of 20 ms.
+    def tell(self, targets: Mapping[str, Target]) -> None:
+        """Give arms new set points, which `state` returns from now on; nothing moves yet.
 
         Args:
             targets: arm → where it is told to be; an arm left out stays as it was told.
+        """
+        for name, target in targets.items():
+            self.env.simulation.command(PSM_NAMES[name], self._command(target))
+
+    def step(self, halfway: Callable[[], None] | None) -> None:
+        """Take one control step of 20 ms under the present set points.
+
+        Args:
             halfway: called after half of it, when `state` may be read.
         """
-        commands = {PSM_NAMES[name]: self._command(target) for name, target in targets.items()}
-        _, _, _, _, self.info = self.env.step_commands(commands, halfway)
+        _, _, _, _, self.info = self.env.step_commands({}, halfway)
         self.steps += 1
 
     def needle(self) -> Pose:

@@ -5,7 +5,7 @@ import functools
 from memory_transport import MemoryTransport
 
 from surgicai_vision import envs
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import ADVANCES, TaskConfig
 from surgicai_vision.robot.recorder import Recorder
 from surgicai_vision.robot.server import ServeConfig, Server
 from surgicai_vision.robot.simulated import SimulatedRobot
@@ -14,16 +14,16 @@ SEED = 900_003
 
 
 @functools.cache
-def env_of(task):
-    return envs.make(TaskConfig(task))
+def env_of(task, advance=ADVANCES[0]):
+    return envs.make(TaskConfig(task, advance=advance))
 
 
 class Served(MemoryTransport):
     """A transport at whose other end a stepped server is asked whenever the client waits."""
 
-    def __init__(self, task, views=(), recordings=None, tell=None, size=64):
+    def __init__(self, task, views=(), recordings=None, tell=None, size=64, advance=ADVANCES[0]):
         super().__init__()
-        self.robot = SimulatedRobot(env_of(task))
+        self.robot = SimulatedRobot(env_of(task, advance))
         self.robot.reset(SEED)
         config = ServeConfig("stepped", views=views, size=(size, size))
         recorder = Recorder(self.robot, recordings, tell) if recordings else None
