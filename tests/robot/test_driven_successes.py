@@ -1,6 +1,7 @@
 """Released policies at a served simulation: the same ends, episode by episode, as in process."""
 
 import io
+from pathlib import Path
 
 import pytest
 from stepped_server import Served
@@ -12,18 +13,21 @@ from surgicai_vision.robot.driven import DrivenRobot
 from surgicai_vision.robot.driver import DriveConfig, Driver
 from surgicai_vision.robot.guards import GuardConfig
 
+PROCEDURE = Path(__file__).resolve().parents[2] / "examples" / "learned-ends.yaml"
+
 
 @pytest.mark.parametrize(
     ("policy", "seeds"),
-    [("released:grasp", (900_000, 900_001)), ("released:suture", (900_000,))],
+    [("released:grasp", (900_000,)), (PROCEDURE, (900_001,))],
+    ids=["grasp", "procedure"],
 )
-def test_a_released_policy_ends_as_it_does_in_process(policy, seeds):
-    """From its images, its measured poses and its guards; the steps are the same too.
+def test_released_policies_end_as_they_do_in_process(policy, seeds):
+    """From images, measured poses and within guards; the steps are the same too.
 
-    `released:suture` is the whole procedure: five low-level policies, the high-level one that
-    says when each ends, and PSM2's letting go.
+    The whole procedure is five low-level policies, the high-level one that says when each ends,
+    and PSM2's letting go. `benchmarks/robot.py` counts more episodes, a process on each side.
     """
-    spec = open_policy(policy)
+    spec = open_policy(str(policy))
     task = spec.config
     agent = spec.make_agent()
     own = evaluate(lambda: agent, task, seeds, batch=1, workers=1)
@@ -38,4 +42,4 @@ def test_a_released_policy_ends_as_it_does_in_process(policy, seeds):
     assert [episode.held for episode in driven] == [0] * len(seeds)
     assert [episode.success for episode in driven] == [entry.row.success for entry in own]
     assert [episode.steps for episode in driven] == [entry.row.steps for entry in own]
-    assert any(episode.success for episode in driven)
+    assert all(episode.success for episode in driven)
