@@ -84,11 +84,9 @@ class CycloneTransport:
         self._topics: dict[str, DdsTopic[IdlStruct]] = {}
         try:
             keep_to(open_sockets() - before, interface)
-        except OSError as error:
+        except InputError:
             self.__exit__()
-            raise InputError(
-                f"The sockets cannot be kept to {interface} ({error.strerror}); nothing was opened."
-            ) from None
+            raise
         self._waiting = Waiting(self._participant)
 
     def __enter__(self) -> Self:

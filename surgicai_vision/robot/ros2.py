@@ -112,11 +112,9 @@ class RclpyTransport:
                 os.environ[RANGE] = range_before
         try:
             keep_to(open_sockets() - before, interface)
-        except OSError as error:
+        except InputError:
             self.__exit__()
-            raise InputError(
-                f"The sockets cannot be kept to {interface} ({error.strerror}); nothing was opened."
-            ) from None
+            raise
 
     def __enter__(self) -> Self:
         return self

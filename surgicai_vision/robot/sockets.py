@@ -49,10 +49,18 @@ def open_sockets() -> set[int]:
 
 
 def keep_to(descriptors: set[int], interface: str) -> None:
-    """Let sockets hear nothing but what comes in by an interface; OSError: not allowed."""
-    for descriptor in descriptors:
-        with socket.socket(fileno=os.dup(descriptor)) as one:
-            if one.family in (socket.AF_INET, socket.AF_INET6):
-                one.setsockopt(
-                    socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode() + b"\0"
-                )
+    """Let sockets hear nothing but what comes in by an interface.
+
+    Raises:
+        InputError: that is refused; the caller closes what it opened.
+    """
+    device = interface.encode() + b"\0"
+    try:
+        for descriptor in descriptors:
+            with socket.socket(fileno=os.dup(descriptor)) as one:
+                if one.family in (socket.AF_INET, socket.AF_INET6):
+                    one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, device)
+    except OSError as error:
+        raise InputError(
+            f"The sockets cannot be kept to {interface} ({error.strerror}); nothing was opened."
+        ) from None

@@ -28,7 +28,7 @@ from surgicai_vision.robot.transport import open_transport
 pytest.importorskip("cyclonedds", reason="the extra `ros` is not installed")
 from surgicai_vision.robot.codecs import ROS_NAMES
 from surgicai_vision.robot.idl import TYPES
-from surgicai_vision.robot.sockets import open_sockets
+from surgicai_vision.robot.sockets import keep_to, open_sockets
 
 SEED = 900_001
 
@@ -79,6 +79,12 @@ def test_every_socket_hears_the_loopback_alone(transport):
             assert device.rstrip(b"\0") == b"lo", one.getsockname()
             checked += 1
     assert checked >= 2
+
+
+def test_sockets_that_cannot_be_kept_to_an_interface_are_refused():
+    refused = pytest.raises(InputError, match="cannot be kept to moon0")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one, refused:
+        keep_to({one.fileno()}, "moon0")
 
 
 def test_what_cannot_be_opened_is_refused():
