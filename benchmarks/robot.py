@@ -1,64 +1,153 @@
 """Measure a policy at the served simulation: successes, jitter and latency.
 
-    python benchmarks/robot.py --policy released:grasp --episodes 50
+    python benchmarks/robot.py --episodes 50
     python benchmarks/robot.py --policy released:grasp --episodes 2 --clock stepped
 
 `robot serve` and `robot drive`, a process each, over a transport on the loopback; beside them the
 same policy and starts in one process (`evaluate`). Where the client steps the clock, every episode
 must have the same end after the same steps. In real time the served simulation is asked how late
-its control steps began, and the driver how long after the newest pose it sent: a shared machine
-says nothing about either, and the load average stands beside them.
+its control steps began, and the driver how long after the newest pose and the newest image it sent:
+a shared machine says nothing about either, and the load average of the minute before stands beside
+them (two to three are the benchmark's own).
+
+Ten episodes at a time; what was counted is kept in `--out`/counted.jsonl, and the same command goes
+on from there. `--out`/robot.json has the result.
 """
 
 import argparse
+import functools
 import json
 import os
 import signal
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 
-from common import emit
+from common import emit, spread_resumable
 
 from surgicai_vision.core import names
+from surgicai_vision.core.files import code_version
+from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.evaluation.rollout import evaluate
 
+ROOT = Path(__file__).resolve().parents[1]
+PROCEDURE = ROOT / "examples" / "learned-ends.yaml"
 COMMAND = (sys.executable, "-m", "surgicai_vision", "robot")
+IN_PROCESS = "in process"
+CLOCKS = ("stepped", "real")
+CHUNK = 10
+"""Episodes that are counted at a time, and lost if it breaks off."""
+BEGINS_S = 120.0
 ENDS_S = 30.0
-"""Time that `robot serve` has to end after Ctrl-C [s]."""
+"""Time that `robot serve` has to begin, and to end after Ctrl-C [s]."""
 
 
-def served_and_driven(
-    spec: PolicySpec, chosen: argparse.Namespace, clock: str
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what `robot serve` and `robot drive` say of the episodes, as JSON."""
-    agent = spec.make_agent()
-    network = ("--transport", chosen.transport, "--domain", str(chosen.domain), "--clock", clock)
+@dataclass(frozen=True)
+class Job:
+    """Episodes to be counted: `repr` names them in the file of what was counted."""
+
+    way: str
+    policy: str
+    transport: str
+    code: str
+    first: int
+    count: int
+
+
+def count(job: Job, domain: int) -> dict[str, Any]:
+    """Count a job's episodes: success, steps and subtasks of each, and how late things were."""
+    begun = time.monotonic()
+    counted = in_process(job) if job.way == IN_PROCESS else at_robot(job, domain)
+    done = counted["episodes"]
+    print(
+        f"{job.way}: starts {job.first}-{job.first + job.count - 1}: "
+        f"{sum(success for success, _, _ in done)} of {len(done)} succeeded, "
+        f"{sum(subtasks for _, _, subtasks in done)} subtasks; {time.monotonic() - begun:.0f} s",
+        file=sys.stderr,
+        flush=True,
+    )
+    return counted
+
+
+@functools.cache
+def opened(policy: str) -> tuple[PolicySpec, Agent]:
+    """Return a policy, and an agent of it."""
+    spec = open_policy(policy)
+    return spec, spec.make_agent()
+
+
+def in_process(job: Job) -> dict[str, Any]:
+    """Count in this process and its workers."""
+    spec, _ = opened(job.policy)
+    seeds = range(job.first, job.first + job.count)
+    rows = [entry.row for entry in evaluate(spec.make_agent, spec.config, seeds)]
+    return {"episodes": [(bool(row.success), row.steps, row.stages) for row in rows]}
+
+
+def at_robot(job: Job, domain: int) -> dict[str, Any]:
+    """Count by `robot serve` and `robot drive`."""
+    spec, agent = opened(job.policy)
+    network = ("--transport", job.transport, "--domain", str(domain), "--clock", job.way)
     serve = [*COMMAND, "serve", "--task", spec.config.task, "--advance", spec.config.advance]
     serve += ["--size", str(agent.image_size), "--image-rate", "50", *network, "--json"]
     serve += ["--view", ",".join(agent.cameras)] if agent.cameras else []
-    drive = [*COMMAND, "drive", chosen.policy, "--simulated", "--send", *network, "--json"]
-    drive += ["--episodes", str(chosen.episodes), "--seed", str(chosen.seed)]
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        subprocess.Popen(
-            serve, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as server,
-    ):
-        assert server.stderr is not None
-        while "serving" not in (line := server.stderr.readline()):
-            if not line:
-                raise SystemExit("robot serve ended; run it by itself to see why")
-        driven = subprocess.run(
-            [*drive, "--out", folder], stdout=subprocess.PIPE, text=True, check=True
-        )
+    drive = [*COMMAND, "drive", job.policy, "--simulated", "--send", *network, "--json"]
+    drive += ["--episodes", str(job.count), "--seed", str(job.first)]
+    with tempfile.TemporaryDirectory() as folder:
+        said = Path(folder) / "serve.json"
+        with serving(serve, said, Path(folder) / "serve.log"):
+            driven = subprocess.run(
+                [*drive, "--out", f"{folder}/drive"], stdout=subprocess.PIPE, text=True, check=True
+            )
+        served = last_line(said.read_text())
+    row = last_line(driven.stdout)
+    late = (
+        "latency_ms_median",
+        "latency_ms_p99",
+        "image_latency_ms_median",
+        "image_latency_ms_p99",
+    )
+    return {
+        "episodes": [
+            (bool(entry["success"]), entry["steps"] + entry["held"], entry["progress"])
+            for entry in row["episodes"]
+        ],
+        "held": sum(entry["held"] for entry in row["episodes"]),
+        "control_steps": served["steps"],
+        "late_ms_median": served["late_ms_median"],
+        "late_ms_p99": served["late_ms_p99"],
+        **{name: row[name] for name in late},
+        "load_average": os.getloadavg()[0],
+    }
+
+
+@contextmanager
+def serving(command: list[str], said: Path, log: Path) -> Iterator[None]:
+    """Run `robot serve` beside; `said` holds what it printed once it has ended."""
+    with said.open("w") as out, log.open("w") as notes:
+        server = subprocess.Popen(command, stdout=out, stderr=notes)
+    try:
+        ends = time.monotonic() + BEGINS_S
+        while "serving" not in log.read_text():
+            if server.poll() is not None or time.monotonic() > ends:
+                raise SystemExit(f"robot serve did not begin:\n{log.read_text()}")
+            time.sleep(0.1)
+        yield
         server.send_signal(signal.SIGINT)
-        said, _ = server.communicate(timeout=ENDS_S)
-    return last_line(said), last_line(driven.stdout)
+        server.wait(ENDS_S)
+    finally:
+        if server.poll() is None:
+            server.kill()
+            server.wait()
 
 
 def last_line(text: str) -> dict[str, Any]:
@@ -67,47 +156,70 @@ def last_line(text: str) -> dict[str, Any]:
     return found
 
 
-def measure(chosen: argparse.Namespace) -> dict[str, Any]:
-    """Drive in both clocks and in one process, and compare episode by episode."""
-    spec = open_policy(chosen.policy)
-    seeds = range(chosen.seed, chosen.seed + chosen.episodes)
-    own = evaluate(spec.make_agent, spec.config, seeds, batch=1, workers=1)
-    ends = [(entry.row.success, entry.row.steps) for entry in own]
-    row: dict[str, Any] = {"task": spec.config.task, "in_process": sum(end for end, _ in ends)}
-    if chosen.clock in ("stepped", "both"):
-        _, driven = served_and_driven(spec, chosen, "stepped")
-        found = [(entry["success"], entry["steps"]) for entry in driven["episodes"]]
-        row |= {
-            "stepped": driven["successes"],
-            "stepped_same_ends": sum(a == b for a, b in zip(ends, found, strict=True)),
+def result(jobs: list[Job], counted: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the sums of each way, and how they compare with one process, episode by episode."""
+    parts: dict[str, list[dict[str, Any]]] = {}
+    for job, part in zip(jobs, counted, strict=True):
+        parts.setdefault(job.way, []).append(part)
+    ends = {
+        way: [tuple(end) for part in chunks for end in part["episodes"]]
+        for way, chunks in parts.items()
+    }
+    own = ends[IN_PROCESS]
+    row: dict[str, Any] = {}
+    for way, found in ends.items():
+        sums: dict[str, Any] = {
+            "successes": sum(success for success, _, _ in found),
+            "subtasks": sum(subtasks for _, _, subtasks in found),
         }
-    if chosen.clock in ("real", "both"):
-        served, driven = served_and_driven(spec, chosen, "real")
-        row |= {
-            "real_time": driven["successes"],
-            "real_time_held": sum(entry["held"] for entry in driven["episodes"]),
-            "late_ms_p50": round(served["late_ms_median"], 3),
-            "late_ms_p99": round(served["late_ms_p99"], 3),
-            "latency_ms_p50": round(driven["latency_ms_median"], 2),
-            "latency_ms_p99": round(driven["latency_ms_p99"], 2),
-        }
+        if way != IN_PROCESS:
+            sums["same_success"] = sum(a[0] == b[0] for a, b in zip(own, found, strict=True))
+            sums["held"] = sum(part["held"] for part in parts[way])
+        if way == "stepped":
+            sums["same_end"] = sum(a == b for a, b in zip(own, found, strict=True))
+        if way == "real":
+            solved = sum(subtasks for _, _, subtasks in own)
+            sums["subtasks_over_in_process"] = round(sums["subtasks"] / max(solved, 1), 3)
+            for name in ("late", "latency", "image_latency"):  # each ten's; the worst counts
+                for of in ("median", "p99"):
+                    key = f"{name}_ms_{of}"
+                    sums[key] = round(max(part[key] for part in parts[way]), 2)
+            sums["load_average"] = round(max(part["load_average"] for part in parts[way]), 2)
+        row[way.replace(" ", "_")] = sums
     return row
 
 
 def main() -> None:
-    """Measure and print one JSON line."""
+    """Measure, keep the result and print one JSON line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--policy", default="released:grasp")
+    parser.add_argument("--policy", default=str(PROCEDURE))
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--seed", type=int, default=names.TEST_SEED)
-    parser.add_argument("--clock", choices=("stepped", "real", "both"), default="both")
+    parser.add_argument("--clock", choices=(*CLOCKS, "both"), default="both")
     parser.add_argument("--transport", default="cyclonedds")
     parser.add_argument("--domain", type=int, default=211)
+    parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/robot"))
     chosen = parser.parse_args()
-    row = {**vars(chosen), **measure(chosen)}
-    row["load_average"] = [round(value, 2) for value in os.getloadavg()]
+    # A shell's background jobs ignore Ctrl-C, and so would `robot serve`, which is ended by it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    clocks = CLOCKS if chosen.clock == "both" else (chosen.clock,)
+    code = code_version()
+    jobs = [
+        Job(way, chosen.policy, chosen.transport, code, first, min(CHUNK, end - first))
+        for end in (chosen.seed + chosen.episodes,)
+        for way in (IN_PROCESS, *clocks)
+        for first in range(chosen.seed, end, CHUNK)
+    ]
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    begun = time.monotonic()
+    counted = spread_resumable(
+        lambda job: count(job, chosen.domain), jobs, 0, chosen.out / "counted.jsonl"
+    )
+    row = {**vars(chosen), "out": str(chosen.out), **result(jobs, counted)}
+    row["seconds"] = round(time.monotonic() - begun)
+    (chosen.out / "robot.json").write_text(json.dumps(row, indent=2) + "\n")
     emit("robot", row, render=True)
 
 

@@ -136,22 +136,25 @@ class Client:
         """
         ends = time.monotonic() + seconds
         asked = 0.0
+        stamp = 0
         while True:
             self.update()
             deaf = [topic.name for topic in self._said if not self._transport.listeners(topic)]
             mute = [name for name in self._inboxes if self._is_due(name) and not self.newest(name)]
-            if not deaf and not mute:
+            if not deaf and not mute and (not self._is_simulated or self._is_answered(stamp)):
                 return
             if time.monotonic() > ends:
                 problems = [f"nobody hears {', '.join(deaf)}"] if deaf else []
                 problems += [f"nothing comes on {', '.join(mute)}"] if mute else []
+                problems += [] if problems else ["a request is not answered"]
                 raise SurgicaiError(
                     f"No robot answers: {'; '.join(problems)}. Is it on, in the same domain and on "
                     "the same interface?"
                 )
             if self._is_simulated and not deaf and time.monotonic() > asked + ASK_AGAIN_S:
                 asked = time.monotonic()
-                self.send(topics.ENTER.name, StringStamped(Header(self.stamp()), ""))
+                stamp = self.stamp()
+                self.send(topics.ENTER.name, StringStamped(Header(stamp), ""))
             self._transport.wait(POLL_S)
 
     def update(self) -> None:
@@ -228,9 +231,13 @@ class Client:
         return judged
 
     def _ask(self, topic: Topic, text: str, stamp: int) -> int:
-        self.send(topic.name, StringStamped(Header(stamp), text))
+        request = StringStamped(Header(stamp), text)
+        asked = -math.inf
         ends = time.monotonic() + STEP_S
         while time.monotonic() < ends:
+            if time.monotonic() > asked + ASK_AGAIN_S:  # it may not have been heard yet
+                asked = time.monotonic()
+                self.send(topic.name, request)
             self.update()
             heard = self.newest(topics.STEPPED.name)
             if heard is not None and isinstance(heard.message, StringStamped):
@@ -244,6 +251,16 @@ class Client:
         raise SurgicaiError(
             f"The served simulation has not answered on {topics.STEPPED.name} for {STEP_S:g} s; "
             "is it served with --clock stepped, in the same domain and on the same interface?"
+        )
+
+    def _is_answered(self, stamp: int) -> bool:
+        """Return True if a request was answered and all that was published with it has come."""
+        heard = self.newest(topics.STEPPED.name)
+        if heard is None or not isinstance(heard.message, StringStamped):
+            return False
+        published = heard.message.header.stamp
+        return heard.message.text == str(stamp) and all(
+            self._has(name, published) for name in self._inboxes
         )
 
     def _wait_for(self, stamp: int, ends: float) -> None:

@@ -73,7 +73,8 @@ class DrivenEpisode:
         success: as a served simulation judges it; None at a robot.
         progress: subtasks solved, likewise.
         ended: why it ended.
-        latencies: time from the newest input to sending, each step [s].
+        latencies: time from the newest pose to sending, each step [s].
+        image_latencies: time from the newest image to sending, likewise; none without images.
     """
 
     seed: int
@@ -83,6 +84,7 @@ class DrivenEpisode:
     progress: int | None
     ended: str
     latencies: tuple[float, ...]
+    image_latencies: tuple[float, ...]
 
 
 @final
@@ -149,6 +151,7 @@ class Driver:
         self._agent.reset(0, robot, seed)
         steps = held = 0
         latencies: list[float] = []
+        image_latencies: list[float] = []
         ended = "its time was over"
         due = time.monotonic()
         for number in range(max_steps):
@@ -166,6 +169,8 @@ class Driver:
                 except InputError as error:  # what has come cannot be used
                     problem = str(error)
                 latencies.append(self._setpoints.youngest())
+                seen_at = self._setpoints.youngest_image()
+                image_latencies += [] if seen_at is None else [seen_at]
             self._setpoints.send(commands if not problem else {})
             steps += not problem
             held += bool(problem)
@@ -188,6 +193,7 @@ class Driver:
             cast(int, judged["progress"]) if judged else None,
             ended,
             tuple(latencies),
+            tuple(image_latencies),
         )
 
     def _check_judge(self) -> None:

@@ -53,7 +53,7 @@ class GuardConfig:
     max_lead: float = 0.02
     max_lead_angle: float = math.radians(45.0)
     max_age: float = 0.1
-    max_image_age: float = 0.5
+    max_image_age: float = 0.1
 
     def __post_init__(self) -> None:
         check_name("frame of the workspace", self.frame, FRAMES)

@@ -3,6 +3,7 @@
 In real time images are rendered in a thread with an env of its own, from states it is offered; when
 rendering is slower than the rate, states are left out, and control goes on. Where the client sets
 the clock they are rendered at once, each step. An image bears the stamp of the state it shows.
+A view that nobody hears is not rendered.
 """
 
 import io
@@ -40,6 +41,7 @@ class Cameras:
         size: height and width of an image [pixel].
         is_compressed: publish JPEG files besides.
         publisher: returns what publishes on a topic.
+        is_heard: returns whether somebody hears a topic.
     """
 
     def __init__(
@@ -49,9 +51,11 @@ class Cameras:
         size: tuple[int, int],
         is_compressed: bool,
         publisher: Callable[[Topic], Publish],
+        is_heard: Callable[[Topic], bool],
     ):
         self._env = env
         self._size = size
+        self._is_heard = is_heard
         self._raw = {view: publisher(image_topic(view)) for view in views}
         self._infos = {view: publisher(info_topic(view)) for view in views}
         self._small: Mapping[str, Publish] = (
@@ -63,10 +67,14 @@ class Cameras:
         height, width = self._size
         for view, publish in self._raw.items():
             header = Header(stamp, optical_frame(view))
-            frame = self._env.image(view, self._size).astype(np.uint8, copy=False)
-            publish(Image(header, height, width, frame.tobytes()))
-            if view in self._small:
-                self._small[view](CompressedImage(header, "jpeg", _jpeg(frame)))
+            is_raw = self._is_heard(image_topic(view))
+            is_small = view in self._small and self._is_heard(compressed_topic(view))
+            if is_raw or is_small:
+                frame = self._env.image(view, self._size).astype(np.uint8, copy=False)
+                if is_raw:
+                    publish(Image(header, height, width, frame.tobytes()))
+                if is_small:
+                    self._small[view](CompressedImage(header, "jpeg", _jpeg(frame)))
             intrinsics = self._env.calibration.intrinsics(view, self._size)
             self._infos[view](CameraInfo(header, height, width, tuple(intrinsics.ravel().tolist())))
 

@@ -13,6 +13,7 @@ for a step bears one stamp, and `/simulation/stepped` says which, last.
 
 import json
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -66,6 +67,10 @@ PATIENCE_S = 1.0
 """Time for which a step waits for the commands it names [s]."""
 MAX_BEHIND_S = 0.1
 """Time by which the clock may lag before it is set anew [s]; nothing is caught up in a burst."""
+
+
+REMEMBERED = 64
+"""Requests that are known again when they come twice; a client asks anew if no answer comes."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,7 @@ class Server:
         self._steps = transport.inbox(topics.STEP)
         self._stamps: dict[str, int] = {}
         self._requests: list[_Request] = []
+        self._taken: deque[tuple[int, str]] = deque(maxlen=REMEMBERED)
         self._shown: dict[str, tuple[str, bool, bool]] = {}
         self._last_stamp = 0
         self._next_image = 0.0
@@ -245,12 +251,16 @@ class Server:
         self._stamps[topic] = max(self._stamps.get(topic, 0), _stamp_of(received.message))
 
     def _texts(self, inbox: Inbox) -> list[_Request]:
-        """Return the requests that have come."""
-        return [
-            _Request(message.header.stamp, message.text, time.monotonic())
-            for message in (received.message for received in inbox())
-            if isinstance(message, StringStamped)
-        ]
+        """Return the requests that have come, each with a stamp once."""
+        found: list[_Request] = []
+        for message in (received.message for received in inbox()):
+            if not isinstance(message, StringStamped):
+                continue
+            request = (message.header.stamp, message.text)
+            if not message.header.stamp or request not in self._taken:
+                self._taken.append(request)
+                found.append(_Request(*request, time.monotonic()))
+        return found
 
     def _do(self, request: _Request, act: Callable[[str], None]) -> None:
         """Do what a request asks and answer it."""
@@ -421,6 +431,7 @@ class Server:
             config.size,
             config.is_compressed,
             lambda topic: self._publishers[topic.name],
+            lambda topic: self._transport.listeners(topic) > 0,
         )
 
     def _add(self, topic: topics.Topic) -> None:

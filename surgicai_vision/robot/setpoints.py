@@ -128,6 +128,11 @@ class Setpoints:
         states, _ = self._robot.input_topics()
         return min(self._client.age(topic) for topic in states)
 
+    def youngest_image(self) -> float | None:
+        """Return how long ago the newest image came [s], None where none is seen."""
+        _, images = self._robot.input_topics()
+        return min((self._client.age(topic) for topic in images), default=None)
+
     def of_action(
         self, action: NDArray[np.float32], now: float
     ) -> tuple[Mapping[str, Command], str]:

@@ -34,10 +34,22 @@ module.OperatingState = module.StringStamped = String  # never sent
 sys.modules |= {"crtk_msgs": package, "crtk_msgs.msg": module}
 """
 ECHO = """
-import json, time
+import json, os, socket, time
 from example_messages import EXAMPLES
 from surgicai_vision.robot import topics
+from surgicai_vision.robot.sockets import open_sockets
 from surgicai_vision.robot.transport import open_transport
+
+def elsewhere():
+    found = []
+    for descriptor in open_sockets():
+        with socket.socket(fileno=os.dup(descriptor)) as one:
+            if one.family not in (socket.AF_INET, socket.AF_INET6):
+                continue
+            device = one.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16)
+            if device.rstrip(b"\\0") != b"lo" and not one.getsockname()[0].startswith("127."):
+                found.append(one.getsockname())
+    return found
 
 name, domain, left_out = sys.argv[1], int(sys.argv[2]), sys.argv[3:]
 with open_transport(name, domain=domain) as transport:
@@ -58,7 +70,7 @@ with open_transport(name, domain=domain) as transport:
             found = inbox()
         same[kind] = bool(found) and repr(found[0].message) == repr(message)
         sources = {received.source for received in found}
-    print(json.dumps({"same": same, "sources": len(sources)}))
+    print(json.dumps({"same": same, "sources": len(sources), "elsewhere": elsewhere()}))
 """
 
 
@@ -83,8 +95,8 @@ def missing_rclpy(*packages):
         ""
         if probe.returncode == 0
         else (
-            f"no rclpy here that imports us and {', '.join(packages)}; SURGICAI_RCLPY_PYTHON may "
-            "name a Python of this version that has both"
+            f"no rclpy here that imports {' and '.join(('us', *packages))}; "
+            "SURGICAI_RCLPY_PYTHON may name a Python of this version that has it"
         )
     )
 

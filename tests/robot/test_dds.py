@@ -1,11 +1,16 @@
 """CRTK over DDS: what is sent arrives, between two processes, and nowhere but on the loopback."""
 
+import contextlib
+import ctypes
+import fcntl
 import io
 import json
 import os
 import socket
+import struct
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,6 +36,10 @@ from surgicai_vision.robot.idl import TYPES
 from surgicai_vision.robot.sockets import keep_to, open_sockets
 
 SEED = 900_001
+SIOCGIFADDR = 0x8915
+"""Asks an interface for its address (linux/sockios.h)."""
+PIDFD_GETFD = 438
+"""Number of the system call that copies another process's descriptor (linux/unistd.h)."""
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +94,55 @@ def test_sockets_that_cannot_be_kept_to_an_interface_are_refused():
     refused = pytest.raises(InputError, match="cannot be kept to moon0")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one, refused:
         keep_to({one.fileno()}, "moon0")
+
+
+def sockets_of(process):
+    """Return (address, device it is bound to, whether it listens) of a process's IP sockets."""
+    found = []
+    handle = os.pidfd_open(process.pid)
+    for entry in Path(f"/proc/{process.pid}/fd").iterdir():
+        try:
+            if not os.readlink(entry).startswith("socket:"):
+                continue
+        except FileNotFoundError:  # closed by now
+            continue
+        descriptor = ctypes.CDLL(None, use_errno=True).syscall(
+            PIDFD_GETFD, handle, int(entry.name), 0
+        )
+        if descriptor < 0:
+            pytest.skip(
+                f"another process's sockets cannot be seen: {os.strerror(ctypes.get_errno())}"
+            )
+        with socket.socket(fileno=descriptor) as one:
+            if one.family in (socket.AF_INET, socket.AF_INET6):
+                device = one.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16)
+                listens = one.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+                found.append((one.getsockname()[0], device.rstrip(b"\0").decode(), bool(listens)))
+    os.close(handle)
+    return found
+
+
+def interfaces():
+    """Return the loopback's name, and that of one interface more that has an address."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        for _, name in socket.if_nameindex():
+            with contextlib.suppress(OSError):
+                fcntl.ioctl(one.fileno(), SIOCGIFADDR, struct.pack("256s", name.encode()))
+                found.append(name)
+    return sorted(found, key=lambda name: name != "lo")[:2]
+
+
+@pytest.mark.parametrize("interface", interfaces())
+def test_a_served_simulation_listens_on_the_named_interface_alone(interface):
+    """Seen from outside, while it serves: the loopback, unless `--interface` names another."""
+    given = () if interface == "lo" else ("--interface", interface)
+    with serving("--task", "grasp", *given, domain=DOMAIN % 200 + 6) as process:
+        found = sockets_of(process)
+    assert len(found) >= 2
+    for address, device, listens in found:
+        assert device == interface or address.startswith("127."), found
+        assert not listens, found
 
 
 def test_what_cannot_be_opened_is_refused():

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from memory_transport import Medium, MemoryTransport
 from stepped_server import SEED, Served, env_of
+from virtual_time import VirtualTime
 
 from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.envs import poses
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.robot import topics
 from surgicai_vision.robot.client import Client, ClientConfig, _Lag
@@ -22,7 +24,7 @@ from surgicai_vision.robot.driven import DrivenRobot
 from surgicai_vision.robot.driver import DriveConfig, Driver
 from surgicai_vision.robot.frames import read_pose, write_pose
 from surgicai_vision.robot.guards import GuardConfig
-from surgicai_vision.robot.messages import Header, JointState, OperatingState, StringStamped
+from surgicai_vision.robot.messages import Header, JointState, StringStamped
 from surgicai_vision.robot.server import ServeConfig, Server
 from surgicai_vision.robot.simulated import SimulatedRobot
 
@@ -233,10 +235,10 @@ def robot_is_in_another_frame(topic, message):
     return header_of(message, frame="moon") if is_pose(topic) else message
 
 
-def robot_is_stopped(topic, message):
-    if isinstance(message, OperatingState):
-        return dataclasses.replace(message, state="PAUSED")
-    return message
+def robot_says_old_things(topic, message):
+    if not is_pose(topic):
+        return message
+    return header_of(message, stamp=message.header.stamp - 10 * SECOND)
 
 
 def robot_jumps(topic, message):
@@ -251,6 +253,7 @@ def robot_jumps(topic, message):
     [
         (robot_is_silent, "s old"),
         (robot_is_late, "s old"),
+        (robot_says_old_things, "s old"),
         (robot_is_not_finite, "finite"),
         (robot_is_in_another_frame, "moon"),
         (robot_jumps, "does not follow"),
@@ -300,6 +303,82 @@ def test_nothing_is_sent_within_100_ms_of_a_robots_fault(monkeypatch, fault, rea
     assert not any(line["sent"] for line in held)
     assert reason in held[-1]["held"]
     assert any(reason in text for text in told)
+
+
+class Interrupted(Along):
+    """Moves along, and has something happen in one of its steps."""
+
+    def __init__(self, act):
+        self.does = act
+        self.steps = 0
+
+    def act(self, slots, robots, observations):
+        self.steps += 1
+        if self.steps == 15:
+            self.does()
+        return super().act(slots, robots, observations)
+
+
+def state_command(text):
+    def act(served):
+        served.publisher(HEARD["state_command"])(StringStamped(Header(), text))
+
+    return act
+
+
+def another_client(served):
+    pose = served.robot.env.simulation.commands["psm2"].pose
+    other = MemoryTransport(served.medium, "another").publisher(HEARD["servo_cp"])
+    other(write_pose((pose[0] - 3e-3, *pose[1:]), 0, "PSM2_base"))
+
+
+@pytest.mark.parametrize(
+    ("act", "reason", "ends"),
+    [
+        (state_command("pause"), "PSM2 is PAUSED", False),
+        (state_command("disable"), "PSM2 is DISABLED", True),
+        (state_command("fault"), "PSM2 is FAULT", True),
+        (another_client, "PSM2 is PAUSED", False),
+    ],
+    ids=["pause", "disable", "fault", "two clients"],
+)
+def test_a_driven_arm_that_is_stopped_is_still_and_told_nothing(monkeypatch, act, reason, ends):
+    """In real time, both sides: still within 100 ms, the log says why, and has all that was sent.
+
+    After `resume` the episode goes on.
+    """
+    served = VirtualTime(monkeypatch, "grasp", 0.007)
+    sent = MemoryTransport(served.medium).inbox(HEARD["servo_cp"])
+    client = Client(served, ClientConfig(is_simulated=True))
+    client.connect()
+    robot = DrivenRobot(client, (), "grasp", 64)
+    config = DriveConfig(GuardConfig(), sends=True, is_simulated=True)
+    log = io.StringIO()
+    told = []
+    agent = Interrupted(lambda: act(served))
+    driver = Driver(agent, robot, TaskConfig("grasp"), config, float, log, told.append)
+    episode = driver.episode(SEED, 15 + STILL_STEPS)
+    place = np.array(served.robot.env.simulation.tip("psm2")[:3])
+    served.pass_time(0.2)
+    assert np.linalg.norm(served.robot.env.simulation.tip("psm2")[:3] - place) < STILL_M
+    lines = [json.loads(line) for line in log.getvalue().splitlines()]
+    assert all(line["sent"] for line in lines[1:15]), told
+    assert not lines[-1]["sent"] or ends
+    assert any(reason in text for text in (*told, episode.ended))
+    own = [entry.message for entry in sent() if entry.source != "another"]
+    logged = [line["commands"]["PSM2"]["pose"][:3] for line in lines if line["sent"]]
+    assert len(own) == len(logged)
+    _, base = robot.frame("PSM2")
+    assert np.allclose(
+        [read_pose(message)[:3] for message in own],
+        [poses.transform(base, tuple(place)) for place in logged],
+        atol=1e-9,
+    )
+    if not ends:
+        served.publisher(HEARD["state_command"])(StringStamped(Header(), "resume"))
+        served.pass_time(0.7)
+        again = driver.episode(SEED, 20)
+        assert again.held == 0
 
 
 def test_a_lag_is_what_is_later_than_usual_whatever_the_senders_clock():

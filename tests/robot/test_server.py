@@ -222,6 +222,34 @@ def test_a_reset_begins_the_episode_of_its_seed_again():
     assert "must be a seed" in client.take()["/simulation/stepped"][0].text
 
 
+def test_a_request_that_comes_twice_is_met_once(client):
+    """A client asks anew where no answer came; without a stamp every request is a new one."""
+    before = client.robot.steps
+    for _ in range(3):
+        client.say(topics.STEP.name, StringStamped(Header(client.stamp + 5), ""))
+        client.server.poll()
+    assert client.robot.steps == before + 1
+    for _ in range(2):
+        client.say(topics.STEP.name, StringStamped(Header(), ""))
+        client.server.poll()
+    assert client.robot.steps == before + 3
+    client.stamp += 5
+
+
+def test_a_view_that_nobody_hears_is_not_rendered(monkeypatch):
+    client = Client(views=("front", "back"), size=(64, 64))
+    rendered = []
+    image = type(client.env).image
+    monkeypatch.setattr(
+        type(client.env),
+        "image",
+        lambda env, *given: rendered.append(given[0]) or image(env, *given),
+    )
+    said = client.step()
+    assert len(said["/front/image_raw"]) == 1
+    assert rendered == ["front"]
+
+
 def test_the_truth_is_named_and_optional(client):
     assert "/needle/measured_cp" not in client.step()
     shown = Client("suture", shows_truth=True)

@@ -117,6 +117,7 @@ def test_a_real_rospy_carries_every_message_and_a_driven_episode(monkeypatch, tm
         said = json.loads(echo.stdout.splitlines()[-1])
         assert all(said["same"].values()), said
         assert said["sources"] == 1
+        assert said["elsewhere"] == []
         check_serve_and_drive("rospy", (), tmp_path)
 
 
@@ -138,6 +139,7 @@ def test_a_real_rclpy_carries_every_message_that_is_not_crtks():
     said = json.loads(echo.stdout.splitlines()[-1])
     assert len(said["same"]) == len(EXAMPLES) - len(CRTK)
     assert all(said["same"].values()), said
+    assert said["elsewhere"] == []
 
 
 def test_a_real_rclpy_carries_crtks_messages_and_a_driven_episode(tmp_path):

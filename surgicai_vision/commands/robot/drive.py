@@ -236,9 +236,17 @@ def _told(
     """Print how late was sent and how many episodes succeeded; return it with each episode."""
     import numpy as np
 
-    late = 1e3 * np.array([value for episode in episodes for value in episode.latencies] or [0.0])
-    median, high = float(np.median(late)), float(np.percentile(late, 99))
-    console.say(f"from the newest pose to sending: {median:.1f} ms in the median, p99 {high:.1f}.")
+    late = [value for episode in episodes for value in episode.latencies]
+    seen = [value for episode in episodes for value in episode.image_latencies]
+    figures: dict[str, float] = {}
+    for name, what, values in (("latency", "pose", late), ("image_latency", "image", seen)):
+        milliseconds = 1e3 * np.array(values or [0.0])
+        median, high = float(np.median(milliseconds)), float(np.percentile(milliseconds, 99))
+        figures |= {f"{name}_ms_median": median, f"{name}_ms_p99": high}
+        if values:
+            console.say(
+                f"from the newest {what} to sending: {median:.1f} ms in the median, p99 {high:.1f}."
+            )
     successes = sum(bool(episode.success) for episode in episodes)
     if options.simulated:
         console.say(f"{successes} of {len(episodes)} episodes succeeded.")
@@ -248,8 +256,7 @@ def _told(
         "task": spec.config.task,
         "sent": options.send,
         "log": str(log),
-        "latency_ms_median": median,
-        "latency_ms_p99": high,
+        **figures,
         "successes": successes if options.simulated else None,
         "episodes": [
             {
