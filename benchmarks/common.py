@@ -72,7 +72,8 @@ def spread_resumable(
             if out is not None:
                 with out.open("a") as file:
                     print(json.dumps({"job": repr(job), "result": result}), file=file)
-            print(f"{len(done)} of {len(jobs)} jobs", file=sys.stderr, flush=True)
+            count = sum(repr(job) in done for job in jobs)
+            print(f"{count} of {len(jobs)} jobs", file=sys.stderr, flush=True)
     return [done[repr(job)] for job in jobs]
 
 

@@ -106,8 +106,10 @@ def at_robot(job: Job, domain: int) -> dict[str, Any]:
         said = Path(folder) / "serve.json"
         with serving(serve, said, Path(folder) / "serve.log"):
             driven = subprocess.run(
-                [*drive, "--out", f"{folder}/drive"], stdout=subprocess.PIPE, text=True, check=True
+                [*drive, "--out", f"{folder}/drive"], capture_output=True, text=True
             )
+            if driven.returncode:
+                raise SystemExit(f"robot drive failed:\n{driven.stderr}")
         served = last_line(said.read_text())
     row = last_line(driven.stdout)
     late = (

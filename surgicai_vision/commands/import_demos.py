@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from surgicai_vision.demos.imports.rosbag.importer import BagSummary
 
 ROLES = tuple(role.name for role in dataclasses.fields(Topics))
+DRIVE_LOG = ".jsonl"
 app = App(
     name="import-demos",
     help_epilogue=f"""\
@@ -37,6 +38,8 @@ A bag is a .bag, .db3 or .mcap file, or a folder of ROS 2; a folder of bags is r
   surgicai-vision import-demos trial.bag --topic needle=/needle/pose --out outputs/demos/trial
 A LeRobot dataset (v2.1 or v3) of both arms' poses, as Open-H-Embodiment and SutureBot have them:
   surgicai-vision import-demos datasets/suturing --out outputs/demos/suturing
+What a policy did at a robot, as robot drive logged it:
+  surgicai-vision import-demos outputs/drive/suture/drive.jsonl --out outputs/demos/driven
 Roles of --topic: {", ".join(ROLES)}.
 Without --task every subtask that is found gets a folder below --out. Frames, units, labels and more
 stand in the table `bag` of a --config file, the scene in the table `env`; see docs/demos.md.\
@@ -50,8 +53,8 @@ class Options:
     """Options of `import-demos`.
 
     Attributes:
-        file: A pickle as SurgicAI writes it, an npz of its arrays, a bag, a folder of bags, or the
-            folder of a LeRobot dataset.
+        file: A pickle as SurgicAI writes it, an npz of its arrays, a bag, a folder of bags, the
+            folder of a LeRobot dataset, or the log of `robot drive`.
         task: What it shows; needed for a pickle, which does not say it.
         out: Folder to make.
         topic: Topics of a bag that differ from the convention's.
@@ -83,6 +86,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     path = options.file
     if (path / names.INFO_FILE).is_file():
         return _import_dataset(path, options, console)
+    if path.suffix == DRIVE_LOG:
+        return _import_drive_log(path, options, console)
     if is_bag(path) or path.is_dir():
         return _import_bags(path, options, console)
     for_bags = {
@@ -140,6 +145,24 @@ def _import_dataset(path: Path, options: Options, console: Console) -> dict[str,
     out = options.out or folders.demos_folder(f"dataset-{path.resolve().name}")
     with console.stage(f"importing {path.name}", "frames") as progress:
         summaries = import_dataset(
+            path,
+            task=options.task,
+            out=out,
+            config=_config(options),
+            env=options.env,
+            progress=progress,
+        )
+    return {"tasks": _told(summaries, console)}
+
+
+def _import_drive_log(path: Path, options: Options, console: Console) -> dict[str, object]:
+    from surgicai_vision.demos.imports.drive_log import import_drive_log
+
+    if options.topic or options.convention:
+        raise InputError(f"--topic and --convention are for bags, and {path} is a log of drive.")
+    out = options.out or folders.demos_folder("drive")
+    with console.stage(f"importing {path.name}", "demonstrations") as progress:
+        summaries = import_drive_log(
             path,
             task=options.task,
             out=out,

@@ -35,6 +35,10 @@ CONTROL_S = 1.0 / names.FPS
 STOPS = (DISABLED, FAULT)
 """States after which a run is over: somebody stopped the robot, and a person begins again."""
 
+TELL_AGAIN_S = 1.0
+"""Time after which the same reason for holding back is told again [s]; the log has every step."""
+_WITHOUT_NUMBERS = str.maketrans("", "", "0123456789.")
+
 
 @dataclass(frozen=True)
 class DriveConfig:
@@ -131,6 +135,7 @@ class Driver:
             is_stepped=config.is_stepped,
         )
         self._told = ""
+        self._told_at: dict[str, float] = {}
         self._next_line = 0.0
         if config.is_simulated:
             robot.on_enter(self._client.enter if config.is_stepped else self._client.tell_subtask)
@@ -258,9 +263,13 @@ class Driver:
 
     def _say(self, commands: Mapping[str, Command], problem: str) -> None:
         """Tell why nothing is sent when that changes, and in a dry run what would be."""
-        if problem != self._told:
-            self._told = problem
-            self._tell(f"held: {problem}" if problem else "the guards let through")
+        kind = problem.translate(_WITHOUT_NUMBERS)
+        now = time.monotonic()
+        if kind != self._told:
+            self._told = kind
+            if now >= self._told_at.get(kind, -math.inf) + TELL_AGAIN_S:
+                self._told_at[kind] = now
+                self._tell(f"held: {problem}" if problem else "the guards let through")
         if self._config.sends or problem or time.monotonic() < self._next_line:
             return
         self._next_line = time.monotonic() + 1.0

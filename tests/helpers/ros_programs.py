@@ -25,7 +25,7 @@ while True:
 """
 COMMAND = "from surgicai_vision.commands.main import main\nsys.exit(main())\n"
 CRTK = ("OperatingState", "StringStamped")
-"""Messages of crtk_msgs, of which there are no wheels."""
+"""Messages of crtk_msgs, of which there are no wheels; `scripts/crtk_msgs.py` builds them."""
 STAND_IN = """
 import types
 from std_msgs.msg import String
@@ -96,7 +96,8 @@ def missing_rclpy(*packages):
         if probe.returncode == 0
         else (
             f"no rclpy here that imports {' and '.join(('us', *packages))}; "
-            "SURGICAI_RCLPY_PYTHON may name a Python of this version that has it"
+            "SURGICAI_RCLPY_PYTHON may name a Python of this version that has it (crtk_msgs: "
+            "scripts/crtk_msgs.py, run by that Python)"
         )
     )
 

@@ -15,8 +15,10 @@ from stepped_server import SEED, Served, env_of
 from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.demos.expert import Expert
+from surgicai_vision.demos.imports.drive_log import import_drive_log
+from surgicai_vision.demos.imports.rosbag.config import BagConfig
 from surgicai_vision.demos.imports.rosbag.config import Frames as BagFrames
 from surgicai_vision.demos.store import list_demos, read_demo
 from surgicai_vision.envs import poses
@@ -261,6 +263,41 @@ def test_what_a_client_does_is_recorded_as_it_was_told(tmp_path):
     assert demo.seed == SEED
     assert np.array_equal(demo.state[-1], served.robot.env.get_state())
     assert "0 % of them clipped" in told[0]
+
+
+def test_the_log_of_a_drive_becomes_demonstrations(tmp_path):
+    """Every subtask that was driven, with the arms where they were measured."""
+    env = env_of("suture")
+    env.reset(seed=SEED)
+    expert = Expert(env)
+    rows = []
+    ended = False
+    while not ended:
+        rows.append((env.phase, expert.action()))
+        _, _, ended, _, _ = env.step(rows[-1][1])
+    _, lines, _, _ = drive(Script(rows), "suture", len(rows) + 100)
+    about = json.dumps({"policy": "script"})
+    text = "\n".join([about, *map(json.dumps, lines), '{"cut off'])
+    log = tmp_path / "drive.jsonl"
+    log.write_text(text)
+    config = BagConfig(drop_pauses=False)
+    made = import_drive_log(log, task=None, out=tmp_path / "demos", config=config)
+    assert [summary.task for summary in made] == list(names.SUBTASKS)
+    measured = np.array([line["both_arms"] for line in lines])
+    phases = np.array([line["phase"] for line in lines])
+    for phase, summary in enumerate(made):
+        demo = read_demo(summary.paths[0])
+        assert demo.demonstrator == "drive"
+        there = measured[phases == phase]
+        assert abs(len(demo) - len(there)) <= 2
+        arm = 7 * names.ARMS.index(names.ACTIVE_ARM[summary.task])
+        for index in range(0, len(demo), 20):
+            env.set_state_vector(demo.state[index])
+            tip = env.both_arms()[arm : arm + 3]
+            assert np.linalg.norm(there[:, arm : arm + 3] - tip, axis=1).min() < 1e-3
+    log.write_text(text.replace("both_arms", "arms"))
+    with pytest.raises(BadFile, match="line 2"):
+        import_drive_log(log, task=None, out=tmp_path / "other")
 
 
 def test_images_reach_the_agent_as_they_were_rendered():

@@ -151,4 +151,5 @@ def test_a_real_rclpy_carries_crtks_messages_and_a_driven_episode(tmp_path):
     assert echo.returncode == 0, echo.stderr
     said = json.loads(echo.stdout.splitlines()[-1])
     assert all(said["same"].values()), said
+    assert said["elsewhere"] == []
     check_serve_and_drive("rclpy", ("--domain", domain), tmp_path)
