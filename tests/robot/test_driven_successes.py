@@ -4,37 +4,28 @@ import io
 from pathlib import Path
 
 import pytest
+from served import DOMAIN, serving
 from stepped_server import Served
 
-from surgicai_vision.evaluation.policy_spec import open_policy
+from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.robot.client import Client, ClientConfig
 from surgicai_vision.robot.driven import DrivenRobot
 from surgicai_vision.robot.driver import DriveConfig, Driver
 from surgicai_vision.robot.guards import GuardConfig
+from surgicai_vision.robot.transport import Transport, open_transport
 
 PROCEDURE = Path(__file__).resolve().parents[2] / "examples" / "learned-ends.yaml"
 
 
-@pytest.mark.parametrize(
-    ("policy", "seeds"),
-    [("released:grasp", (900_000,)), (PROCEDURE, (900_001,))],
-    ids=["grasp", "procedure"],
-)
-def test_released_policies_end_as_they_do_in_process(policy, seeds):
-    """From images, measured poses and within guards; the steps are the same too.
-
-    The whole procedure is five low-level policies, the high-level one that says when each ends,
-    and PSM2's letting go. `benchmarks/robot.py` counts more episodes, a process on each side.
-    """
-    spec = open_policy(str(policy))
-    task = spec.config
+def check_same_ends(spec: PolicySpec, transport: Transport, seeds: tuple[int, ...]) -> None:
+    """Drive what a transport leads to, and compare with the same policy and starts in process."""
     agent = spec.make_agent()
+    task = spec.config
     own = evaluate(lambda: agent, task, seeds, batch=1, workers=1)
     views = tuple(agent.cameras)
-    served = Served(task.task, views, size=agent.image_size, advance=task.advance)
-    client = Client(served, ClientConfig(views=views, is_simulated=True))
-    client.connect()
+    client = Client(transport, ClientConfig(views=views, is_simulated=True))
+    client.connect(60.0)
     robot = DrivenRobot(client, views, task.task, agent.image_size)
     config = DriveConfig(GuardConfig(), sends=True, is_simulated=True, is_stepped=True)
     driver = Driver(agent, robot, task, config, float, io.StringIO(), lambda text: None)
@@ -43,3 +34,30 @@ def test_released_policies_end_as_they_do_in_process(policy, seeds):
     assert [episode.success for episode in driven] == [entry.row.success for entry in own]
     assert [episode.steps for episode in driven] == [entry.row.steps for entry in own]
     assert all(episode.success for episode in driven)
+
+
+def test_a_released_policy_ends_as_it_does_in_process():
+    """From images, measured poses and within guards; the steps are the same too."""
+    spec = open_policy("released:grasp")
+    agent = spec.make_agent()
+    served = Served("grasp", tuple(agent.cameras), size=agent.image_size)
+    check_same_ends(spec, served, (900_000,))
+
+
+def test_the_whole_procedure_ends_as_it_does_in_process():
+    """By released policies, served in a process of its own, over cyclonedds.
+
+    Five low-level policies, the high-level one that says when each ends, and PSM2's letting go.
+    `benchmarks/robot.py` counts more episodes, and in real time.
+    """
+    pytest.importorskip("cyclonedds", reason="the extra `ros` is not installed")
+    spec = open_policy(str(PROCEDURE))
+    agent = spec.make_agent()
+    options = ("--task", "suture", "--clock", "stepped", "--advance", spec.config.advance)
+    views = ("--view", ",".join(agent.cameras), "--size", str(agent.image_size))
+    domain = DOMAIN % 200 + 8
+    with (
+        serving(*options, *views, domain=domain),
+        open_transport("cyclonedds", domain=domain) as transport,
+    ):
+        check_same_ends(spec, transport, (900_001,))
