@@ -26,6 +26,7 @@ from surgicai_vision.commands.options import (
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RANDOMISATION_CHOICES
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.variants import Variants
 
 app = App(
     name="render-demos",
@@ -96,7 +97,6 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     from surgicai_vision.core.executor import LOCAL, RunContext, open_engine
     from surgicai_vision.dataset import render_demos
     from surgicai_vision.dataset.layouts import LAYOUTS
-    from surgicai_vision.dataset.variants import Variants
     from surgicai_vision.scene.opengl import check_opengl
 
     # Everything that can be wrong is found before any work.

@@ -27,12 +27,12 @@ from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.executor import Job, RunContext, building, register_job, run
 from surgicai_vision.core.files import check_output, code_version, read_json, sha256_file
 from surgicai_vision.core.tasks import task_text
+from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.convert import DatasetSummary, check_video, finished, write_converted
 from surgicai_vision.dataset.layouts import LAYOUTS, SURGICAI
 from surgicai_vision.dataset.reader import open_dataset
 from surgicai_vision.dataset.schema import Table
-from surgicai_vision.dataset.variants import Variants
 from surgicai_vision.dataset.writer import SUMMARY_FILE, assemble
 from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo, read_marker
 

@@ -21,11 +21,11 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import sha256_file, write_json
+from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.layouts import LAYOUTS, SURGICAI
 from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
-from surgicai_vision.dataset.variants import Variants
 from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, column_array, compression
 from surgicai_vision.demos.store import read_demo
 from surgicai_vision.envs.looks import draw as draw_look

@@ -6,12 +6,13 @@ and none meets the banks of validation and test. Training seed 0 begins at `name
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON, TaskConfig, check_frame_stride
+from surgicai_vision.core.config import JSON, TaskConfig, check_frame_stride, to_mapping
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
-from surgicai_vision.demos.demonstrator import SCRIPTED_DEMONSTRATORS
+from surgicai_vision.core.variants import Variants
+from surgicai_vision.demos.demonstrator import CHOOSING_DEMONSTRATORS, SCRIPTED_DEMONSTRATORS
 from surgicai_vision.demos.disturbance import Disturbance, check_late
 
 SEEDS_EACH = 20_000
@@ -21,6 +22,12 @@ TRAINING_SEEDS = 20
 MOST_EPISODES = 4_000
 """Most demonstrations of a dataset: at most four seeds each are tried (`demos.record`), so that all
 are the training seed's own.
+"""
+DEMONSTRATORS = (*SCRIPTED_DEMONSTRATORS, *sorted(CHOOSING_DEMONSTRATORS))
+"""Who may demonstrate: a scripted expert, or what re-poses other demonstrations."""
+LATER = ("appearance", "distractors", "variants", "of")
+"""Fields that demonstrations did not have at first: where they say nothing they are no part of
+`Demonstrations.identity`, so that plans which do not use them stay what they were.
 """
 
 
@@ -43,6 +50,17 @@ class Demonstrations:
             one policies are evaluated in.
         visits_of: name of demonstrations of the whole procedure, whose visits of this task
             (`demos.cut`) are rendered beside these.
+        appearance: the looks they are rendered in (`core.variants`), "train" or one of its
+            families; "" renders each as it was recorded.
+        distractors: most things that lie about in what is rendered; 0 leaves what was recorded.
+        variants: in how many looks each demonstration is rendered.
+        of: name of demonstrations of the same task, which are re-posed to new starts where the
+            demonstrator is "multiply" (`demos.multiply`).
+
+    Raises:
+        InputError: a number out of its range, variants without a look to draw, a demonstrator
+            without the demonstrations it re-poses, or such demonstrations without one.
+        UnknownName: no such demonstrator or appearance.
     """
 
     name: str
@@ -57,13 +75,41 @@ class Demonstrations:
     late: int = 0
     env: Mapping[str, JSON] = field(default_factory=dict)
     visits_of: str = ""
+    appearance: str = ""
+    distractors: int = 0
+    variants: int = 1
+    of: str = ""
 
     def __post_init__(self) -> None:
-        check_name("demonstrator", self.demonstrator, SCRIPTED_DEMONSTRATORS)
+        check_name("demonstrator", self.demonstrator, DEMONSTRATORS)
         check_late(self.demonstrator, self.disturbance)
         check_frame_stride(self.frame_stride)
         check_at_least(1, **{f"demonstrations {self.name}: episodes": self.episodes})
         check_at_least(0, post_success_steps=self.post_success_steps)
+        if bool(self.of) != (self.demonstrator in CHOOSING_DEMONSTRATORS):
+            choosing = ", ".join(sorted(CHOOSING_DEMONSTRATORS))
+            raise InputError(
+                f"demonstrations {self.name}: demonstrator is '{self.demonstrator}' and of is "
+                f"'{self.of}'; with demonstrator {choosing}, and with no other, name the "
+                "demonstrations that are re-posed (of: NAME)."
+            )
+        _ = self.looks  # refuses variants that cannot be drawn
+
+    @property
+    def looks(self) -> Variants | None:
+        """The looks each is rendered in; None as it was recorded."""
+        if not (self.appearance or self.distractors) and self.variants == 1:
+            return None
+        return Variants(self.appearance, self.distractors, self.variants)
+
+    @property
+    def identity(self) -> Mapping[str, JSON]:
+        """They as plain data by which they are known: what says nothing of them is left out."""
+        plain = to_mapping(self)
+        usual = {each.name: each.default for each in fields(self)}
+        return {
+            key: value for key, value in plain.items() if key not in LATER or value != usual[key]
+        }
 
     @property
     def disturbance(self) -> Disturbance:
@@ -74,13 +120,15 @@ class Demonstrations:
     def manner(self) -> str:
         """How is demonstrated, in words."""
         after = self.post_success_steps
-        parts = [f"by the scripted {self.demonstrator}"]
+        who = f"re-posed from '{self.of}'" if self.of else f"by the scripted {self.demonstrator}"
+        parts = [who]
         parts += [f"executed with noise {self.noise:g}"] if self.noise else []
         parts += [f"upset in {self.upset_fraction:.0%}"] if self.upset_fraction else []
         parts += [f"noticed up to {self.late} steps late"] if self.late else []
         parts += [f"going on for {after} steps after their success"] if after else []
         parts += [f"a frame every {self.frame_stride} steps"] if self.frame_stride > 1 else []
         parts += [f"with the visits in '{self.visits_of}'"] if self.visits_of else []
+        parts += [f"each in {self.looks.text}"] if self.looks else []
         return ", ".join(parts)
 
 
@@ -95,6 +143,7 @@ class DatasetConfig:
         depth: render depth beside RGB.
         first_seed: start seed of the first demonstration.
         visited: the whole procedures whose visits are rendered too, where `demonstrations` says so.
+        multiplied: the demonstrations that are re-posed, where `demonstrations` says so.
     """
 
     env: TaskConfig
@@ -103,6 +152,7 @@ class DatasetConfig:
     depth: bool = False
     first_seed: int = names.TRAIN_SEED
     visited: "DatasetConfig | None" = None
+    multiplied: "DatasetConfig | None" = None
 
 
 def first_seed(training_seed: int) -> int:

@@ -33,13 +33,14 @@ def check_plan(plan: "Plan") -> None:
         first_seed(seed)
     check_at_least(1, episodes=plan.episodes, size=plan.size, epochs=plan.epochs)
     for recorded in plan.demonstrations:
-        plan.recorded_env(recorded)
+        _check_looks(plan, recorded)
         if recorded.episodes > MOST_EPISODES:
             raise InputError(
                 f"demonstrations {recorded.name}: episodes is {recorded.episodes}; "
                 f"allowed: 1 to {MOST_EPISODES}."
             )
         _check_visits(plan, recorded)
+        _check_multiplied(plan, recorded)
     for policy in plan.policies:
         _check_policy(plan, policy)
     for condition in plan.conditions:
@@ -58,6 +59,28 @@ def _check_visits(plan: "Plan", recorded: Demonstrations) -> None:
     whole = [each.name for each in plan.demonstrations if each.task == names.SUTURE]
     check_name("demonstrations of the whole procedure", recorded.visits_of, whole)
     check_name("task that is visited", recorded.task, names.SUBTASKS)
+
+
+def _check_looks(plan: "Plan", recorded: Demonstrations) -> None:
+    """Refuse to render looks that are held out for tests: no policy may learn from them."""
+    env = plan.recorded_env(recorded)
+    shown = recorded.looks.shown(env) if recorded.looks else env
+    if recorded.view and shown.randomisation.shows_heldout:
+        raise InputError(
+            f"demonstrations {recorded.name} would show looks that are held out for tests "
+            f"({', '.join(names.HELDOUT_APPEARANCES)}); take appearance: {names.TRAIN}, and no "
+            "appearance_shift; a condition may show them."
+        )
+
+
+def _check_multiplied(plan: "Plan", recorded: Demonstrations) -> None:
+    """Refuse to re-pose demonstrations of another task, and multiplied ones."""
+    if not recorded.of:
+        return
+    first = [
+        each.name for each in plan.demonstrations if each.task == recorded.task and not each.of
+    ]
+    check_name(f"demonstrations of {recorded.task} that are not multiplied", recorded.of, first)
 
 
 def _check_policy(plan: "Plan", policy: PlannedPolicy) -> None:

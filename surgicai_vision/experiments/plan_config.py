@@ -133,25 +133,35 @@ class Plan:
         """Return the fields of `TaskConfig` that an evaluation has, whatever was trained on.
 
         An empty table keeps the env that the policies were trained in: so what demonstrations
-        alone have is named with its default.
+        alone have, looks they are rendered in among it, is named with its default.
         """
         plain = to_mapping(TaskConfig(names.SUTURE))
-        theirs = {key: plain[key] for recorded in self.demonstrations for key in recorded.env}
+        own = [key for recorded in self.demonstrations for key in recorded.env]
+        own += ["randomisation"] if any(each.looks for each in self.demonstrations) else []
+        theirs = {key: plain[key] for key in own}
         return {**theirs, **self.env, **(condition.env if condition else {})}
 
     def recorded(self, policy: PlannedPolicy) -> Demonstrations:
         """Return what a policy is trained on."""
-        return next(each for each in self.demonstrations if each.name == policy.demonstrations)
+        return self._named(policy.demonstrations)
+
+    def _named(self, name: str) -> Demonstrations:
+        return next(each for each in self.demonstrations if each.name == name)
 
     def dataset(self, recorded: Demonstrations, seed: int) -> DatasetConfig:
         """Return the dataset of demonstrations for a training seed."""
-        visited = [each for each in self.demonstrations if each.name == recorded.visits_of]
+        built_on = {
+            each.name: self.dataset(each, seed)
+            for each in self.demonstrations
+            if each.name in (recorded.visits_of, recorded.of)
+        }
         return DatasetConfig(
             self.recorded_env(recorded),
             recorded,
             self.size,
             first_seed=first_seed(seed),
-            visited=self.dataset(visited[0], seed) if visited else None,
+            visited=built_on.get(recorded.visits_of),
+            multiplied=built_on.get(recorded.of),
         )
 
     def training(self, policy: PlannedPolicy, seed: int) -> RunConfig:
@@ -173,6 +183,8 @@ class Plan:
             noise=recorded.noise,
             post_success_steps=recorded.post_success_steps,
             frame_stride=recorded.frame_stride,
+            variants=recorded.looks,
+            multiplied_from=self._named(recorded.of).episodes if recorded.of else None,
             seed=seed,
         )
 
@@ -289,7 +301,10 @@ class Plan:
     @property
     def _digest(self) -> str:
         """Hash of what the whole procedure's policies are but for the training seed."""
-        table = to_mapping(self)
+        table = {
+            **to_mapping(self),
+            "demonstrations": [each.identity for each in self.demonstrations],
+        }
         decide = ("size", "encoder", "pool", "recipe", "demonstrations", "policies", "procedure")
         return digest({key: table[key] for key in (*decide, "epochs", "env")})
 

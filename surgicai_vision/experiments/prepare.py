@@ -7,10 +7,12 @@ from pathlib import Path
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.executor import RunContext
+from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset.render import render_demos
 from surgicai_vision.demos.cut import cut_demos
 from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance
 from surgicai_vision.demos.record import record
+from surgicai_vision.demos.store import list_demos
 from surgicai_vision.envs.upset import check_upset_task
 from surgicai_vision.experiments.dataset_config import DatasetConfig, Demonstrations
 
@@ -28,14 +30,17 @@ def check_dataset(dataset: DatasetConfig) -> None:
 def make_dataset(dataset: DatasetConfig, folder: Path, context: RunContext) -> Path:
     """Record and render what `dataset` says, into `folder`/demos and `folder`/dataset.
 
-    Visits in whole procedures lie in `folder`/visits; the procedures themselves are recorded into
-    the folder beside `folder` that has their name, where they are not there yet.
+    Visits in whole procedures lie in `folder`/visits. The procedures themselves, and demonstrations
+    that are re-posed, are recorded into the folder beside `folder` that has their name, where they
+    are not there yet.
 
     Returns:
         The dataset's folder; that of the demonstrations where nothing is rendered.
     """
     recorded = dataset.demonstrations
     beside = [] if dataset.visited is None else [_cut(dataset.visited, recorded, folder, context)]
+    few = dataset.multiplied
+    demos = [] if few is None else list_demos(_recorded(few, folder, context))
     return prepare_dataset(
         dataset.env,
         folder,
@@ -50,15 +55,22 @@ def make_dataset(dataset: DatasetConfig, folder: Path, context: RunContext) -> P
         post_success_steps=recorded.post_success_steps,
         seed=dataset.first_seed,
         beside=beside,
+        demos=demos,
+        variants=recorded.looks,
     )
+
+
+def _recorded(other: DatasetConfig, folder: Path, context: RunContext) -> Path:
+    """Record what a dataset builds on into the folder beside it; return the demonstrations'."""
+    alone = replace(other, demonstrations=replace(other.demonstrations, view=()))
+    return make_dataset(alone, folder.parent / other.demonstrations.name, context)
 
 
 def _cut(
     visited: DatasetConfig, recorded: Demonstrations, folder: Path, context: RunContext
 ) -> Path:
     """Cut the visits of a task out of whole procedures; return their folder."""
-    alone = replace(visited, demonstrations=replace(visited.demonstrations, view=()))
-    whole = make_dataset(alone, folder.parent / visited.demonstrations.name, context)
+    whole = _recorded(visited, folder, context)
     cut_demos(whole, recorded.task, out=folder / "visits", stage=context.stage)
     return folder / "visits"
 
@@ -78,10 +90,13 @@ def prepare_dataset(
     post_success_steps: int = 0,
     seed: int = names.TRAIN_SEED,
     beside: Sequence[Path] = (),
+    demos: Sequence[Path] = (),
+    variants: Variants | None = None,
 ) -> Path:
     """Record demonstrations into `folder`/demos and render them into `folder`/dataset.
 
-    Without views nothing is rendered. Folders of demonstrations in `beside` are rendered with them.
+    Without views nothing is rendered. Folders of demonstrations in `beside` are rendered with them,
+    each demonstration in every look of `variants`. `demos` are files that a demonstrator re-poses.
 
     Returns:
         The dataset's folder; that of the demonstrations where nothing is rendered.
@@ -94,6 +109,7 @@ def prepare_dataset(
         seed=seed,
         disturbance=disturbance,
         post_success_steps=post_success_steps,
+        demos=demos,
         context=context,
     )
     if not views:
@@ -105,6 +121,7 @@ def prepare_dataset(
         size=size,
         depth=depth,
         frame_stride=frame_stride,
+        variants=variants,
         context=context,
     )
     return folder / "dataset"

@@ -23,6 +23,8 @@ class Condition:
         recipe: its recipe's name.
         changes: what is changed in the recipe.
         demonstrations: demonstrations trained on, validation included; None where not known.
+        looks: the looks in which each demonstration was rendered, or "".
+        multiplied_from: how many demonstrations those were re-posed from; None where they were not.
         axis: what is shifted in a robustness evaluation, or "".
         strength: how much.
         expert_swap: subtask of a hierarchical policy in which the expert acts, or "".
@@ -42,6 +44,8 @@ class Condition:
     recipe: str = "paper"
     changes: tuple[str, ...] = ()
     demonstrations: int | None = None
+    looks: str = ""
+    multiplied_from: int | None = None
     axis: str = ""
     strength: float = 0.0
     expert_swap: str = ""
@@ -59,6 +63,8 @@ class Condition:
             hierarchical,
             *(part for part, common in usual if part != common),
             " + ".join(self.changes),
+            self.looks,
+            f"multiplied from {self.multiplied_from}" if self.multiplied_from else "",
             self.name,
             self.place,
         ]
@@ -111,6 +117,8 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         recipe=Path(run.recipe).stem,
         changes=run.changes,
         demonstrations=run.demonstrations,
+        looks=run.variants.text if run.variants else "",
+        multiplied_from=run.multiplied_from,
         axis=run.shift.axis if run.shift else "",
         strength=run.shift.strength if run.shift else 0.0,
         expert_swap=run.expert_swap or "",

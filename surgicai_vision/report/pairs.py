@@ -1,10 +1,11 @@
 """Pairs: exact McNemar on the same starts, Holm's correction within a task.
 
 Compared are trained conditions of a task that differ in one thing (`FACTORS`); recipes as wholes,
-with the encoder, views and demonstrations of each; conditions of a plan, with how subtasks end in
-each; and each with images against proprioception alone. Episodes are paired by training seed and
-start. The test speaks of the policies that were trained, not of all that the same recipe might
-give.
+with the encoder, views and demonstrations of each; multiplied demonstrations against the few they
+were made of; demonstrations and looks with the epochs that were trained on each; conditions of a
+plan, with how subtasks end in each; and each with images against proprioception alone. Episodes are
+paired by training seed and start. The test speaks of the policies that were trained, not of all
+that the same recipe might give.
 """
 
 import itertools
@@ -27,11 +28,15 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "recipe": "recipe",
         "changes": "change",
         "demonstrations": "demonstrations",
+        "looks": "looks",
+        "multiplied_from": "multiplied demonstrations",
         "name": "condition",
         "place": "place",
     }
 )
 """Field of a condition → how a difference in it is called."""
+AMOUNTS = ("demonstrations", "looks", "multiplied_from")
+"""Fields that say how much there was to learn from."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +89,25 @@ def factor(first: Condition, second: Condition) -> str:
     if "recipe" in differ and bool(first.views) == bool(second.views):
         whole = ("encoder", "views", "pool", "recipe", "changes", "demonstrations")
         differ = [name for name in differ if name == "recipe" or name not in whole]
+    if "multiplied_from" in differ and _originals(first) == _originals(second):
+        differ = [name for name in differ if name != "demonstrations"]
+    if set(differ) & set(AMOUNTS) and _without_epochs(first) == _without_epochs(second):
+        differ = [name for name in differ if name != "changes"]
     if "name" in differ:
         differ = [name for name in differ if name != "hierarchical"]
     if blind:
         differ = ["images" if name == "encoder" else name for name in differ if name != "views"]
     return FACTORS.get(differ[0], differ[0]) if len(differ) == 1 else ""
+
+
+def _without_epochs(condition: Condition) -> list[str]:
+    """Return what is changed in the recipe but for its epochs, of which more data need fewer."""
+    return [change for change in condition.changes if not change.startswith("epochs=")]
+
+
+def _originals(condition: Condition) -> int | None:
+    """Return how many demonstrations there were before any was multiplied."""
+    return condition.multiplied_from or condition.demonstrations
 
 
 def _is_compared(condition: Condition) -> bool:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from markupsafe import Markup
 
 from surgicai_vision.core import names
+from surgicai_vision.core.config import RandomisationConfig
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.evaluation.robustness import ALL
@@ -162,21 +163,22 @@ def _row(row: Kept) -> tuple[str, ...]:
 def looks(groups: Sequence[Group]) -> list[tuple[str, ...]]:
     """Return task, policy, counts in held-in and in held-out looks, and what is kept, as text.
 
-    A policy is in a row if it was evaluated in both; it is the same by all but where it stands and
-    what it looked at.
+    A policy is in a row if it was evaluated in both; it is the same by all but where it stands,
+    what the condition is called and what it looked at, in worlds that vary alike in all else.
     """
-    seen: dict[tuple[str, str], dict[bool, list[Result]]] = {}
+    seen: dict[tuple[str, str, RandomisationConfig], dict[bool, list[Result]]] = {}
     for item in groups:
         if not (item.episodes and item.condition.plain and item.condition.trained):
             continue
-        label = replace(item.condition, place="").label
+        label = replace(item.condition, place="", name="").label
         for result in item.results:
             axes = result.config.randomisation
             if axes.appearance in (names.TRAIN, *names.TRAIN_APPEARANCES) or axes.shows_heldout:
-                by_look = seen.setdefault((item.condition.task, label), {})
+                world = replace(axes, appearance="", appearance_shift=0.0)
+                by_look = seen.setdefault((item.condition.task, label, world), {})
                 by_look.setdefault(axes.shows_heldout, []).append(result)
     rows: list[tuple[str, ...]] = []
-    for (task, label), by_look in seen.items():
+    for (task, label, _), by_look in seen.items():
         if len(by_look) == 2:
             held_in, held_out = _wins(by_look[False]), _wins(by_look[True])
             rows.append((task, label, _count(held_in), _count(held_out), _ratio(held_in, held_out)))

@@ -14,8 +14,9 @@ from types import MappingProxyType
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import check_view
-from surgicai_vision.core.config import JSON, TaskConfig, read_changes
+from surgicai_vision.core.config import JSON, TaskConfig, read_changes, to_mapping
 from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.variants import Variants
 
 OWN = "own"
 """Stands for an encoder: a network of the policy's own, trained with it on the images."""
@@ -83,6 +84,10 @@ class RunConfig:
         noise: how much what the demonstrator executed was disturbed.
         post_success_steps: control steps that demonstrations go on after their success.
         frame_stride: control steps from frame to frame of the dataset.
+        variants: the looks in which each demonstration was rendered, where a plan says so; None as
+            it was recorded, or where it is not known.
+        multiplied_from: how many demonstrations those trained on were re-posed from
+            (`demos.multiply`), where a plan says so; None where they were not.
         updates: updates of the weights and `batch_size`, for LeRobot's policies.
         batch_size: frames of an update, for LeRobot's policies.
         seed: training seed.
@@ -113,6 +118,8 @@ class RunConfig:
     noise: float = 0.0
     post_success_steps: int = 0
     frame_stride: int = 1
+    variants: Variants | None = None
+    multiplied_from: int | None = None
     updates: int | None = None
     batch_size: int | None = None
     seed: int = 0
@@ -205,6 +212,8 @@ class RunConfig:
             parts.append(self.inputs)
             parts += [self.pool] if self.pool != "global" else []
             parts += [self.recipe_label] if self.recipe_label != "paper" else []
+            parts += [self.variants.name] if self.variants else []
+            parts += [f"from-{self.multiplied_from}"] if self.multiplied_from else []
         if self.expert_swap:
             parts.append(f"expert-{self.expert_swap}")
         return "-".join(parts).replace(":", "-")
@@ -213,6 +222,15 @@ class RunConfig:
     def recipe_changes(self) -> dict[str, JSON]:
         """Keys of the recipe that are replaced, with their values: the only way to change one."""
         return read_changes(self.changes) | ({"privileged": True} if self.privileged else {})
+
+
+LATER = ("variants", "multiplied_from")
+"""Fields that runs did not have at first: where they say nothing they are no part of `identity`."""
+
+
+def identity(run: RunConfig) -> Mapping[str, JSON]:
+    """Return a run as plain data by which it is known: what says nothing of it is left out."""
+    return {key: value for key, value in to_mapping(run).items() if value or key not in LATER}
 
 
 def with_epochs(changes: tuple[str, ...], epochs: int | None) -> tuple[str, ...]:

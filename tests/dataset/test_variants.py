@@ -13,10 +13,10 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.executor import RunContext
+from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset import check_dataset, open_dataset, render_demos, schema
 from surgicai_vision.dataset.hub import dataset_card
 from surgicai_vision.dataset.subset import first_episodes, with_frame_stride
-from surgicai_vision.dataset.variants import Variants
 from surgicai_vision.demos.rollout import EpisodeRecorder
 from surgicai_vision.demos.store import list_demos, read_demo, write_demo, write_marker
 from surgicai_vision.training.data import split

@@ -1,4 +1,4 @@
-"""Variants: each demonstration rendered in several looks.
+"""Variants: each demonstration rendered in several looks, as data; light to import.
 
     render_demos(demos, out, variants=Variants("train", count=5))
 
@@ -66,6 +66,21 @@ class Variants:
                 distractors=self.distractors or own.distractors,
             ),
         )
+
+    @property
+    def name(self) -> str:
+        """What they are, as a part of a name: "train-x5"."""
+        parts = [self.appearance] if self.appearance else []
+        parts += [f"distractors{self.distractors}"] if self.distractors else []
+        return "-".join([*parts, f"x{self.count}"])
+
+    @property
+    def text(self) -> str:
+        """What they are, in words."""
+        looks = f"{self.count} {'look' if self.count == 1 else 'looks'}"
+        parts = [f"({self.appearance})"] if self.appearance else []
+        parts += [f"with up to {self.distractors} distractors"] if self.distractors else []
+        return " ".join([looks, *parts])
 
     @property
     def request(self) -> Mapping[str, JSON]:
