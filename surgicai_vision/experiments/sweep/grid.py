@@ -49,7 +49,9 @@ AXES: Mapping[str, Callable[[RunConfig], object]] = MappingProxyType(
 """Keys of a grid that hold lists, and a run's value on each; one value alone may be written without
 brackets.
 """
-HIGH_LEVEL: Mapping[str, str] = MappingProxyType({"best": "high-level", "endoscope": "high-level"})
+HIGH_LEVEL: Mapping[str, str] = MappingProxyType(
+    dict.fromkeys(("best", "endoscope", "unmoved"), "high-level")
+)
 """Recipe of the low-level policies → the high-level policy's; any other trains both, as the paper's
 does.
 """
