@@ -99,11 +99,19 @@ class ServeConfig:
 
 @dataclass(frozen=True)
 class _Request:
-    """A message that asks the simulation for something, and what must come before it."""
+    """A message that asks the simulation for something, and what must come before it.
+
+    Attributes:
+        stamp: of its header [ns].
+        text: what is asked.
+        asked: when it came, by the monotonic clock [s].
+        sent: when it was sent, as `Received.sent`.
+    """
 
     stamp: int
     text: str
     asked: float
+    sent: int
 
 
 @final
@@ -152,6 +160,7 @@ class Server:
             self._add(topics.NEEDLE)
             self._add(topics.LABEL)
         self._resets = transport.inbox(topics.RESET)
+        self._reset_sent = 0
         self._enters = transport.inbox(topics.ENTER)
         self._steps = transport.inbox(topics.STEP)
         self._stamps: dict[str, int] = {}
@@ -223,6 +232,7 @@ class Server:
         """Take what has come; where the client sets the clock, also step as it asks."""
         for request in self._texts(self._resets):
             self._do(request, lambda text: self._reset(_seed(text)))
+            self._reset_sent = max(self._reset_sent, request.sent)
         for request in self._texts(self._enters):
             self._do(request, lambda text: self.robot.enter(text) if text else None)
         self._requests += self._texts(self._steps)
@@ -230,6 +240,7 @@ class Server:
             (received.sent, place, received)
             for place, (_, _, _, inbox) in enumerate(self._inboxes)
             for received in inbox()
+            if received.sent >= self._reset_sent  # not what was meant for the episode before
         ]
         for _, place, received in sorted(heard, key=lambda entry: entry[:2]):
             arm, channel, topic, _ = self._inboxes[place]
@@ -253,13 +264,14 @@ class Server:
     def _texts(self, inbox: Inbox) -> list[_Request]:
         """Return the requests that have come, each with a stamp once."""
         found: list[_Request] = []
-        for message in (received.message for received in inbox()):
+        for received in inbox():
+            message = received.message
             if not isinstance(message, StringStamped):
                 continue
             request = (message.header.stamp, message.text)
             if not message.header.stamp or request not in self._taken:
                 self._taken.append(request)
-                found.append(_Request(*request, time.monotonic()))
+                found.append(_Request(*request, time.monotonic(), received.sent))
         return found
 
     def _do(self, request: _Request, act: Callable[[str], None]) -> None:

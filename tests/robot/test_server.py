@@ -222,6 +222,20 @@ def test_a_reset_begins_the_episode_of_its_seed_again():
     assert "must be a seed" in client.take()["/simulation/stepped"][0].text
 
 
+def test_what_was_sent_before_a_reset_is_not_obeyed_after_it():
+    """A client sends until its episode ends; its last command may lie there beside the reset."""
+    client = Client()
+    client.step()
+    before = client.env.get_state()
+    client.say("/PSM2/jaw/servo_jp", JointState(Header(), ("jaw",), (0.2,)))
+    client.say("/simulation/reset", StringStamped(Header(70), str(SEED)))
+    client.step()
+    assert np.array_equal(client.env.get_state(), before)
+    client.say("/PSM2/jaw/servo_jp", JointState(Header(), ("jaw",), (0.2,)))
+    client.step()
+    assert client.robot.state("PSM2").jaw_setpoint < 0.8
+
+
 def test_a_request_that_comes_twice_is_met_once(client):
     """A client asks anew where no answer came; without a stamp every request is a new one."""
     before = client.robot.steps
