@@ -99,11 +99,12 @@ def as_built(built):
         path.write_bytes(content)
 
 
-def test_nothing_is_released_before_it_is_built(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv(released.VARIABLE, str(tmp_path / "released"))
-    with pytest.raises(InputError, match=r"no policy is released .* `surgicai-vision release`"):
-        open_policy("released:grasp")
-    code, listed = run(capsys, "policies")
+def test_nothing_is_released_before_it_is_built(tmp_path, capsys):
+    with pytest.MonkeyPatch.context() as patch:  # undone before `here` is, whatever else patches
+        patch.setenv(released.VARIABLE, str(tmp_path / "released"))
+        with pytest.raises(InputError, match=r"no policy is released .* `surgicai-vision release`"):
+            open_policy("released:grasp")
+        code, listed = run(capsys, "policies")
     assert code == 0 and listed["policies"] == []
 
 
