@@ -55,17 +55,21 @@ def folder(tmp_path_factory):
 def working_in(folder: Path) -> Iterator[None]:
     """Work in the folder, with policies and features of its own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setenv(released.VARIABLE, str(folder / "released"))
-        patch.setenv("SURGICAI_VISION_CACHE", str(folder / "cache"))
+        work_in(folder, patch)
         yield
+
+
+def work_in(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """Work in the folder until `patch` is undone."""
+    patch.chdir(folder)
+    patch.setenv(released.VARIABLE, str(folder / "released"))
+    patch.setenv("SURGICAI_VISION_CACHE", str(folder / "cache"))
 
 
 @pytest.fixture(autouse=True)
-def here(folder):
-    """Work in the folder."""
-    with working_in(folder):
-        yield
+def here(folder, monkeypatch):
+    """Work in the folder, by the patches a test may add to: they are undone in turn."""
+    work_in(folder, monkeypatch)
 
 
 @pytest.fixture(scope="module")
