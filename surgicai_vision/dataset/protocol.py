@@ -4,7 +4,6 @@ A `reader.RenderedDataset` and a `subset.DatasetSubset` are datasets in this sen
 one names this protocol in its signature.
 """
 
-import itertools
 from pathlib import Path
 from typing import Protocol
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.runs import runs_of
 
 
 class Dataset(Protocol):
@@ -73,6 +73,4 @@ class Dataset(Protocol):
 
 def episode_bounds(episode_index: NDArray[np.int64]) -> list[tuple[int, int]]:
     """Return (first frame, frame after the last) of every episode in `episode_index`, (N,)."""
-    count = len(episode_index)
-    starts = [0, *(np.flatnonzero(np.diff(episode_index)) + 1).tolist(), count]
-    return list(itertools.pairwise(starts)) if count else []
+    return runs_of(episode_index)

@@ -16,8 +16,6 @@ The folder is written whole; the same request finds it finished.
 """
 
 import dataclasses
-import itertools
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +25,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.files import check_output, whole_folder
 from surgicai_vision.core.progress import Stage, silent_stage
+from surgicai_vision.core.runs import runs_of
 from surgicai_vision.demos.record import finished
 from surgicai_vision.demos.store import (
     MARKER,
@@ -90,8 +89,8 @@ def visits(demo: Demo, subtask: str) -> list[Demo]:
     config = dataclasses.replace(demo.config, task=subtask, max_steps=TaskConfig(subtask).max_steps)
     number = names.SUBTASKS.index(subtask)
     found = [
-        (first, _kept_end(demo, first, last))
-        for first, last in _runs(demo.phase.tolist())
+        (first, _kept_end(demo, first, end))
+        for first, end in runs_of(demo.phase)
         if demo.phase[first] == number
     ]
     return [
@@ -111,19 +110,10 @@ def visits(demo: Demo, subtask: str) -> list[Demo]:
     ]
 
 
-def _runs(phase: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Yield the first and the last step of every run of equal phases."""
-    at = 0
-    for _, group in itertools.groupby(phase):
-        length = len(list(group))
-        yield at, at + length - 1
-        at += length
-
-
-def _kept_end(demo: Demo, first: int, last: int) -> int:
-    """Return the step after the last that is kept of a visit."""
-    is_broken_off = last + 1 < len(demo) and demo.phase[last + 1] < demo.phase[last]
+def _kept_end(demo: Demo, first: int, end: int) -> int:
+    """Return the step after the last that is kept of a visit, whose steps are `first` to `end`."""
+    is_broken_off = end < len(demo) and demo.phase[end] < demo.phase[first]
     if not is_broken_off:
-        return last + 1
-    touching = np.flatnonzero(demo.contact[first : last + 1])
+        return end
+    touching = np.flatnonzero(demo.contact[first:end])
     return first + int(touching[-1]) + 1 if len(touching) else first

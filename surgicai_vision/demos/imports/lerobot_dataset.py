@@ -23,7 +23,6 @@ Nothing in the files runs. Columns that are not named here are never read, so ne
 
 import dataclasses
 import hashlib
-import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -39,6 +38,7 @@ from surgicai_vision.core.config import JSON, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, first_line
 from surgicai_vision.core.files import check_output, read_json
 from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.core.runs import runs_of
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
 from surgicai_vision.demos.imports.rosbag.importer import BagSummary, base_config, write_tracks
 from surgicai_vision.demos.imports.rosbag.tracks import SegmentTrack, tracks_of
@@ -200,8 +200,7 @@ class DatasetFiles:
             total += len(table)
             if total > MAX_FRAMES:
                 raise BadFile(f"{self._path} holds over {MAX_FRAMES} frames.")
-            cuts = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(table)]
-            for start, stop in itertools.pairwise(cuts):
+            for start, stop in runs_of(numbers):
                 part = table.slice(start, stop - start)
                 if waiting is not None and _number(waiting) == _number(part):
                     waiting = pa.concat_tables([waiting, part])
@@ -209,7 +208,7 @@ class DatasetFiles:
                 if waiting is not None:
                     yield _number(waiting), self._arrays(waiting, tasks)
                 waiting = part
-        if waiting is not None and len(waiting):
+        if waiting is not None:
             yield _number(waiting), self._arrays(waiting, tasks)
 
     def _tasks(self) -> dict[int, str]:

@@ -24,6 +24,7 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import sha256_file
+from surgicai_vision.core.runs import runs_of
 from surgicai_vision.demos.demonstrator import GOAL_FREE_DEMONSTRATORS
 from surgicai_vision.demos.expert import on_path, turn_about_wound
 from surgicai_vision.demos.multiply.segments import (
@@ -147,11 +148,9 @@ def read_source(path: str) -> Source:
 
 def _runs(demo: Demo) -> list[tuple[str, int, int]]:
     """Return (subtask, first state, last state) of each subtask's last run of frames."""
-    edges = np.flatnonzero(np.diff(demo.phase)) + 1
-    bounds = [0, *edges.tolist(), len(demo)]
     return [
         (names.SUBTASKS[demo.phase[first]], first, last)
-        for first, last in itertools.pairwise(bounds)
+        for first, last in runs_of(demo.phase)
         if demo.phase[first] >= 0
     ]
 
