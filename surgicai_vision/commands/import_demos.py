@@ -1,7 +1,7 @@
 """`import-demos`: read demonstrations of the original SurgicAI, bags of ROS, LeRobot datasets."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -137,32 +137,39 @@ def _import_surgicai(path: Path, options: Options, console: Console) -> dict[str
 def _import_dataset(path: Path, options: Options, console: Console) -> dict[str, object]:
     from surgicai_vision.demos.imports.lerobot_dataset import import_dataset
 
-    if options.topic or options.convention:
-        raise InputError(
-            f"--topic and --convention are for bags, and {path} is a LeRobot dataset; frames, "
-            "labels and more stand in the table bag of a --config file."
-        )
+    _refuse_topics(
+        options,
+        "a LeRobot dataset; frames, labels and more stand in the table bag of a --config file",
+    )
     out = options.out or folders.demos_folder(f"dataset-{path.resolve().name}")
-    with console.stage(f"importing {path.name}", "frames") as progress:
-        summaries = import_dataset(
-            path,
-            task=options.task,
-            out=out,
-            config=_config(options),
-            env=options.env,
-            progress=progress,
-        )
-    return {"tasks": _told(summaries, console)}
+    return _import_arms(import_dataset, options, out, "frames", console)
 
 
 def _import_drive_log(path: Path, options: Options, console: Console) -> dict[str, object]:
     from surgicai_vision.demos.imports.drive_log import import_drive_log
 
-    if options.topic or options.convention:
-        raise InputError(f"--topic and --convention are for bags, and {path} is a log of drive.")
+    _refuse_topics(options, "a log of drive")
     out = options.out or folders.demos_folder("drive")
-    with console.stage(f"importing {path.name}", "demonstrations") as progress:
-        summaries = import_drive_log(
+    return _import_arms(import_drive_log, options, out, "demonstrations", console)
+
+
+def _refuse_topics(options: Options, what: str) -> None:
+    """Refuse options that only bags have; `what` says what is imported in their place."""
+    if options.topic or options.convention:
+        raise InputError(f"--topic and --convention are for bags, and {options.file} is {what}.")
+
+
+def _import_arms(
+    read: "Callable[..., Sequence[BagSummary]]",
+    options: Options,
+    out: Path,
+    unit: str,
+    console: Console,
+) -> dict[str, object]:
+    """Import what holds both arms' poses and no images of ours, by one of its readers."""
+    path = options.file
+    with console.stage(f"importing {path.name}", unit) as progress:
+        summaries = read(
             path,
             task=options.task,
             out=out,

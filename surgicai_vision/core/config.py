@@ -10,7 +10,7 @@ import hashlib
 import json
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeVar, cast
 
@@ -324,6 +324,22 @@ def to_mapping(config: "DataclassInstance") -> dict[str, JSON]:
     """Return a frozen dataclass as plain JSON data."""
     plain: dict[str, JSON] = json.loads(json.dumps(dataclasses.asdict(config)))
     return plain
+
+
+def to_identity(config: "DataclassInstance", later: Collection[str]) -> dict[str, JSON]:
+    """Return a frozen dataclass as the plain data by which it is known.
+
+    Args:
+        config: the dataclass.
+        later: fields that it did not have at first, each with a default. Those that still have it
+            are left out, so that a digest of what does not use them stays what it was.
+    """
+    usual = {field.name: field.default for field in dataclasses.fields(config)}
+    return {
+        name: value
+        for name, value in to_mapping(config).items()
+        if name not in later or getattr(config, name) != usual[name]
+    }
 
 
 def read_changes(texts: Iterable[str]) -> dict[str, JSON]:

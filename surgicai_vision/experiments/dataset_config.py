@@ -6,10 +6,10 @@ and none meets the banks of validation and test. Training seed 0 begins at `name
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON, TaskConfig, check_frame_stride, to_mapping
+from surgicai_vision.core.config import JSON, TaskConfig, check_frame_stride, to_identity
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.core.variants import Variants
 from surgicai_vision.demos.demonstrator import CHOOSING_DEMONSTRATORS, SCRIPTED_DEMONSTRATORS
@@ -26,9 +26,7 @@ are the training seed's own.
 DEMONSTRATORS = (*SCRIPTED_DEMONSTRATORS, *sorted(CHOOSING_DEMONSTRATORS))
 """Who may demonstrate: a scripted expert, or what re-poses other demonstrations."""
 LATER = ("appearance", "distractors", "variants", "of")
-"""Fields that demonstrations did not have at first: where they say nothing they are no part of
-`Demonstrations.identity`, so that plans which do not use them stay what they were.
-"""
+"""Fields that demonstrations did not have at first (`config.to_identity`)."""
 
 
 @dataclass(frozen=True)
@@ -104,12 +102,8 @@ class Demonstrations:
 
     @property
     def identity(self) -> Mapping[str, JSON]:
-        """They as plain data by which they are known: what says nothing of them is left out."""
-        plain = to_mapping(self)
-        usual = {each.name: each.default for each in fields(self)}
-        return {
-            key: value for key, value in plain.items() if key not in LATER or value != usual[key]
-        }
+        """They as plain data by which they are known (`config.to_identity`)."""
+        return to_identity(self, LATER)
 
     @property
     def disturbance(self) -> Disturbance:

@@ -181,7 +181,7 @@ def read_row(path: Path) -> Row:
         raise BadFile(f"{path} cannot be read ({told}).") from None
 
 
-def default_config(run: RunConfig) -> TaskConfig:
+def _default_config(run: RunConfig) -> TaskConfig:
     """Return the env that a row must have; a hierarchical policy's is its own."""
     env = TaskConfig(run.task)
     if run.termination is None:
@@ -194,7 +194,7 @@ def problem(row: Row) -> str:
     if row.sealed().digest != row.digest:
         return "its digest is not that of its content; it was changed after it was made."
     env = row.run.env
-    default = default_config(row.run)
+    default = _default_config(row.run)
     shift = row.run.shift
     if shift is None:
         wanted = default

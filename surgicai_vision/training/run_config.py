@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import check_view
-from surgicai_vision.core.config import JSON, TaskConfig, read_changes, to_mapping
+from surgicai_vision.core.config import JSON, TaskConfig, read_changes, to_identity
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.variants import Variants
 
@@ -225,12 +225,12 @@ class RunConfig:
 
 
 LATER = ("variants", "multiplied_from")
-"""Fields that runs did not have at first: where they say nothing they are no part of `identity`."""
+"""Fields that runs did not have at first (`config.to_identity`)."""
 
 
 def identity(run: RunConfig) -> Mapping[str, JSON]:
-    """Return a run as plain data by which it is known: what says nothing of it is left out."""
-    return {key: value for key, value in to_mapping(run).items() if value or key not in LATER}
+    """Return a run as plain data by which it is known (`config.to_identity`)."""
+    return to_identity(run, LATER)
 
 
 def with_epochs(changes: tuple[str, ...], epochs: int | None) -> tuple[str, ...]:
