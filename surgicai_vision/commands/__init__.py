@@ -51,7 +51,7 @@ COMMANDS = MappingProxyType(
         "scene": "Show what every camera sees.",
         "record-demos": "Record demonstrations by the scripted expert.",
         "teleoperate": "Record demonstrations by keyboard or gamepad.",
-        "import-demos": "Read demonstrations of the original SurgicAI, or bags of ROS 1 and 2.",
+        "import-demos": "Read SurgicAI's recordings, ROS bags, LeRobot datasets, logs of drive.",
         "cut-demos": "Take a subtask's visits out of recordings of whole procedures.",
         "export-demos": "Turn demonstrations into transitions for SB3, d3rlpy and Minari.",
         "render-demos": "Render demonstrations into a LeRobot dataset.",

@@ -62,7 +62,7 @@ class Options:
         quality: fast (as datasets are rendered) or high.
         sheet: File to write.
         film: Draw a film strip of the expert in every subtask instead, in the first view.
-        animation: Draw the expert's episode as a moving picture instead, in the first view.
+        animation: Draw the expert's episode as an animation instead, in the first view.
         axes: Draw every axis of `robustness` at every strength instead, in the first view.
         looks: Draw families of looks instead, a row each: every view at seeds from --seed on.
         appearance: Families of --looks: all, train, heldout, plain, or names.

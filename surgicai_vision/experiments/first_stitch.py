@@ -3,7 +3,7 @@
     sewing = find_sewer("released:suture")
     row = sew(sewing, Path("outputs/quickstart/procedure"), say=print)
 
-The folder gets `procedure.mp4`, `procedure.webp` (the same as a moving picture, for a page that
+The folder gets `procedure.mp4`, `procedure.webp` (the same as an animation, for a page that
 plays no video), `strip.jpg`, `poster.jpg` (the video's first image) and, written last,
 `procedure.json`; where that is there nothing is done again.
 """
