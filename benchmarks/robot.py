@@ -39,8 +39,7 @@ from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.evaluation.rollout import evaluate
 
-ROOT = Path(__file__).resolve().parents[1]
-PROCEDURE = ROOT / "examples" / "learned-ends.yaml"
+PROCEDURE = "released:suture"
 COMMAND = (sys.executable, "-m", "surgicai_vision", "robot")
 IN_PROCESS = "in process"
 CLOCKS = ("stepped", "real")
@@ -196,7 +195,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--policy", default=str(PROCEDURE))
+    parser.add_argument("--policy", default=PROCEDURE)
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--seed", type=int, default=names.TEST_SEED)
     parser.add_argument("--clock", choices=(*CLOCKS, "both"), default="both")

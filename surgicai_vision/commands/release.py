@@ -39,7 +39,7 @@ class Options:
     """
 
     plan: Annotated[
-        Path | None, Parameter(metavar="FILE.yaml"), default_text("configs/release.yaml")
+        Path | None, Parameter(metavar="FILE.yaml"), default_text("configs/sweep/procedure.yaml")
     ] = None
     only: Annotated[
         tuple[str, ...], UNIQUE, Parameter(metavar="NAME[,NAME]"), default_text("all")

@@ -32,7 +32,7 @@ Two commands take a plan:
   (`experiments.sweep`); a condition's starts are the same for every seed, and the same as those of
   the other conditions. Seeds and conditions may be added later, in the same folder.
 * `surgicai-vision release --plan PLAN.yaml`: its first training seed alone, counted as trained, as
-  the policies that come with the product (`experiments.release`; `configs/release.yaml`).
+  the policies that come with the product (`experiments.release`).
 
 What it lists is in `plan_parts`, what is refused before any work in `plan_check`.
 
@@ -71,6 +71,9 @@ from surgicai_vision.training.run_config import (
     Starts,
     with_epochs,
 )
+
+RELEASED_PLAN = Path("sweep") / "procedure.yaml"
+"""Below `configs/`: the plan of the policies that come with the product."""
 
 
 @dataclass(frozen=True)
@@ -431,11 +434,11 @@ def plan_of(table: Mapping[str, object], where: str) -> Plan:
 
 
 def read_plan(path: Path | None = None) -> Plan:
-    """Read a plan, by default `configs/release.yaml`.
+    """Read a plan, by default that of the policies which come with the product.
 
     Raises:
         BadFile: it cannot be read.
         InputError: a key or a value that is not allowed.
     """
-    path = path or configs_folder() / "release.yaml"
+    path = path or configs_folder() / RELEASED_PLAN
     return plan_of(read_yaml(path), str(path))

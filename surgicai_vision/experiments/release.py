@@ -142,8 +142,8 @@ class _Build:
             name=policy.name,
             run=checkpoint.run,
             scene_hash=self.scene_hash,
-            data=f"{whose}{recorded.episodes} demonstrations of {recorded.task} by the scripted "
-            f"expert ({recorded.demonstrator}), {checkpoint.frames} frames",
+            data=f"{whose}{recorded.episodes} demonstrations of {recorded.task}, "
+            f"{recorded.manner}: {checkpoint.frames} frames",
             licence=self.plan.licence,
             encoder=_encoder(checkpoint),
             command=command_line(),

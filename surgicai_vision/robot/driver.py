@@ -5,7 +5,8 @@
     driver.episode(seed, max_steps)
 
 Each control step the agent is given measured poses, jaws and images (`robot.driven`); what its
-action becomes, and whether it is sent, is `robot.setpoints`'. Nothing else is done that the policy
+action becomes, and whether it is sent, is `robot.setpoints`'. In real time a control step is drawn
+to begin just after images have come (`drawn_to_images`). Nothing else is done that the policy
 has not said, but PSM2's letting go where the pull-out begins.
 """
 
@@ -32,6 +33,10 @@ from surgicai_vision.robot.operating_state import DISABLED, FAULT
 from surgicai_vision.robot.setpoints import Setpoints
 
 CONTROL_S = 1.0 / names.FPS
+AFTER_IMAGE_S = 0.002
+"""Time from an image's coming to the control step that sees it, once the two go together [s]."""
+DRAWN_S = 0.002
+"""Time by which a control step begins earlier or later at most, to come after the images [s]."""
 STOPS = (DISABLED, FAULT)
 """States after which a run is over: somebody stopped the robot, and a person begins again."""
 
@@ -161,6 +166,8 @@ class Driver:
         due = time.monotonic()
         for number in range(max_steps):
             self._client.update()
+            image_age = self._setpoints.youngest_image()
+            begun = time.monotonic()
             problem = self._setpoints.problem_of_inputs()
             commands: Mapping[str, Command] = {}
             action: NDArray[np.float32] | None = None
@@ -188,6 +195,8 @@ class Driver:
                 break
             if not self._config.is_stepped:
                 due = max(due + CONTROL_S, time.monotonic() - CONTROL_S)
+                if image_age is not None and math.isfinite(image_age):
+                    due += drawn_to_images(due - (begun - image_age))
                 self._sleep_until(due)
         judged = self._client.judgement()
         return DrivenEpisode(
@@ -279,6 +288,19 @@ class Driver:
                 f"dry run, {self._robot.subtask}: {arm} would be told ({x:.1f}, {y:.1f}, {z:.1f}) "
                 f"mm in its base, jaw {math.degrees(command.jaw / self._robot.jaw_scale):.0f}°"
             )
+
+
+def drawn_to_images(after: float) -> float:
+    """Return by how much a control step should begin earlier or later [s].
+
+    A policy that looks just after images have come acts a step sooner than one that looks just
+    before.
+
+    Args:
+        after: time from some image's coming to the beginning of the step [s].
+    """
+    ahead = (after - AFTER_IMAGE_S + CONTROL_S / 2) % CONTROL_S - CONTROL_S / 2
+    return min(max(-ahead, -DRAWN_S), DRAWN_S)
 
 
 def check_drivable(agent: Agent, task: TaskConfig) -> None:

@@ -1,14 +1,16 @@
 """Images: what the cameras of a served simulation publish, without holding up its control.
 
-In real time images are rendered in a thread with an env of its own, from states it is offered; when
-rendering is slower than the rate, states are left out, and control goes on. Where the client sets
-the clock they are rendered at once, each step. An image bears the stamp of the state it shows.
-A view that nobody hears is not rendered.
+In real time images are rendered in a thread with an env of its own. A control step is computed at
+its beginning, so the state that it leads to is offered to the thread ahead of its time, and its
+images are published as soon as it is the present one. When rendering is slower than the rate,
+states are left out, and control goes on. Where the client sets the clock they are rendered at once,
+each step. An image bears the stamp of the state it shows. A view that nobody hears is not rendered.
 """
 
 import io
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -29,6 +31,31 @@ State = NDArray[np.float64]
 def optical_frame(view: str) -> str:
     """Return the name of a view's optical frame: x right, y down, z forward."""
     return f"{view}_optical_frame"
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One view of one state, as it will be published.
+
+    Attributes:
+        view: the camera or crop.
+        intrinsics: its matrix, row by row [pixel].
+        raw: the image's bytes, height × width × 3; None where nobody hears it.
+        jpeg: the image as a JPEG file; None where nobody hears that.
+    """
+
+    view: str
+    intrinsics: tuple[float, ...]
+    raw: bytes | None
+    jpeg: bytes | None
+
+
+@dataclass
+class _Offer:
+    """A state to be shown, and the stamp it bears once it is the present one [ns]."""
+
+    state: State
+    stamp: int | None = None
 
 
 @final
@@ -64,19 +91,38 @@ class Cameras:
 
     def publish(self, stamp: int) -> None:
         """Render the env's present state and publish every view with `stamp` [ns]."""
-        height, width = self._size
-        for view, publish in self._raw.items():
-            header = Header(stamp, optical_frame(view))
+        self.publish_shots(self.render(), stamp)
+
+    def render(self) -> list["Shot"]:
+        """Render the env's present state in every view."""
+        shots = []
+        for view in self._raw:
             is_raw = self._is_heard(image_topic(view))
             is_small = view in self._small and self._is_heard(compressed_topic(view))
+            frame = None
             if is_raw or is_small:
                 frame = self._env.image(view, self._size).astype(np.uint8, copy=False)
-                if is_raw:
-                    publish(Image(header, height, width, frame.tobytes()))
-                if is_small:
-                    self._small[view](CompressedImage(header, "jpeg", _jpeg(frame)))
             intrinsics = self._env.calibration.intrinsics(view, self._size)
-            self._infos[view](CameraInfo(header, height, width, tuple(intrinsics.ravel().tolist())))
+            shots.append(
+                Shot(
+                    view,
+                    tuple(intrinsics.ravel().tolist()),
+                    None if frame is None or not is_raw else frame.tobytes(),
+                    None if frame is None or not is_small else _jpeg(frame),
+                )
+            )
+        return shots
+
+    def publish_shots(self, shots: list["Shot"], stamp: int) -> None:
+        """Publish what `render` returned with the stamp of its state [ns]."""
+        height, width = self._size
+        for shot in shots:
+            header = Header(stamp, optical_frame(shot.view))
+            if shot.raw is not None:
+                self._raw[shot.view](Image(header, height, width, shot.raw))
+            if shot.jpeg is not None:
+                self._small[shot.view](CompressedImage(header, "jpeg", shot.jpeg))
+            self._infos[shot.view](CameraInfo(header, height, width, shot.intrinsics))
 
 
 @final
@@ -92,7 +138,8 @@ class ImageThread:
         self._config = config
         self._make = make
         self._changed = threading.Condition()
-        self._offer: tuple[State, int] | None = None
+        self._next: _Offer | None = None
+        self._newest: _Offer | None = None
         self._error: Exception | None = None
         self._is_over = False
         self._thread = threading.Thread(target=self._run, name="images", daemon=True)
@@ -109,12 +156,12 @@ class ImageThread:
 
     @property
     def is_free(self) -> bool:
-        """Return True if a state that is offered now is rendered at once."""
+        """Return True if no state that was offered still waits to be rendered."""
         with self._changed:
-            return self._offer is None
+            return self._next is None
 
-    def offer(self, state: State, stamp: int) -> None:
-        """Show a state of the env's `get_state` next, in the place of one that still waits.
+    def offer(self, state: State) -> None:
+        """Render a state of the env's `get_state` next, in the place of one that still waits.
 
         Raises:
             Exception: whatever ended the thread.
@@ -122,8 +169,18 @@ class ImageThread:
         with self._changed:
             if self._error is not None:
                 raise self._error
-            self._offer = (state, stamp)
+            self._next = self._newest = _Offer(state)
             self._changed.notify()
+
+    def release(self, stamp: int) -> None:
+        """Publish the state that was offered last, now that it is the present one of `stamp` [ns].
+
+        Nothing is done where it was released before.
+        """
+        with self._changed:
+            if self._newest is not None and self._newest.stamp is None:
+                self._newest.stamp = stamp
+                self._changed.notify()
 
     def _run(self) -> None:
         try:
@@ -131,26 +188,33 @@ class ImageThread:
         except Exception as error:  # it belongs to the thread that offers states
             with self._changed:
                 self._error = error
-                self._offer = None
+                self._next = None
 
     def _render(self) -> None:
         env = envs.make(self._config)
         cameras = self._make(env)
-        while True:
-            with self._changed:
-                while self._offer is None and not self._is_over:
-                    self._changed.wait()
-                if self._is_over:
-                    break
-                offer = self._offer
-            assert offer is not None
-            state, stamp = offer
-            env.set_state_vector(state)
-            cameras.publish(stamp)
-            with self._changed:
-                if self._offer is offer:
-                    self._offer = None
+        while (offer := self._take()) is not None:
+            env.set_state_vector(offer.state)
+            shots = cameras.render()
+            stamp = self._stamp_of(offer)
+            if stamp is not None:
+                cameras.publish_shots(shots, stamp)
         env.close()
+
+    def _take(self) -> _Offer | None:
+        """Wait for an offer and take it; None where the thread is over."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._next is not None or self._is_over)
+            offer, self._next = self._next, None
+            return None if self._is_over else offer
+
+    def _stamp_of(self, offer: _Offer) -> int | None:
+        """Wait for an offer's stamp; None at the end, or where a reset put another in its place."""
+        with self._changed:
+            self._changed.wait_for(
+                lambda: offer.stamp is not None or offer is not self._newest or self._is_over
+            )
+            return offer.stamp
 
 
 def _jpeg(frame: NDArray[np.uint8]) -> bytes:

@@ -4,11 +4,11 @@
         server.run(lambda: False)
 
 In real time a control step of 20 ms begins 50 times a second: the commands that have come become
-the set points, the state at its beginning is published with them, and the state halfway is
-published 10 ms later, so that states come 100 times a second. A set point that came in time is
-thus published before its sender's next control step begins. Where the client sets the clock
-(`stepped`), nothing moves until a message on `/simulation/step` asks for it; everything published
-for a step bears one stamp, and `/simulation/stepped` says which, last.
+the set points, the state at its beginning is published with them and the images of that state, and
+the state halfway is published 10 ms later, so that states come 100 times a second. A set point that
+came in time is thus published before its sender's next control step begins. Where the client sets
+the clock (`stepped`), nothing moves until a message on `/simulation/step` asks for it; everything
+published for a step bears one stamp, and `/simulation/stepped` says which, last.
 """
 
 import json
@@ -89,7 +89,7 @@ class ServeConfig:
     clock: str = REAL
     views: tuple[str, ...] = ()
     size: tuple[int, int] = (224, 224)
-    image_rate: float = 25.0
+    image_rate: float = 50.0
     is_compressed: bool = False
     shows_truth: bool = False
 
@@ -184,6 +184,7 @@ class Server:
         elif self.config.views:
             thread = ImageThread(self.robot.env.config, self._make_cameras)
             self._images = self._stack.enter_context(thread)
+            self._offer_image()
         for name in PSM_NAMES:
             self._publishers[f"/{name}/tool_type"](String(self.robot.instrument))
         self._publish_all(self._stamp())
@@ -217,13 +218,15 @@ class Server:
         self._obey()
         stamp = self._stamp()
         self._publish_all(stamp)
-        self._offer_image(stamp)
+        if self._images is not None:
+            self._images.release(stamp)
         halfway: dict[str, ArmState] = {}
 
         def read() -> None:
             halfway.update({name: self.robot.state(name) for name in PSM_NAMES})
 
         self._move(read)
+        self._offer_image()
         return halfway
 
     # -- what comes --------------------------------------------------------------------------------
@@ -338,6 +341,8 @@ class Server:
             self._recorder.begin()
         for psm in self._psms.values():
             psm.forget()
+        if self._images is not None:  # in the place of what the episode before was coming to
+            self._images.offer(self.robot.env.get_state())
 
     # -- what is said ------------------------------------------------------------------------------
 
@@ -426,14 +431,14 @@ class Server:
         message = StringStamped(Header(stamp), json.dumps(judged))
         self._publishers[topics.JUDGEMENT.name](message)
 
-    def _offer_image(self, stamp: int) -> None:
-        """Give the image thread the present state where an image is due and it has time."""
+    def _offer_image(self) -> None:
+        """Give the image thread the state to come, where an image of it is due and it has time."""
         images = self._images
         now = time.monotonic()
         if images is None or now < self._next_image or not images.is_free:
             return
         self._next_image = max(self._next_image + 1.0 / self.config.image_rate, now - CONTROL_S)
-        images.offer(self.robot.env.get_state(), stamp)
+        images.offer(self.robot.env.get_state())
 
     def _make_cameras(self, env: SuturingEnv) -> Cameras:
         config = self.config

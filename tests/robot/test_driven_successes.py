@@ -1,7 +1,6 @@
 """Released policies at a served simulation: the same ends, episode by episode, as in process."""
 
 import io
-from pathlib import Path
 
 import pytest
 from served import DOMAIN, serving
@@ -14,8 +13,6 @@ from surgicai_vision.robot.driven import DrivenRobot
 from surgicai_vision.robot.driver import DriveConfig, Driver
 from surgicai_vision.robot.guards import GuardConfig
 from surgicai_vision.robot.transport import Transport, open_transport
-
-PROCEDURE = Path(__file__).resolve().parents[2] / "examples" / "learned-ends.yaml"
 
 
 def check_same_ends(spec: PolicySpec, transport: Transport, seeds: tuple[int, ...]) -> None:
@@ -51,7 +48,7 @@ def test_the_whole_procedure_ends_as_it_does_in_process():
     `benchmarks/robot.py` counts more episodes, and in real time.
     """
     pytest.importorskip("cyclonedds", reason="the extra `ros` is not installed")
-    spec = open_policy(str(PROCEDURE))
+    spec = open_policy("released:suture")
     agent = spec.make_agent()
     options = ("--task", "suture", "--clock", "stepped", "--advance", spec.config.advance)
     views = ("--view", ",".join(agent.cameras), "--size", str(agent.image_size))

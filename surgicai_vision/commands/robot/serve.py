@@ -75,7 +75,7 @@ class Options:
     size: Annotated[int, IMAGE_SIZE] = 224
     image_rate: Annotated[
         float, Parameter(validator=validators.Number(gt=0, lte=100), metavar="HZ")
-    ] = 25.0
+    ] = 50.0
     compressed: bool = False
     advance: Annotated[str, Parameter(choices=ADVANCES)] = ADVANCES[0]
     record: Annotated[Path | None, DIRECTORY, default_text("keep nothing")] = None
