@@ -6,8 +6,9 @@ Interface:
   vectors and features and never acts.
 
 Each slot plans by itself, in a batch of one and with random numbers of its own seed and step, so
-that a result depends neither on the batch nor on the processes. An image is encoded only when a
-plan needs it. `restart` forgets what is planned.
+that a result depends neither on the batch nor on the processes. An image is looked at and encoded
+when it is seen, and only where this plan or a later one needs it: an env that renders its images
+when they are looked at cannot show one later. `restart` forgets what is planned.
 """
 
 from collections import deque
@@ -27,6 +28,19 @@ SEED_STRIDE = 1_000_003
 """A prime beyond any step limit: no two steps of two episodes draw the same numbers."""
 
 
+@dataclass(frozen=True)
+class _Moment:
+    """What is kept of an observation.
+
+    Attributes:
+        features: of its images (F,), float32; None where no plan needs them, or without views.
+        vector: what stands beside them (n,).
+    """
+
+    features: NDArray[np.float32] | None
+    vector: NDArray[np.float32]
+
+
 @dataclass
 class _Episode:
     """What a slot remembers.
@@ -34,12 +48,12 @@ class _Episode:
     Attributes:
         seed: the episode's.
         tick: control steps since its subtask began.
-        past: the last observations with what stood beside them, the present one last.
+        past: the last moments, the present one last.
         plans: (tick at which it was made, its actions (chunk, 7)), the oldest first.
     """
 
     seed: int
-    past: deque[tuple[Observation, NDArray[np.float32]]]
+    past: deque[_Moment]
     tick: int = 0
     plans: list[tuple[int, NDArray[np.float32]]] = field(default_factory=list)
 
@@ -88,8 +102,9 @@ class ChunkAgent(Agent):
         with one_thread():
             ticks = [episode.tick for episode in episodes]
             vectors = self._senses.vectors(robots, observations, ticks)
-            for episode, observation, vector in zip(episodes, observations, vectors, strict=True):
-                episode.past.append((observation, vector))
+            features = self._features(episodes, observations)
+            for episode, seen, vector in zip(episodes, features, vectors, strict=True):
+                episode.past.append(_Moment(seen, vector))
             self._plan([episode for episode in episodes if self._is_due(episode)])
         actions = [self._action(episode) for episode in episodes]
         for episode in episodes:
@@ -100,29 +115,49 @@ class ChunkAgent(Agent):
         """Return True if a new plan is to be made now."""
         return not episode.plans or episode.tick - episode.plans[-1][0] >= self._policy.execute
 
-    def _plan(self, episodes: Sequence[_Episode]) -> None:
-        """Plan for some slots; all their images are encoded at once."""
+    def _is_planned_from(self, tick: int) -> bool:
+        """Return True if a plan sees the observation of `tick`: its own or a later one.
+
+        Plans are made every `execute` control steps from the first on.
+        """
         policy = self._policy
-        histories = [self._history(episode) for episode in episodes]
-        if not histories:
-            return
-        features = None
-        if self._sees:
-            seen = [observation for history in histories for observation, _ in history]
-            encoded = self._senses.features(seen)
+        return any(
+            (tick + moment * policy.spacing) % policy.execute == 0
+            for moment in range(policy.history)
+        )
+
+    def _features(
+        self, episodes: Sequence[_Episode], observations: Sequence[Observation]
+    ) -> list[NDArray[np.float32] | None]:
+        """Return each observation's features (F,), None where no plan needs them.
+
+        The images of all slots are encoded at once.
+        """
+        rows: list[NDArray[np.float32] | None] = [None] * len(episodes)
+        needed = [
+            row for row, episode in enumerate(episodes) if self._is_planned_from(episode.tick)
+        ]
+        if self._sees and needed:
+            encoded = self._senses.features([observations[row] for row in needed])
             assert encoded is not None, "a policy with views has an encoder"
-            features = encoded.reshape(len(histories), policy.history, -1)
-        for row, (episode, history) in enumerate(zip(episodes, histories, strict=True)):
-            vectors = np.stack([vector for _, vector in history])
-            chunk = policy.plan(
-                None if features is None else features[row : row + 1],
-                vectors[None],
+            for row, features in zip(needed, encoded, strict=True):
+                rows[row] = features
+        return rows
+
+    def _plan(self, episodes: Sequence[_Episode]) -> None:
+        """Plan for some slots, each from its own moments."""
+        for episode in episodes:
+            history = self._history(episode)
+            features = [moment.features for moment in history if moment.features is not None]
+            chunk = self._policy.plan(
+                np.stack(features)[None] if features else None,
+                np.stack([moment.vector for moment in history])[None],
                 episode.seed * SEED_STRIDE + episode.tick,
             )[0]
             kept = [(tick, plan) for tick, plan in episode.plans if episode.tick - tick < len(plan)]
             episode.plans = [*kept, (episode.tick, chunk)]
 
-    def _history(self, episode: _Episode) -> list[tuple[Observation, NDArray[np.float32]]]:
+    def _history(self, episode: _Episode) -> list[_Moment]:
         """Return the moments that the policy sees, the present one last.
 
         At the start the first stands for what came before.

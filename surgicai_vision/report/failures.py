@@ -19,8 +19,8 @@ QUALITY = 80
 def failure_sheet(groups: Sequence[Group], reel: Reel) -> bytes | None:
     """Return a JPEG with failures of the best policy of each task; None without a strip.
 
-    Each kind of failure stands once, as its policy's first view saw it; frames are evenly spaced
-    over the episode.
+    Each kind of failure stands once, in the view of its strip; frames are evenly spaced over the
+    episode.
     """
     strips = list(_failures(groups, reel))[:MOST]
     if not strips:

@@ -85,7 +85,7 @@ def _strip(choice: Choice | None, kind: str) -> dict[str, object]:
         }
     row = choice.row
     condition = choice.group.condition
-    view = next(iter(condition.views), "front")
+    view = choice.view
     film = read_film(choice.result.folder, row["seed"])
     with contact_sheet.state_renderer(choice.result.config, SIZE) as image:
         frames = [

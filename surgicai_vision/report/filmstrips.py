@@ -30,6 +30,8 @@ BUDGET = 4_000_000
 """Characters of base64 that all strips together may take: with the rest the page stays below 8
 MB.
 """
+WHOLE_VIEW = "front"
+"""View in which whole procedures are shown: a crop about one arm misses what the other one does."""
 MOST_STRIPS = 160
 COMPARED = 5
 """Policies whose rollouts from one start stand beside each other."""
@@ -47,6 +49,13 @@ class Choice:
     def identity(self) -> tuple[str, int]:
         """What tells the episode from all others."""
         return str(self.result.folder), self.row["seed"]
+
+    @property
+    def view(self) -> str:
+        """The view it is shown in: the policy's first, for whole procedures `WHOLE_VIEW`."""
+        condition = self.group.condition
+        seen = () if condition.task == names.SUTURE else condition.views
+        return next(iter(seen), WHOLE_VIEW)
 
 
 @dataclass(frozen=True)
@@ -184,8 +193,8 @@ def _render(choices: Sequence[Choice]) -> Iterator[Strip]:
 
 
 def _strip(choice: Choice, image: contact_sheet.Draw) -> Strip | None:
-    """Render one episode as the policy's first view saw it; None where no state of it was kept."""
-    view = next(iter(choice.group.condition.views), "front")
+    """Render one episode in its view; None where no state of it was kept."""
+    view = choice.view
     film = read_film(choice.result.folder, choice.row["seed"])
     if not len(film.steps):
         return None

@@ -1,6 +1,7 @@
 """Chunks of actions: their column, their policies, and how they are acted."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import final
@@ -17,6 +18,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import RunContext
+from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.dataset import open_dataset, render_demos
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.dataset.subset import of_subtask, with_frame_stride
@@ -214,6 +216,15 @@ def acting(recipe: ChunkRecipe) -> tuple[ChunkAgent, list[float]]:
     return ChunkAgent(policy, PolicyAgent("linear", policy, None, (), 32)), seeds
 
 
+class Brightness:
+    """An encoder: an image's mean."""
+
+    fingerprint = "brightness"
+
+    def __call__(self, frames: np.ndarray) -> np.ndarray:
+        return frames.reshape(len(frames), -1).mean(1, keepdims=True)
+
+
 def moved(agent: ChunkAgent, steps: int) -> list[float]:
     """Return the first value of each action while the arm moves by 1 a step."""
     arm = SimpleNamespace(agent_pos=lambda: np.full(7, arm.step, np.float32), step=0)
@@ -234,6 +245,45 @@ def test_the_beginning_of_a_chunk_is_executed_and_then_planned_anew() -> None:
     agent.reset(0, None, 7)
     moved(agent, 7)
     assert seeds[:3] == seeds[-3:]
+
+
+@pytest.mark.parametrize(
+    ("execute", "spacing", "history"), [(8, 5, 2), (3, 2, 3), (2, 5, 3), (4, 1, 1)]
+)
+def test_images_are_looked_at_while_they_can_be_shown(
+    execute: int, spacing: int, history: int
+) -> None:
+    recipe = replace(QUICK, chunk=8, execute=execute, frame_stride=spacing, history=history)
+    policy = Linear(recipe, ((1,),))
+    planned: list[list[float]] = []
+
+    def plan(features: np.ndarray, vectors: np.ndarray, seed: int) -> np.ndarray:
+        assert np.array_equal(features[0, :, 0], vectors[0, :, 0])
+        planned.append(features[0, :, 0].tolist())
+        return np.zeros((1, recipe.chunk, ACTIONS), np.float32)
+
+    policy.plan = plan  # type: ignore[method-assign,assignment]
+    agent = ChunkAgent(policy, PolicyAgent("seeing", policy, Brightness(), ("front",), 4))
+    agent.reset(0, None, 0)
+    arm = SimpleNamespace(agent_pos=lambda: np.full(7, arm.step, np.float32), step=0)
+    looked_at = []
+
+    def image(step: int) -> np.ndarray:
+        assert step == arm.step, "the env has moved on"
+        looked_at.append(step)
+        return np.full((4, 4, 3), step, np.uint8)
+
+    for arm.step in range(20):
+        agent.act([0], [arm], [LazyMapping({"front": partial(image, arm.step)}, {})])
+    due = range(0, 20, execute)
+    wanted = [
+        [max(0, tick - back * spacing) for back in range(history - 1, -1, -1)] for tick in due
+    ]
+    assert planned == wanted
+    # Nothing is looked at that no plan sees: the last steps' plans lie beyond the end.
+    ahead = range(0, 20 + spacing * history, execute)
+    seen = {max(0, tick - back * spacing) for tick in ahead for back in range(history)}
+    assert looked_at == sorted(step for step in seen if step < 20)
 
 
 def test_an_ensemble_is_the_weighted_mean_of_the_plans() -> None:
