@@ -24,6 +24,8 @@ TWIN_DELAYED = (*DETERMINISTIC, "policy_delay", "target_noise", "target_noise_cl
 HINDSIGHT = ("goals", "relabel_demand")
 CLONING = ("demo_share", "bc_weight", "q_filter", "normalise_q", "clip_q")
 OFFLINE = (*COMMON, "tau", "critics", "samples")
+CLONED: Mapping[str, JSON] = {"tau": 0.01, "learning_rate": 3e-4}
+"""Defaults with a cloning loss: at 1e-3 what was learned is lost again (docs/results/rl.md)."""
 
 
 @final
@@ -112,15 +114,21 @@ ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType(
         "ddpg-her": Algorithm(SB3, "DDPG", HER, (*DETERMINISTIC, *HINDSIGHT), {"critics": 1}),
         "sac-her": Algorithm(SB3, "SAC", HER, (*OFF_POLICY, *HINDSIGHT)),
         "td3-her": Algorithm(SB3, "TD3", HER, (*TWIN_DELAYED, *HINDSIGHT)),
-        "td3-bc": Algorithm(
-            SB3, "TD3", NAIR, (*TWIN_DELAYED, *CLONING), {"tau": 0.01}, needs_demos=True
-        ),
+        "td3-bc": Algorithm(SB3, "TD3", NAIR, (*TWIN_DELAYED, *CLONING), CLONED, needs_demos=True),
         "td3-her-bc": Algorithm(
             SB3,
             "TD3",
             NAIR,
             (*TWIN_DELAYED, *HINDSIGHT, *CLONING),
-            {"tau": 0.01},
+            CLONED,
+            needs_demos=True,
+        ),
+        "td3-her-bc-unfiltered": Algorithm(
+            SB3,
+            "TD3",
+            f"{NAIR}, without its Q-filter: demonstrations are cloned wherever they lead",
+            (*TWIN_DELAYED, *HINDSIGHT, *CLONING),
+            {**CLONED, "q_filter": False},
             needs_demos=True,
         ),
         "rlpd": Algorithm(

@@ -3,12 +3,16 @@
 `train(request, demos, out)` goes on where it was broken off: a kill costs at most the steps since
 the last training state, and the result is what it would have been. See the package's docstring for
 the folder.
+
+The policy that is kept is that of the evaluation with the most successes from validation starts,
+of equals the last: learning goes up and down, and where it happens to end says little. Without
+`validation` it is the last.
 """
 
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,6 +55,8 @@ or holes, those that hindsight relabels mostly do not, and would lie ten deviati
 RANDOM_EPISODES = 5
 """Episodes of random actions that give the statistics of the inputs without demonstrations."""
 EVALUATED_AT_ONCE = 10
+Weights = Mapping[str, torch.Tensor]
+"""Names → parameters of an actor."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +239,7 @@ def _run(
     tensorboard: bool,
 ) -> Checkpoint:
     """Learn to the end, with an evaluation and a training state every so often."""
-    curve: list[Point] = _resume(learner, out)
+    curve, best = _resume(learner, out)
     log = _Log(out if tensorboard else None, learner)
     minutes = curve[-1].minutes if curve else 0.0
     if progress:
@@ -243,30 +249,39 @@ def _run(
         began = time.process_time()
         losses = learner.advance(target)
         minutes += (time.process_time() - began) / 60.0
-        curve.append(_evaluate(request, learner, minutes))
+        actor = actor_of(request, learner)
+        curve.append(_evaluate(request, actor, learner, minutes))
+        if curve[-1] == best_point(curve):
+            best = actor.state_dict()
         log.draw(curve[-1], losses)
         write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
         if learner.done < request.total:
-            _save(learner, curve, out)
+            _save(learner, curve, best, out)
         if progress:
             progress(min(learner.done, request.total), request.total)
     log.close()
-    return _write(request, learner, out)
+    return _write(request, best, learner.squash, best_point(curve), out)
 
 
-def _save(learner: Learner, curve: Sequence[Point], out: Path) -> None:
+def best_point(curve: Sequence[Point]) -> Point:
+    """Return the point whose policy is kept: the most successes, of equals the last."""
+    return max(reversed(curve), key=lambda point: point.successes)
+
+
+def _save(learner: Learner, curve: Sequence[Point], best: Weights, out: Path) -> None:
     """Write the training state, whole."""
     points = [dataclasses.asdict(point) for point in curve]
-    write_state(out, {"learner": learner.get_state(), "curve": points})
+    state = {"learner": learner.get_state(), "curve": points, "best": dict(best)}
+    write_state(out, state)
 
 
-def _resume(learner: Learner, out: Path) -> list[Point]:
-    """Go on from the training state, if there is a whole one; return the curve so far."""
+def _resume(learner: Learner, out: Path) -> tuple[list[Point], Weights]:
+    """Go on from the training state, if there is a whole one; return the curve and the best."""
     state = read_state(out)
     if state is None:
-        return []
+        return [], {}
     learner.set_state(state["learner"])
-    return [Point(**point) for point in state["curve"]]
+    return [Point(**point) for point in state["curve"]], state["best"]
 
 
 class _Log:
@@ -327,7 +342,7 @@ def actor_of(request: Request, learner: Learner) -> Policy:
     return actor
 
 
-def _evaluate(request: Request, learner: Learner, minutes: float) -> Point:
+def _evaluate(request: Request, actor: Policy, learner: Learner, minutes: float) -> Point:
     """Count successes from validation starts, with the generators left as they are."""
     steps = learner.done if request.algorithm.is_online else 0
     if not request.validation:
@@ -335,7 +350,7 @@ def _evaluate(request: Request, learner: Learner, minutes: float) -> Point:
     make = functools.partial(
         PolicyAgent,
         request.algo,
-        actor_of(request, learner),
+        actor,
         None,
         (),
         IMAGE_SIZE,
@@ -370,14 +385,13 @@ def run_of(request: Request) -> RunConfig:
     )
 
 
-def _write(request: Request, learner: Learner, out: Path) -> Checkpoint:
-    """Write the trained actor."""
-    actor = actor_of(request, learner)
-    if not all(torch.isfinite(parameter).all() for parameter in actor.parameters()):
+def _write(request: Request, weights: Weights, squash: str, kept: Point, out: Path) -> Checkpoint:
+    """Write the actor of these weights, those of the point that is kept."""
+    if not all(torch.isfinite(weight).all() for weight in weights.values()):
         raise InputError(
             f"'{request.algo}' diverged: weights are not finite; lower the learning rate."
         )
-    recipe = actor_recipe(request, learner.squash)
+    recipe = actor_recipe(request, squash)
     checkpoint = Checkpoint(
         run=run_of(request),
         recipe=to_mapping(recipe),
@@ -386,11 +400,11 @@ def _write(request: Request, learner: Learner, out: Path) -> Checkpoint:
         proprioception=False,
         epoch=0,
         dataset=request.demos,
-        frames=learner.done,
+        frames=kept.env_steps or kept.updates,
         validation_episodes=(),
         train_losses=(),
         validation_losses=(),
         device="cpu",
         code_version=__version__,
     )
-    return write_checkpoint(out, checkpoint, actor.state_dict())
+    return write_checkpoint(out, checkpoint, weights)

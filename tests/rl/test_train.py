@@ -58,11 +58,11 @@ def request_of(algo, demos, task="grasp", **changes):
 def test_every_algorithm_leaves_a_policy_that_acts_as_the_librarys(algo, demos, tmp_path):
     request, paths = request_of(algo, demos)
     kept = []
-    original = training._write
+    original = training._evaluate
 
-    def write(asked, learner, out):
+    def evaluate(asked, actor, learner, minutes):
         kept.append(library_actions(learner, seen))
-        return original(asked, learner, out)
+        return original(asked, actor, learner, minutes)
 
     env = envs.make(request.env, "goal")
     shown = envs.make(request.env, "relative")
@@ -71,13 +71,13 @@ def test_every_algorithm_leaves_a_policy_that_acts_as_the_librarys(algo, demos, 
     moves = np.random.default_rng(0).uniform(-1, 1, (5, 7)).astype(np.float32)
     seen = [(env.step(move)[0], shown.step(move)[0]) for move in moves]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "_write", write)
+        patch.setattr(training, "_evaluate", evaluate)
         checkpoint = train(request, paths, tmp_path / "out", tensorboard=False)
     policy = load_policy(tmp_path / "out")
     assert policy.inputs.vector == (VECTORS["relative"],)
     ours = policy.act(None, np.stack([relative for _, relative in seen]))
     assert np.abs(ours).max() <= 1
-    assert np.allclose(ours, kept[0], atol=2e-5)
+    assert np.allclose(ours, kept[-1], atol=2e-5)
     assert checkpoint.run.algo == algo and checkpoint.run.name == f"{algo}-relative"
     assert set(checkpoint.recipe["settings"]) == set(ALGORITHMS[algo].settings)
     spec = open_policy(tmp_path / "out")
@@ -135,6 +135,32 @@ def test_a_killed_training_ends_as_if_it_had_not_been_killed(algo, demos, tmp_pa
     )
     assert 0 < started[0] < request.total  # it went on
     assert resumed.policy_sha256 == whole.policy_sha256
+
+
+@pytest.mark.parametrize("killed_at", [None, 36])
+def test_the_policy_kept_is_that_of_the_most_successes(killed_at, tmp_path, monkeypatch):
+    request = replace(request_of("td3", {})[0], save_every=12)
+    successes = {12: 1, 24: 3, 36: 3, 48: 2}
+    seen = {}
+
+    def evaluate(asked, actor, learner, minutes):
+        seen[learner.done] = {name: value.clone() for name, value in actor.state_dict().items()}
+        count = successes[learner.done]
+        return training.Point(learner.done, learner.updates, minutes, count, 5, 1.0)
+
+    def kill(done, total, unit=""):
+        if done == killed_at:
+            raise Killed
+
+    monkeypatch.setattr(training, "_evaluate", evaluate)
+    if killed_at:
+        with pytest.raises(Killed):
+            train(request, [], tmp_path / "out", progress=kill, tensorboard=False)
+    checkpoint = train(request, [], tmp_path / "out", tensorboard=False)
+    assert sorted(seen) == sorted(successes) and checkpoint.frames == 36
+    kept = load_policy(tmp_path / "out").state_dict()
+    assert all(torch.equal(kept[name], value) for name, value in seen[36].items())
+    assert not all(torch.equal(kept[name], value) for name, value in seen[48].items())
 
 
 def test_workers_change_no_result(demos, tmp_path):
