@@ -77,6 +77,11 @@ class SuturingEnv(gymnasium.Env):
         view: what it shows.
         render_mode: None, "rgb_array", or "human": it shows itself (`envs.live.human`).
         truncates: end episodes at `config.max_steps`; False where gymnasium's `TimeLimit` does.
+
+    Attributes:
+        success_steps: control steps for which the success of a task of one subtask must hold before
+            it counts; 1 is the paper's. Learners set it that want to know what comes after
+            (`rl.settings`); the whole procedure has `config.DWELL`.
     """
 
     # gymnasium declares no ClassVar
@@ -99,6 +104,7 @@ class SuturingEnv(gymnasium.Env):
         self.view = view
         self.render_mode = render_mode
         self._truncates = truncates
+        self.success_steps = 1
         self.scene = build_scene(config.scene)
         axes = config.randomisation
         self.simulation = Simulation(self.scene, own_model=bool(axes.on), latency=axes.latency)
@@ -551,6 +557,10 @@ class SuturingEnv(gymnasium.Env):
 
     def _progress(self, info: Info) -> bool:
         """Go on to the next subtask, where a task has several; return True if so."""
+        if self.success_steps > 1:
+            state = self.simulation.task_state
+            state.dwell = state.dwell + 1 if info["is_success"] else 0
+            info["is_success"] = state.dwell >= self.success_steps
         return False
 
 

@@ -3,8 +3,10 @@
 `DecisionEnv` is the whole procedure with one decision a step: a subtask is chosen, its policy moves
 its arm until the subtask's measured success has held or its steps are over
 (`evaluation.hierarchical`, `termination: privileged`), and the next is chosen. What is observed is
-what a robot measures: pose and jaw of both arms, (14,). The reward is 0 for a decision that solved
-the subtask that was due and -1 for any other; the paper does not say its own.
+what a robot measures: pose and jaw of both arms, (14,). The reward is 1 for a decision that solved
+the subtask that was due; any other gives 0 and ends the episode, since from where it leaves the
+arms hardly a decision is right, and what is due would be met once in so many. The paper does not
+say its own.
 
     train_high_level(HighLevelRequest(HierarchicalConfig(hlp="order", grasp="outputs/train/…", …,
                                       termination="privileged")), out)
@@ -146,9 +148,10 @@ class DecisionEnv(gymnasium.Env[Vector, np.int64]):
                 break
         success = bool(info.get("is_success", False))
         solved = success or env.simulation.task_state.done > due
+        terminated = terminated or not solved
         truncated = truncated or self._decisions >= self.config.decisions
         about = {"is_success": success, "progress": env.simulation.task_state.done}
-        return env.both_arms(), float(solved) - 1.0, terminated, truncated, about
+        return env.both_arms(), float(solved), terminated, truncated, about
 
     def _has_ended(self, subtask: int) -> bool:
         """Return True if the present subtask's success has held, as a privileged end has it."""

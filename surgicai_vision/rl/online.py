@@ -75,6 +75,7 @@ class OnlineLearner(Learner):
         has_goal = request.algorithm.has_hindsight
         obs_type = "goal" if has_goal else request.observation
         self.env = SuturingVecEnv.of(request.env, obs_type, settings.envs, workers)
+        self.env.set_attr("success_steps", settings.success_steps)
         self.model = self._model()
         if transitions is not None:
             buffer = self._buffer

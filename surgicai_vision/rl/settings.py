@@ -52,6 +52,9 @@ class Settings:
         clip_q: clip targets to the range of a return of the reward, [-1 / (1 - γ), 0].
         rollout: steps of all envs from update to update (PPO).
         samples: actions sampled a state by BCQ and Cal-QL (their papers' code: 100 and 10).
+        success_steps: control steps for which success must hold before an episode of learning, or
+            a demonstration, ends. With 1, the paper's, nothing is learned of what comes after, and
+            the next subtask of a whole procedure finds it unfinished (`config.DWELL`).
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -77,6 +80,7 @@ class Settings:
     clip_q: bool = True
     rollout: int = 2048
     samples: int = 10
+    success_steps: int = 1
 
     def __post_init__(self) -> None:
         check_name("relabel_demand", self.relabel_demand, DEMANDS)
@@ -91,6 +95,7 @@ class Settings:
             goals=self.goals,
             rollout=self.rollout,
             samples=self.samples,
+            success_steps=self.success_steps,
         )
         for name in ("gamma", "tau", "demo_share", "bc_weight"):
             if not 0 < getattr(self, name) < 1:

@@ -180,7 +180,8 @@ def _learner(request: Request, demos: Sequence[Path], workers: int) -> Learner:
     transitions = None
     if algorithm.needs_demos:
         obs_type = "goal" if algorithm.has_hindsight else request.observation
-        transitions = of_demos(demos, request.env, obs_type)
+        steps = request.settings.success_steps
+        transitions = of_demos(demos, request.env, obs_type, success_steps=steps)
     mean, std = _statistics(request, transitions)
     if algorithm.is_online:
         from surgicai_vision.rl.online import OnlineLearner

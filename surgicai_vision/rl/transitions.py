@@ -113,6 +113,7 @@ def of_demos(
     config: TaskConfig | None = None,
     obs_type: str = "relative",
     progress: Progress | None = None,
+    success_steps: int = 1,
 ) -> Transitions:
     """Replay demonstrations and return their transitions.
 
@@ -122,6 +123,7 @@ def of_demos(
             those they were recorded in. None takes the recorded one.
         obs_type: what is observed, one of `OBS_TYPES`.
         progress: called with (demonstrations done, in all).
+        success_steps: control steps for which success must hold before an episode ends.
 
     Raises:
         InputError: demonstrations of another task, scene, step size or randomisation, or none that
@@ -138,6 +140,7 @@ def of_demos(
         demo = read_demo(path)
         config = config or demo.config
         env = env or envs.make(config, obs_type)
+        env.success_steps = success_steps
         _check(path, demo, env)
         episode = _replay(env, demo)
         if episode.terminated:
@@ -150,7 +153,8 @@ def of_demos(
     if not episodes:
         raise InputError(
             f"None of {len(paths)} demonstrations succeeds when it is replayed with these options; "
-            "record them in this env, or leave the options out."
+            "record them in this env, or leave the options out; where a success must hold, record "
+            "what comes after it (--post-success-steps)."
         )
     return Transitions(
         config=config,
@@ -198,7 +202,7 @@ def _check(path: Path, demo: Demo, env: SuturingEnv) -> None:
 
 
 def _replay(env: SuturingEnv, demo: Demo) -> _Episode:
-    """Take a demonstration's executed actions from its first state to its first success."""
+    """Take a demonstration's executed actions from its first state to its success."""
     executed = demo.action if demo.executed is None else demo.executed
     repeat = env.config.action_repeat
     env.set_state_vector(demo.state[0])

@@ -8,9 +8,11 @@ import pytest
 
 from surgicai_vision.commands.sweep import grid_file, read_experiment
 from surgicai_vision.core import names
+from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.evaluation.storage import GRID_FILE, read_evaluation
+from surgicai_vision.experiments.sweep import rl_jobs
 from surgicai_vision.experiments.sweep.driver import run_sweep
 from surgicai_vision.experiments.sweep.plan import CACHED, Jobs, plan, read_experiment_of, run_key
 from surgicai_vision.experiments.sweep.rl_grid import RLGrid
@@ -19,7 +21,7 @@ from surgicai_vision.rl.algorithms import ALGORITHMS
 
 SHIPPED = {
     "rl-online": 8 * 2 * 3,
-    "rl-demonstrations": 3 * 5 * 3,
+    "rl-demonstrations": 4 * 5 * 3,
     "rl-offline": 5 * 5 * 3,
     "rl-ten-demonstrations": 5 * 2 * 3,
     "rl-hierarchy": 5 * 3 + 3,
@@ -52,6 +54,9 @@ def test_a_whole_procedure_shares_the_actors_of_its_seed(tmp_path):
     jobs = Jobs(grid, tmp_path)
     keys = {jobs.policy(part).key() for part in parts.values()}
     assert len(keys) == 5 and set(jobs.run(last).inputs) == keys
+    for run in (run for run in actors if run.task != names.SUTURE):  # not trained again
+        assert jobs.run(run).inputs == tuple(jobs.policy(p).key() for p in grid.parts(run).values())
+        assert len(jobs.run(run).inputs) == 1
 
 
 @pytest.mark.parametrize(
@@ -107,6 +112,37 @@ def test_a_killed_sweep_goes_on_inside_the_training(tmp_path, monkeypatch):
     again = run_sweep(grid, tmp_path / "killed", RunContext(0))
     assert saved == [2, 4]  # not from the beginning
     assert again["done"] == 1 and again["digest"] == whole["digest"]
+
+
+def test_an_actor_trained_before_is_counted_and_not_trained_again(tmp_path, monkeypatch):
+    grid = RLGrid(
+        ("grasp",), ("bc",), demonstrations=(1,), updates=4, validation=0, save_every=4, episodes=1
+    )
+    run_sweep(grid, tmp_path / "sweep", RunContext(0))
+    (run,) = grid.runs
+    before = tmp_path / "sweep" / "runs" / run_key(run)
+
+    def train(*arguments, **options):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(rl_jobs, "train", train)
+    rl_jobs.train_and_evaluate(
+        tmp_path / "again",
+        to_mapping(run),
+        str(tmp_path / "again"),
+        {"grasp": str(before / "policy")},
+        decisions=0,
+        validation=0,
+        save_every=4,
+        demos="",
+        scratch=str(tmp_path / "scratch"),
+        command="",
+        environment={},
+    )
+    weights = "policy/policy.safetensors"
+    assert (tmp_path / "again" / weights).read_bytes() == (before / weights).read_bytes()
+    stored = read_evaluation(tmp_path / "again" / "evaluation")
+    assert stored.summary == read_evaluation(before / "evaluation").summary
 
 
 def test_a_sweep_trains_counts_and_is_not_done_twice(tmp_path):

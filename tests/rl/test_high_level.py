@@ -31,7 +31,7 @@ def test_decisions_in_order_are_the_hierarchical_policy_that_takes_them_in_order
     for subtask in range(len(names.SUBTASKS)):
         assert env.phase == subtask
         seen, reward, terminated, truncated, info = env.step(np.int64(subtask))
-        assert reward == 0 and not truncated and env.observation_space.contains(seen)
+        assert reward == 1 and not truncated and env.observation_space.contains(seen)
         assert info["progress"] == subtask + 1
     assert terminated and info["is_success"]
     steps = env.control_steps
@@ -40,17 +40,15 @@ def test_decisions_in_order_are_the_hierarchical_policy_that_takes_them_in_order
     assert episode.row.success and episode.row.steps == steps
 
 
-def test_a_decision_that_solves_nothing_costs_one_and_takes_its_steps():
-    short = dataclasses.replace(EXPERTS, steps=5, decisions=3)
+@pytest.mark.parametrize("subtask", range(len(names.SUBTASKS)))
+def test_a_decision_that_solves_nothing_earns_nothing_and_ends_the_episode(subtask):
+    short = dataclasses.replace(EXPERTS, steps=5)
     task = TaskConfig(names.SUTURE, max_steps=2000)
     env = DecisionEnv(short, task, [BASELINES["zero"]() for _ in names.SUBTASKS])
     env.reset(seed=0)
-    ends = []
-    for subtask in (2, 0, 4):
-        _, reward, terminated, truncated, _ = env.step(np.int64(subtask))
-        assert reward == -1 and not terminated
-        ends.append(truncated)
-    assert ends == [False, False, True] and env.control_steps == 15
+    _, reward, terminated, truncated, info = env.step(np.int64(subtask))
+    assert (reward, terminated, truncated) == (0, True, False)
+    assert not info["is_success"] and env.control_steps == 5
     env.close()
 
 

@@ -75,6 +75,21 @@ def test_options_of_the_env_hold_in_the_replay(demos):
         of_demos(list_demos(demos["grasp"]), TaskConfig("insert"))
 
 
+@pytest.mark.parametrize("task", ["grasp", "insert"])
+def test_a_success_that_must_hold_ends_a_demonstration_so_many_steps_later(demos, task):
+    paths = list_demos(demos[task])
+    plain = of_demos(paths)
+    held = of_demos(paths, success_steps=3)
+    assert held.episodes == 2 and len(held) >= len(plain) + 2 * 2
+    for episode in range(2):
+        met = int(np.argmax(read_demo(paths[episode]).success)) + 1
+        rewards = held.reward[held.episode == episode]
+        assert len(rewards) >= met + 2
+        assert rewards[-1] == 0 and (rewards[:-1] == -1).all()
+    with pytest.raises(InputError, match="--post-success-steps"):
+        of_demos(paths, success_steps=9)
+
+
 def test_what_is_written_is_read(demos, tmp_path):
     found = of_demos(list_demos(demos["grasp"]), obs_type="goal")
     write_transitions(tmp_path / "a.npz", found)

@@ -176,11 +176,24 @@ class RLGrid:
             task: DatasetConfig(
                 self.config(task),
                 Demonstrations(
-                    task, task, max(self.demonstrations), (), noise=self.noise, frame_stride=1
+                    task,
+                    task,
+                    max(self.demonstrations),
+                    (),
+                    noise=self.noise,
+                    post_success_steps=self._post_success_steps,
+                    frame_stride=1,
                 ),
             )
             for task in self.task
         }
+
+    @property
+    def _post_success_steps(self) -> int:
+        """Return the control steps recorded after a success, where one must hold: twice as many."""
+        changed = (settings_of(algo, read_changes(self._changes(algo))) for algo in self.algo)
+        most = max(settings.success_steps for settings in changed)
+        return 2 * most if most > 1 else 0
 
     @property
     def accept_licence(self) -> bool:
@@ -197,13 +210,12 @@ class RLGrid:
         return run.task
 
     def parts(self, run: RunConfig) -> Mapping[str, Training]:
-        """Return the actors of a whole procedure, which are trained once and shared."""
-        if not run.is_hierarchical:
+        """Return the actors of a whole procedure, trained once; the rows of actors share them."""
+        if not self.hierarchical:
             return {}
-        return {
-            task: Training(replace(run, env=self.config(task), termination=None, starts=None), task)
-            for task in names.SUBTASKS
-        }
+        actor = replace(run, termination=None, starts=None)
+        tasks = names.SUBTASKS if run.is_hierarchical else (run.task,)
+        return {task: Training(replace(actor, env=self.config(task)), task) for task in tasks}
 
     def needs(self, run: RunConfig) -> str:
         """Return "": a grid lists nothing that it cannot run."""

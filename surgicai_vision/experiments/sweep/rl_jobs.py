@@ -57,18 +57,25 @@ def train_and_evaluate(
     command: str,
     environment: Mapping[str, str],
 ) -> None:
-    """Job "sweep-rl": train an actor, or PPO over actors made before, and count its successes."""
+    """Job "sweep-rl": train an actor, or PPO over actors made before, and count its successes.
+
+    An actor that whole procedures share was trained before, and is counted alone here.
+    """
     os.environ.update(environment)
     what = from_mapping(RunConfig, run)
+    trained = Path(scratch) / POLICY
     seconds: dict[str, float] = {}
     with timed(silent_stage, seconds) as measured:
         with measured("policy", "steps"):
             if what.is_hierarchical:
                 spec = _procedure(what, policies, decisions, validation, Path(scratch))
             else:
-                trained = _train(what, demos, validation, save_every, Path(scratch))
+                if policies:
+                    trained = Path(policies[what.task])
+                else:
+                    _train(what, demos, validation, save_every, Path(scratch))
                 spec = open_policy(trained, task=what.task)
-        shutil.copytree(Path(scratch) / POLICY, folder / POLICY)
+        shutil.copytree(trained, folder / POLICY)
         place = str(Path(final) / POLICY)
         kept: dict[str, JSON] = {"command": command, "folder": place}
         if what.is_hierarchical:
