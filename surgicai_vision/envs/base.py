@@ -81,7 +81,8 @@ class SuturingEnv(gymnasium.Env):
     Attributes:
         success_steps: control steps for which the success of a task of one subtask must hold before
             it counts; 1 is the paper's. Learners set it that want to know what comes after
-            (`rl.settings`); the whole procedure has `config.DWELL`.
+            (`rl.settings`); the whole procedure has `config.DWELL`. `compute_reward` knows goals
+            alone, and takes one that is reached for a success at once.
     """
 
     # gymnasium declares no ClassVar
@@ -558,10 +559,14 @@ class SuturingEnv(gymnasium.Env):
     def _progress(self, info: Info) -> bool:
         """Go on to the next subtask, where a task has several; return True if so."""
         if self.success_steps > 1:
-            state = self.simulation.task_state
-            state.dwell = state.dwell + 1 if info["is_success"] else 0
-            info["is_success"] = state.dwell >= self.success_steps
+            info["is_success"] = self._count_dwell(info["is_success"]) >= self.success_steps
         return False
+
+    def _count_dwell(self, holds: bool) -> int:
+        """Return the control steps for which something has held, this one with them."""
+        state = self.simulation.task_state
+        state.dwell = state.dwell + 1 if holds else 0
+        return state.dwell
 
 
 def _refuse_increments(config: TaskConfig) -> None:

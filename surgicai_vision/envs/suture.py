@@ -36,14 +36,14 @@ class Suture(SuturingEnv):
             return False
         state = self.simulation.task_state
         info["subtask_success"] = info["is_success"]
-        state.dwell = state.dwell + 1 if info["paper_success"] else 0
+        dwell = self._count_dwell(info["paper_success"])
         is_last = state.phase == len(self._subtasks) - 1
         if info["is_success"] and state.phase == state.done:
             state.done += 1
         info["progress"] = state.done
         info["is_success"] = is_last and info["is_success"]
         info["paper_success"] = is_last and info["paper_success"]
-        if is_last or state.dwell < DWELL:
+        if is_last or dwell < DWELL:
             return False
         self._make_present(state.phase + 1)
         return True

@@ -105,26 +105,20 @@ class ChunkAgent(Agent):
             features = self._features(episodes, observations)
             for episode, seen, vector in zip(episodes, features, vectors, strict=True):
                 episode.past.append(_Moment(seen, vector))
-            self._plan([episode for episode in episodes if self._is_due(episode)])
+            self._plan([episode for episode in episodes if self._is_due(episode.tick)])
         actions = [self._action(episode) for episode in episodes]
         for episode in episodes:
             episode.tick += 1
         return np.stack(actions)
 
-    def _is_due(self, episode: _Episode) -> bool:
-        """Return True if a new plan is to be made now."""
-        return not episode.plans or episode.tick - episode.plans[-1][0] >= self._policy.execute
+    def _is_due(self, tick: int) -> bool:
+        """Return True if a plan is made at `tick`: every `execute` control steps, from 0 on."""
+        return tick % self._policy.execute == 0
 
     def _is_planned_from(self, tick: int) -> bool:
-        """Return True if a plan sees the observation of `tick`: its own or a later one.
-
-        Plans are made every `execute` control steps from the first on.
-        """
+        """Return True if a plan sees the observation of `tick`: its own or a later one."""
         policy = self._policy
-        return any(
-            (tick + moment * policy.spacing) % policy.execute == 0
-            for moment in range(policy.history)
-        )
+        return any(self._is_due(tick + moment * policy.spacing) for moment in range(policy.history))
 
     def _features(
         self, episodes: Sequence[_Episode], observations: Sequence[Observation]

@@ -139,8 +139,9 @@ def of_demos(
     for index, path in enumerate(paths):
         demo = read_demo(path)
         config = config or demo.config
-        env = env or envs.make(config, obs_type)
-        env.success_steps = success_steps
+        if env is None:
+            env = envs.make(config, obs_type)
+            env.success_steps = success_steps
         _check(path, demo, env)
         episode = _replay(env, demo)
         if episode.terminated:

@@ -52,6 +52,18 @@ def test_a_decision_that_solves_nothing_earns_nothing_and_ends_the_episode(subta
     env.close()
 
 
+def test_an_episode_has_so_many_decisions():
+    env = DecisionEnv(
+        dataclasses.replace(EXPERTS, decisions=2),
+        TaskConfig(names.SUTURE, max_steps=2000),
+        [BASELINES["expert"]() for _ in names.SUBTASKS],
+    )
+    env.reset(seed=4)
+    ends = [env.step(np.int64(subtask))[2:4] for subtask in (0, 1)]
+    assert ends == [(False, False), (False, True)]
+    env.close()
+
+
 def request_of(**changes):
     low = HierarchicalConfig(
         hlp="order", **dict.fromkeys(names.SUBTASKS, "zero"), termination="privileged", steps=4,

@@ -63,17 +63,17 @@ def train_and_evaluate(
     """
     os.environ.update(environment)
     what = from_mapping(RunConfig, run)
-    trained = Path(scratch) / POLICY
     seconds: dict[str, float] = {}
     with timed(silent_stage, seconds) as measured:
         with measured("policy", "steps"):
             if what.is_hierarchical:
                 spec = _procedure(what, policies, decisions, validation, Path(scratch))
+                trained = Path(scratch) / POLICY
+            elif policies:
+                trained = Path(policies[what.task])
+                spec = open_policy(trained, task=what.task)
             else:
-                if policies:
-                    trained = Path(policies[what.task])
-                else:
-                    _train(what, demos, validation, save_every, Path(scratch))
+                trained = _train(what, demos, validation, save_every, Path(scratch))
                 spec = open_policy(trained, task=what.task)
         shutil.copytree(trained, folder / POLICY)
         place = str(Path(final) / POLICY)
