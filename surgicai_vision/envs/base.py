@@ -44,7 +44,7 @@ from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.envs.observation import ObservationConfig
 from surgicai_vision.envs.relative import relative_features
 from surgicai_vision.envs.simulation import SUBSTEPS, Simulation
-from surgicai_vision.envs.subtask import Subtask
+from surgicai_vision.envs.subtask import Subtask, Tolerance
 from surgicai_vision.envs.success import Info, Target, measure, meets_demands
 from surgicai_vision.scene import build_scene
 from surgicai_vision.scene.rendering import Frame
@@ -83,6 +83,8 @@ class SuturingEnv(gymnasium.Env):
             it counts; 1 is the paper's. Learners set it that want to know what comes after
             (`rl.settings`); the whole procedure has `config.DWELL`. `compute_reward` knows goals
             alone, and takes one that is reached for a success at once.
+        tolerance_share: share of the tolerance within which a success counts; 1 is all of it.
+            Learners set it too: what stops at the edge has nothing left for a start it never saw.
     """
 
     # gymnasium declares no ClassVar
@@ -106,6 +108,7 @@ class SuturingEnv(gymnasium.Env):
         self.render_mode = render_mode
         self._truncates = truncates
         self.success_steps = 1
+        self.tolerance_share = 1.0
         self.scene = build_scene(config.scene)
         axes = config.randomisation
         self.simulation = Simulation(self.scene, own_model=bool(axes.on), latency=axes.latency)
@@ -390,6 +393,10 @@ class SuturingEnv(gymnasium.Env):
     def _target(self) -> Target:
         return self.subtask.target(self.simulation, self.stitch)
 
+    def tolerance(self) -> Tolerance:
+        """Return how near the present subtask's goal is near enough, `tolerance_share` of it."""
+        return self.subtask.tolerances[self.config.tolerance].scaled(self.tolerance_share)
+
     def reward(self, info: Info) -> float:
         """Return the reward of a measurement."""
         if self.config.reward == "sparse":
@@ -558,9 +565,17 @@ class SuturingEnv(gymnasium.Env):
 
     def _progress(self, info: Info) -> bool:
         """Go on to the next subtask, where a task has several; return True if so."""
+        if self.tolerance_share < 1:
+            info["is_success"] = info["is_success"] and self._is_within_share(info)
         if self.success_steps > 1:
             info["is_success"] = self._count_dwell(info["is_success"]) >= self.success_steps
         return False
+
+    def _is_within_share(self, info: Info) -> bool:
+        """Return True if the pose is within the share of the tolerance that counts."""
+        tolerance = self.tolerance()
+        near: bool = info["d_trans"] <= tolerance.distance and info["d_angle"] <= tolerance.angle
+        return near
 
     def _count_dwell(self, holds: bool) -> int:
         """Return the control steps for which something has held, this one with them."""

@@ -67,7 +67,7 @@ class GoalSuturingEnv(SuturingEnv):
     def _reached(self, achieved_goal: Goals, desired_goal: Goals) -> NDArray[np.bool_]:
         """Return whether goals are within the tolerance and what else they ask for holds."""
         distance, turn = observation.goal_errors(achieved_goal, desired_goal)
-        tolerance = self.subtask.tolerances[self.config.tolerance]
+        tolerance = self.tolerance()
         is_near = (distance <= tolerance.distance) & (turn <= tolerance.angle)
         return is_near & _meets(achieved_goal, desired_goal)
 

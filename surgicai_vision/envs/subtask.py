@@ -35,6 +35,10 @@ class Tolerance(NamedTuple):
         """Return a tolerance from mm and degrees."""
         return cls(millimetres / 1e3, math.radians(degrees))
 
+    def scaled(self, share: float) -> "Tolerance":
+        """Return so large a share of it."""
+        return Tolerance(share * self.distance, share * self.angle)
+
 
 @dataclass(frozen=True)
 class Demands:

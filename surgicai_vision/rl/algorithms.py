@@ -16,7 +16,7 @@ SB3 = "stable_baselines3"
 SB3_CONTRIB = "sb3_contrib"
 D3RLPY = "d3rlpy"
 
-COMMON = ("hidden", "learning_rate", "gamma", "batch_size", "success_steps")
+COMMON = ("hidden", "learning_rate", "gamma", "batch_size", "success_steps", "tolerance_share")
 ONLINE = (*COMMON, "envs")
 OFF_POLICY = (*ONLINE, "tau", "train_every", "updates", "learning_starts", "critics")
 DETERMINISTIC = (*OFF_POLICY, "exploration_noise")

@@ -76,6 +76,7 @@ class OnlineLearner(Learner):
         obs_type = "goal" if has_goal else request.observation
         self.env = SuturingVecEnv.of(request.env, obs_type, settings.envs, workers)
         self.env.set_attr("success_steps", settings.success_steps)
+        self.env.set_attr("tolerance_share", settings.tolerance_share)
         self.model = self._model()
         if transitions is not None:
             buffer = self._buffer

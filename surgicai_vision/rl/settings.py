@@ -55,6 +55,8 @@ class Settings:
         success_steps: control steps for which success must hold before an episode of learning, or
             a demonstration, ends. With 1, the paper's, nothing is learned of what comes after, and
             the next subtask of a whole procedure finds it unfinished (`config.DWELL`).
+        tolerance_share: share of the tolerance within which a success counts in learning. With 1,
+            the paper's, an actor learns to stop at the edge of the tolerance.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -81,6 +83,7 @@ class Settings:
     rollout: int = 2048
     samples: int = 10
     success_steps: int = 1
+    tolerance_share: float = 1.0
 
     def __post_init__(self) -> None:
         check_name("relabel_demand", self.relabel_demand, DEMANDS)
@@ -96,12 +99,15 @@ class Settings:
             rollout=self.rollout,
             samples=self.samples,
             success_steps=self.success_steps,
+            tolerance_share=self.tolerance_share,
         )
         for name in ("gamma", "tau", "demo_share", "bc_weight"):
             if not 0 < getattr(self, name) < 1:
                 raise InputError(
                     f"{name} is {getattr(self, name)}; it must be between 0 and 1, both left out."
                 )
+        if self.tolerance_share > 1:
+            raise InputError(f"tolerance_share is {self.tolerance_share}; it must be at most 1.")
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1.")
 

@@ -180,8 +180,14 @@ def _learner(request: Request, demos: Sequence[Path], workers: int) -> Learner:
     transitions = None
     if algorithm.needs_demos:
         obs_type = "goal" if algorithm.has_hindsight else request.observation
-        steps = request.settings.success_steps
-        transitions = of_demos(demos, request.env, obs_type, success_steps=steps)
+        settings = request.settings
+        transitions = of_demos(
+            demos,
+            request.env,
+            obs_type,
+            success_steps=settings.success_steps,
+            tolerance_share=settings.tolerance_share,
+        )
     mean, std = _statistics(request, transitions)
     if algorithm.is_online:
         from surgicai_vision.rl.online import OnlineLearner

@@ -114,6 +114,7 @@ def of_demos(
     obs_type: str = "relative",
     progress: Progress | None = None,
     success_steps: int = 1,
+    tolerance_share: float = 1.0,
 ) -> Transitions:
     """Replay demonstrations and return their transitions.
 
@@ -124,6 +125,7 @@ def of_demos(
         obs_type: what is observed, one of `OBS_TYPES`.
         progress: called with (demonstrations done, in all).
         success_steps: control steps for which success must hold before an episode ends.
+        tolerance_share: share of the tolerance within which a success counts.
 
     Raises:
         InputError: demonstrations of another task, scene, step size or randomisation, or none that
@@ -142,6 +144,7 @@ def of_demos(
         if env is None:
             env = envs.make(config, obs_type)
             env.success_steps = success_steps
+            env.tolerance_share = tolerance_share
         _check(path, demo, env)
         episode = _replay(env, demo)
         if episode.terminated:

@@ -161,10 +161,11 @@ class SuturingVecEnv(VecEnv):
         return [values[index] for index in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of all envs."""
+        """Set an attribute of all envs, and of the one that answers for them in this process."""
         if len(list(self._chosen(indices))) != self.num_envs:
             raise InputError("set_attr sets an attribute of all envs; leave indices out.")
         self._vector.set_attr(attr_name, [value] * self.num_envs)
+        setattr(self._local, attr_name, value)
 
     def env_method(
         self,

@@ -66,6 +66,8 @@ def test_a_whole_procedure_shares_the_actors_of_its_seed(tmp_path):
         ({"task": ("suture",)}, UnknownName),
         ({"change": {"bc": ["goals=3"]}}, UnknownName),
         ({"change": {"bc": "hidden=3"}}, InputError),
+        ({"change": {"grasp": ["goals=3"]}}, UnknownName),
+        ({"change": {"graps": ["gamma=0.9"]}}, UnknownName),
         ({"hierarchical": True}, InputError),
         ({"env_steps": 0}, InputError),
         ({"noise": 2.0}, InputError),
@@ -74,6 +76,24 @@ def test_a_whole_procedure_shares_the_actors_of_its_seed(tmp_path):
 def test_what_cannot_be_run_is_refused_at_once(changes, error):
     with pytest.raises(error):
         RLGrid(**{"task": ("grasp",), "algo": ("bc",), **changes})
+
+
+def test_a_task_has_changes_of_its_own_in_rows_and_procedures():
+    grid = RLGrid(
+        names.SUBTASKS,
+        ("td3-her-bc",),
+        change={"td3-her-bc": ["success_steps=15"], "pullout": ["tolerance_share=0.5"]},
+        hierarchical=True,
+    )
+    *actors, procedure = grid.runs
+    found = {run.task: run.changes for run in actors}
+    assert found.pop("pullout") == ("success_steps=15", "tolerance_share=0.5")
+    assert set(found.values()) == {("success_steps=15",)} == {procedure.changes}
+    parts = grid.parts(procedure)
+    for run in actors:
+        assert grid.parts(run)[run.task] == parts[run.task]
+        assert parts[run.task].run.changes == run.changes
+    assert "pullout with tolerance_share=0.5" in grid.text
 
 
 def test_tasks_algorithms_and_seeds_may_be_added_later():

@@ -10,7 +10,9 @@ from surgicai_vision import envs
 from surgicai_vision.commands.main import main
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.core.tasks import load_subtask
 from surgicai_vision.demos.store import list_demos, read_demo
+from surgicai_vision.envs.observation import goal_errors
 from surgicai_vision.rl import export
 from surgicai_vision.rl.transitions import (
     OBS_TYPES,
@@ -88,6 +90,23 @@ def test_a_success_that_must_hold_ends_a_demonstration_so_many_steps_later(demos
         assert rewards[-1] == 0 and (rewards[:-1] == -1).all()
     with pytest.raises(InputError, match="--post-success-steps"):
         of_demos(paths, success_steps=9)
+
+
+def test_a_share_of_the_tolerance_ends_a_demonstration_nearer_to_its_goal(demos):
+    paths = list_demos(demos["insert"])
+    tolerance = load_subtask("insert").tolerances["paper"]
+
+    def used(transitions):
+        last = transitions.next_observation
+        distance, turn = goal_errors(last["achieved_goal"], last["desired_goal"])
+        shares = np.maximum(distance / tolerance.distance, turn / tolerance.angle)
+        return shares[transitions.terminated].max()
+
+    plain = of_demos(paths, obs_type="goal")
+    share = float(0.99 * used(plain))
+    nearer = of_demos(paths, obs_type="goal", tolerance_share=share)
+    assert nearer.episodes == plain.episodes and len(nearer) > len(plain)
+    assert used(nearer) <= share < used(plain) <= 1
 
 
 def test_what_is_written_is_read(demos, tmp_path):

@@ -9,7 +9,8 @@ recorded once a task and not rendered; a run with fewer takes the first of them.
     demonstrations: [100]
     noise: 0.5
     env_steps: 50000                  # online; `updates` offline
-    change: {rlpd: ["critics=4"]}     # settings of one algorithm, as `train --change` takes them
+    change:                           # settings of an algorithm or a task, as `train --change`
+      rlpd: ["critics=4"]
     hierarchical: true                # the whole procedure, over the actors of each algorithm
     decisions: 1500                   # of PPO as its high-level policy (Table 3)
 
@@ -50,7 +51,8 @@ class RLGrid:
         observation: what the actors see of the state, "relative" or "state".
         env_steps: control steps of online algorithms.
         updates: updates of offline algorithms.
-        change: algorithm → its settings that are changed, "key=value" each.
+        change: algorithm, or task → settings that are changed for it, "key=value" each; a task's
+            come after an algorithm's, and every algorithm must read them.
         env: fields of `TaskConfig` for demonstrations, training and evaluation alike.
         validation: episodes of each evaluation on the way, from validation starts.
         save_every: control steps (offline: updates) from one to the next, and between the states
@@ -84,10 +86,12 @@ class RLGrid:
     def __post_init__(self) -> None:
         for task in self.task:
             check_name("subtask", task, names.SUBTASKS)
-        for algo in (*self.algo, *self.change):
-            check_name("algo", algo, ALGORITHMS)
         for algo in self.algo:
-            settings_of(algo, read_changes(self._changes(algo)))  # refuses what is not read
+            check_name("algo", algo, ALGORITHMS)
+        for key in self.change:
+            check_name("algo or subtask", key, (*ALGORITHMS, *names.SUBTASKS))
+        for algo, task in itertools.product(self.algo, self.task):
+            settings_of(algo, read_changes(self._changes(algo, task)))  # refuses what is not read
         check_name("observation", self.observation, OBSERVATIONS)
         check_name("bank of starts", self.starts, BANKS)
         Disturbance(self.noise)  # refuses what is not within 0 and 1
@@ -108,11 +112,15 @@ class RLGrid:
             )
         check_runs(self.runs)
 
-    def _changes(self, algo: str) -> tuple[str, ...]:
-        """Return the changed settings of an algorithm."""
-        changes = self.change.get(algo, ())
+    def _changes(self, algo: str, task: str) -> tuple[str, ...]:
+        """Return the changed settings of an algorithm on a task."""
+        return (*self._changes_of(algo), *self._changes_of(task))
+
+    def _changes_of(self, key: str) -> tuple[str, ...]:
+        """Return what `change` has for an algorithm or a task."""
+        changes = self.change.get(key, ())
         if not isinstance(changes, list | tuple):
-            raise InputError(f"change of '{algo}' is {changes!r}; give a list of KEY=VALUE.")
+            raise InputError(f"change of '{key}' is {changes!r}; give a list of KEY=VALUE.")
         return tuple(map(str, changes))
 
     @functools.cached_property
@@ -136,7 +144,7 @@ class RLGrid:
             policy=algorithm.policy,
             privileged=self.observation == "state",
             recipe=RECIPE,
-            changes=self._changes(algo),
+            changes=self._changes(algo, task),
             demonstrations=demonstrations if learns else None,
             demonstrator="expert" if learns else None,
             noise=self.noise if learns else 0.0,
@@ -153,7 +161,12 @@ class RLGrid:
             return
         for algo, count, seed in itertools.product(self.algo, self.demonstrations, self.seed):
             low = self._actor(algo, names.SUBTASKS[0], count, seed)
-            yield replace(low, env=self.config(names.SUTURE), termination="privileged")
+            yield replace(
+                low,
+                env=self.config(names.SUTURE),
+                changes=self._changes_of(algo),
+                termination="privileged",
+            )
 
     @property
     def bank(self) -> Starts:
@@ -181,17 +194,16 @@ class RLGrid:
                     max(self.demonstrations),
                     (),
                     noise=self.noise,
-                    post_success_steps=self._post_success_steps,
+                    post_success_steps=self._post_success_steps(task),
                     frame_stride=1,
                 ),
             )
             for task in self.task
         }
 
-    @property
-    def _post_success_steps(self) -> int:
+    def _post_success_steps(self, task: str) -> int:
         """Return the control steps recorded after a success, where one must hold: twice as many."""
-        changed = (settings_of(algo, read_changes(self._changes(algo))) for algo in self.algo)
+        changed = (settings_of(algo, read_changes(self._changes(algo, task))) for algo in self.algo)
         most = max(settings.success_steps for settings in changed)
         return 2 * most if most > 1 else 0
 
@@ -213,9 +225,11 @@ class RLGrid:
         """Return the actors of a whole procedure, trained once; the rows of actors share them."""
         if not self.hierarchical:
             return {}
-        actor = replace(run, termination=None, starts=None)
+        assert run.algo is not None
+        algo, count, seed = run.algo, run.demonstrations or 0, run.seed
         tasks = names.SUBTASKS if run.is_hierarchical else (run.task,)
-        return {task: Training(replace(actor, env=self.config(task)), task) for task in tasks}
+        actors = {task: self._actor(algo, task, count, seed) for task in tasks}
+        return {task: Training(replace(actor, starts=None), task) for task, actor in actors.items()}
 
     def needs(self, run: RunConfig) -> str:
         """Return "": a grid lists nothing that it cannot run."""
@@ -276,9 +290,9 @@ class RLGrid:
         if not all(kind.is_online for kind in kinds):
             parts.append(f"{self.updates:,} updates offline")
         changed = [
-            f"{algo} with {', '.join(self._changes(algo))}"
-            for algo in self.algo
-            if self._changes(algo)
+            f"{key} with {', '.join(self._changes_of(key))}"
+            for key in (*self.algo, *self.task)
+            if self._changes_of(key)
         ]
         starts = f"{self.episodes} {self.starts} starts from {self.bank.first_seed}"
         return "; ".join([*parts, f"observation {self.observation}", *changed, starts])
