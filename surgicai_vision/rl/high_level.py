@@ -13,7 +13,8 @@ say its own.
 
 leaves a checkpoint of the policy `hlp`, for the key `hlp:` of a hierarchical policy's file. Every
 training state begins new episodes, in a training that was killed as in one that was not, so that
-the same command gives the same result; the folder is that of `rl.train`.
+the same command gives the same result; the folder, and which policy is kept, are those of
+`rl.train`.
 """
 
 import dataclasses
@@ -49,7 +50,13 @@ from surgicai_vision.evaluation.slot import env_of
 from surgicai_vision.rl.extractor import StandardExtractor
 from surgicai_vision.rl.high_level_config import HighLevelRequest
 from surgicai_vision.rl.learner import linear, random_state, set_random_state
-from surgicai_vision.rl.train import CURVE, EVALUATED_AT_ONCE, IMAGE_SIZE
+from surgicai_vision.rl.train import (
+    CURVE,
+    EVALUATED_AT_ONCE,
+    IMAGE_SIZE,
+    Weights,
+    best_point,
+)
 from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
 from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
 from surgicai_vision.training.policies import policy_plugin
@@ -208,7 +215,7 @@ def _run(
     mean, std = _statistics(env)
     env.control_steps = 0
     model = _model(request, env, mean, std)
-    curve = _resume(model, env, out)
+    curve, best = _resume(model, env, out)
     minutes = curve[-1].minutes if curve else 0.0
     while model.num_timesteps < request.decisions:
         progress(model.num_timesteps, request.decisions)
@@ -220,12 +227,15 @@ def _run(
         chunk = min(request.save_every, request.decisions - model.num_timesteps)
         model.learn(chunk, reset_num_timesteps=False)
         minutes += (time.process_time() - began) / 60.0
-        curve.append(_evaluate(request, task, model, env, minutes))
+        policy = _policy(request, model)
+        curve.append(_evaluate(request, task, policy, model.num_timesteps, env, minutes))
+        if curve[-1] is best_point(curve):
+            best = policy.state_dict()
         write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
         if model.num_timesteps < request.decisions:
-            _save(model, env, curve, out)
+            _save(model, env, curve, best, out)
     progress(request.decisions, request.decisions)
-    return _write(request, task, model, env, out)
+    return _write(request, task, best, best_point(curve), env, out)
 
 
 def _model(
@@ -272,7 +282,7 @@ def _statistics(env: DecisionEnv) -> tuple[list[float], list[float]]:
 # -- the state -------------------------------------------------------------------------------------
 
 
-def _save(model: PPO, env: DecisionEnv, curve: Sequence[Point], out: Path) -> None:
+def _save(model: PPO, env: DecisionEnv, curve: Sequence[Point], best: Weights, out: Path) -> None:
     """Write the training state, whole."""
     state = {
         "parameters": model.get_parameters(),
@@ -281,38 +291,42 @@ def _save(model: PPO, env: DecisionEnv, curve: Sequence[Point], out: Path) -> No
         "control_steps": env.control_steps,
         "random": random_state(),
         "curve": [dataclasses.asdict(point) for point in curve],
+        "best": dict(best),
     }
     write_state(out, state)
 
 
-def _resume(model: PPO, env: DecisionEnv, out: Path) -> list[Point]:
-    """Go on from the training state, if there is a whole one; return the curve so far."""
+def _resume(model: PPO, env: DecisionEnv, out: Path) -> tuple[list[Point], Weights]:
+    """Go on from the training state, if there is a whole one; return the curve and the best."""
     state = read_state(out)
     if state is None:
-        return []
+        return [], {}
     model.set_parameters(state["parameters"], exact_match=True)
     model.num_timesteps = state["decisions"]
     model._n_updates = state["updates"]
     env.control_steps = state["control_steps"]
     set_random_state(state["random"])
-    return [Point(**point) for point in state["curve"]]
+    return [Point(**point) for point in state["curve"]], state["best"]
 
 
 # -- the policy ------------------------------------------------------------------------------------
 
 
-@torch.no_grad()
-def _policy(request: HighLevelRequest, model: PPO) -> tuple[Policy, Recipe]:
-    """Return the actor as a policy `hlp`, and its recipe."""
-    plugin = policy_plugin(HLP)
-    recipe = plugin.recipe(
+def _recipe(request: HighLevelRequest) -> Recipe:
+    """Return what a checkpoint says of its network and training."""
+    return policy_plugin(HLP).recipe(
         hidden=request.settings.hidden,
         batch_norm=False,
         learning_rate=request.settings.learning_rate,
         batch_size=request.settings.batch_size,
         validation=0.0,
     )
-    policy = plugin.make(recipe, ())
+
+
+@torch.no_grad()
+def _policy(request: HighLevelRequest, model: PPO) -> Policy:
+    """Return the actor as a policy `hlp`."""
+    policy = policy_plugin(HLP).make(_recipe(request), ())
     actor = [*linear(model.policy.mlp_extractor.policy_net), *linear(model.policy.action_net)]
     for own, given in zip(linear(policy), actor, strict=True):
         own.weight.copy_(given.weight)
@@ -320,17 +334,21 @@ def _policy(request: HighLevelRequest, model: PPO) -> tuple[Policy, Recipe]:
     extractor = cast(StandardExtractor, model.policy.features_extractor)
     policy.input_mean.copy_(extractor.mean)
     policy.input_std.copy_(extractor.std)
-    return policy.eval().requires_grad_(False), recipe
+    return policy.eval().requires_grad_(False)
 
 
 def _evaluate(
-    request: HighLevelRequest, task: TaskConfig, model: PPO, env: DecisionEnv, minutes: float
+    request: HighLevelRequest,
+    task: TaskConfig,
+    policy: Policy,
+    decisions: int,
+    env: DecisionEnv,
+    minutes: float,
 ) -> Point:
     """Count whole procedures from validation starts, by what is evaluated of the checkpoint too."""
     successes = 0
     stages = 0.0
     if request.validation:
-        policy, _ = _policy(request, model)
         high = functools.partial(PolicyAgent, HLP, policy, None, (), IMAGE_SIZE, (names.BOTH_ARMS,))
         low = [
             open_policy(path, task=subtask).make_agent for subtask, path in request.low.low.items()
@@ -341,7 +359,7 @@ def _evaluate(
         successes = sum(episode.row.success for episode in episodes)
         stages = float(np.mean([episode.row.stages for episode in episodes]))
     return Point(
-        decisions=model.num_timesteps,
+        decisions=decisions,
         env_steps=env.control_steps,
         minutes=minutes,
         successes=successes,
@@ -370,23 +388,27 @@ def run_of(request: HighLevelRequest, task: TaskConfig, env_steps: int | None = 
 
 
 def _write(
-    request: HighLevelRequest, task: TaskConfig, model: PPO, env: DecisionEnv, out: Path
+    request: HighLevelRequest,
+    task: TaskConfig,
+    weights: Weights,
+    kept: Point,
+    env: DecisionEnv,
+    out: Path,
 ) -> Checkpoint:
-    """Write the trained high-level policy."""
-    policy, recipe = _policy(request, model)
+    """Write the high-level policy of these weights, those of the point that is kept."""
     checkpoint = Checkpoint(
         run=run_of(request, task, env.control_steps),
-        recipe=to_mapping(recipe),
+        recipe=to_mapping(_recipe(request)),
         image_size=IMAGE_SIZE,
         encoder=None,
         proprioception=True,
         epoch=0,
         dataset="",
-        frames=model.num_timesteps,
+        frames=kept.decisions,
         validation_episodes=(),
         train_losses=(),
         validation_losses=(),
         device="cpu",
         code_version=__version__,
     )
-    return write_checkpoint(out, checkpoint, policy.state_dict())
+    return write_checkpoint(out, checkpoint, weights)

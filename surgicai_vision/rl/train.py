@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -270,7 +270,15 @@ def _run(
     return _write(request, best, learner.squash, best_point(curve), out)
 
 
-def best_point(curve: Sequence[Point]) -> Point:
+class Counted(Protocol):
+    """A point of a learning curve that says how many episodes succeeded."""
+
+    @property
+    def successes(self) -> int:
+        """Episodes that succeeded."""
+
+
+def best_point[P: Counted](curve: Sequence[P]) -> P:
     """Return the point whose policy is kept: the most successes, of equals the last."""
     return max(reversed(curve), key=lambda point: point.successes)
 

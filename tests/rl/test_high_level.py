@@ -74,24 +74,50 @@ def request_of(**changes):
 
 
 def test_the_checkpoint_names_what_ppo_names(tmp_path, monkeypatch):
-    kept = []
-    original = high_level._write
+    models = []
+    original = high_level._policy
 
-    def write(request, task, model, env, out):
-        kept.append(model)
-        return original(request, task, model, env, out)
+    def policy_of(request, model):
+        models.append(model)
+        return original(request, model)
 
-    monkeypatch.setattr(high_level, "_write", write)
+    monkeypatch.setattr(high_level, "_policy", policy_of)
     checkpoint = train_high_level(request_of(), tmp_path / "hlp")
     assert checkpoint.run.name == "ppo-proprioception" and checkpoint.run.task == names.SUTURE
     policy = load_policy(tmp_path / "hlp")
     poses = np.random.default_rng(0).normal(size=(20, 14)).astype(np.float32) / 10
-    theirs, _ = kept[0].predict(poses, deterministic=True)
+    theirs, _ = models[-1].predict(poses, deterministic=True)
     assert np.array_equal(policy.act(None, poses).argmax(axis=1), theirs)
     whole = dataclasses.replace(request_of().low, hlp=str(tmp_path / "hlp"))
     assert hierarchical_policy(whole).config.task == names.SUTURE
     with pytest.raises(OutputExists):
         train_high_level(request_of(seed=1), tmp_path / "hlp")
+
+
+def test_the_policy_of_the_best_evaluation_is_kept(tmp_path, monkeypatch):
+    shorter = dataclasses.replace(request_of(), decisions=8)
+    early = train_high_level(shorter, tmp_path / "early")
+    original = high_level._evaluate
+
+    def evaluate(*arguments):
+        point = original(*arguments)
+        return dataclasses.replace(point, successes=16 - point.decisions)
+
+    monkeypatch.setattr(high_level, "_evaluate", evaluate)
+    kept = train_high_level(request_of(), tmp_path / "kept")
+    assert kept.policy_sha256 == early.policy_sha256 and kept.frames == 8
+    killed = high_level._save
+
+    def die(*arguments):
+        killed(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(high_level, "_save", die)
+    with pytest.raises(KeyboardInterrupt):
+        train_high_level(request_of(), tmp_path / "killed")
+    monkeypatch.setattr(high_level, "_save", killed)
+    resumed = train_high_level(request_of(), tmp_path / "killed")
+    assert resumed.policy_sha256 == kept.policy_sha256
 
 
 def test_a_kill_changes_no_result(tmp_path, monkeypatch):
