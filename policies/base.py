@@ -317,7 +317,7 @@ class Policy(nn.Module, abc.ABC):
         Raises:
             InputError: arrays of other shapes than the policy was trained on, or not finite.
         """
-        observed = self._observed(features, agent_pos)
+        observed = self.observed(features, agent_pos)
         exact = self._exact
         if exact is None:
             exact = self._copy_to_act().eval().requires_grad_(False)
@@ -338,10 +338,10 @@ class Policy(nn.Module, abc.ABC):
         super().train(mode)
         return self
 
-    def _observed(
+    def observed(
         self, features: NDArray[np.float32] | None, agent_pos: NDArray[np.float32]
     ) -> NDArray[np.float64]:
-        """Check the inputs and lay them side by side, (B, inputs.dim) float64."""
+        """Return checked inputs side by side, (B, inputs.dim) float64; see `act`."""
         agent_pos = np.asarray(agent_pos)
         parts = [] if features is None else [np.asarray(features)]
         width = parts[0].shape[1:] if parts else (0,)

@@ -190,7 +190,7 @@ class ChunkPolicy(Policy, abc.ABC):
             raise InputError(
                 f"The policy sees {self.history} moments, got vectors of {vectors.shape}."
             )
-        flat = self._observed(
+        flat = self.observed(
             None if features is None else features.reshape(-1, features.shape[-1]),
             vectors.reshape(-1, vectors.shape[-1]),
         )

@@ -161,7 +161,11 @@ class FeatureHeads(nn.Module):
 
 @final
 class FeatureMLP(nn.Module):
-    """The paper's network on features beside a vector: layers with BatchNorm before each."""
+    """The paper's network on features beside a vector: layers with BatchNorm before each.
+
+    Attributes:
+        width: length of what the heads leave with the vector beside it.
+    """
 
     def __init__(self, recipe: Recipe, inputs: Inputs, answers: int):
         super().__init__()
@@ -170,7 +174,7 @@ class FeatureMLP(nn.Module):
         heads = [_head(shape, recipe.map_head) for shape in self.shapes]
         self.heads = nn.ModuleList(heads)
         layers: list[nn.Module] = []
-        width = sum(head.dim for head in heads) + inputs.dim - inputs.features
+        self.width = width = sum(head.dim for head in heads) + inputs.dim - inputs.features
         for hidden in recipe.hidden:
             layers += [nn.BatchNorm1d(width)] if recipe.batch_norm else []
             layers += [nn.Linear(width, hidden), nn.ReLU()]
@@ -179,8 +183,12 @@ class FeatureMLP(nn.Module):
 
     def forward(self, observed: torch.Tensor) -> torch.Tensor:
         """Return (B, answers) for normalised inputs (B, inputs.dim)."""
+        answers: torch.Tensor = self.layers(self.seen(observed))
+        return answers
+
+    def seen(self, observed: torch.Tensor) -> torch.Tensor:
+        """Return what the heads leave with the vector beside it, (B, width)."""
         sizes = [math.prod(shape) for shape in self.shapes]
         *rows, vector = observed.split([*sizes, self.inputs.dim - self.inputs.features], dim=1)
         seen = [head(row) for head, row in zip(self.heads, rows, strict=True)]
-        answers: torch.Tensor = self.layers(torch.cat([*seen, vector], dim=1))
-        return answers
+        return torch.cat([*seen, vector], dim=1)

@@ -33,6 +33,7 @@ from surgicai_vision.features import encoders
 from surgicai_vision.features.devices import find_device
 from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.rl.high_level_config import DECISIONS, SAVE_EVERY, HighLevelRequest
+from surgicai_vision.rl.residual_config import ALGO, BOUND, ResidualRequest, residual_settings
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import REQUEST, Checkpoint, read_checkpoint
 from surgicai_vision.training.run_config import RunConfig, with_budget
@@ -50,6 +51,8 @@ LeRobot's ACT on feature maps, for ten minutes of a core:
     --view front_psm1 --minutes 10
 by reinforcement:
   surgicai-vision train --algo td3-her-bc --env-steps 25000
+a correction of an image policy:
+  surgicai-vision train --algo td3 --residual-on outputs/train/grasp-bc-seed0 --env-steps 20000
 a high-level policy over policies of the subtasks:
   surgicai-vision train --task suture --algo ppo --low hierarchical.yaml""",
 )
@@ -102,6 +105,9 @@ class Options:
         low: YAML file of a hierarchical policy (docs/hierarchical.md) with hlp: order; PPO learns
             the high-level policy over its subtasks' policies.
         decisions: Decisions that it learns from.
+        residual_on: Checkpoint, or released:NAME, of a cloned image policy; TD3 learns a correction
+            of its actions.
+        bound: Largest correction of each element of an action.
         workers: Processes that train seeds, or step the envs of a single one; 0 for this one.
         env: Fields of the env, such as hold_jaw.
     """
@@ -159,6 +165,8 @@ class Options:
     seeds: Annotated[int, COUNT] = 1
     low: Annotated[Path | None, Parameter(metavar="FILE.yaml")] = None
     decisions: Annotated[int, COUNT] = DECISIONS
+    residual_on: Annotated[Path | None, DIRECTORY] = None
+    bound: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=1))] = BOUND
     workers: Annotated[int, NOT_NEGATIVE] = 0
     env: EnvFields = None
 
@@ -168,6 +176,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Encode what is not in the cache, train and print where the checkpoint is."""
     if options.low:
         return _high_level(options, options.low, console)
+    if options.residual_on:
+        return _residual(options, options.residual_on, console)
     if options.algo:
         return _reinforce(options, options.algo, console)
     if options.device is not None:
@@ -364,4 +374,44 @@ def _high_level(options: Options, low: Path, console: Console) -> dict[str, obje
         console.say(f"checkpoint: {out}")
         outs.append(out)
     console.say(f"next: give {outs[0]} as hlp: of {low}, and surgicai-vision evaluate {low}")
+    return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}
+
+
+def _residual(options: Options, base: Path, console: Console) -> dict[str, object]:
+    """Train a correction of an image policy; print where the checkpoints are."""
+    from surgicai_vision.rl.extra import check_extra
+
+    if options.algo != ALGO:
+        raise InputError(f"--residual-on goes with --algo {ALGO}; got --algo {options.algo}.")
+    for name in (*IMITATION, "demos", "demonstrations", "env"):
+        if getattr(options, name) is not None:
+            raise InputError(f"--{name} does not go with --residual-on; leave it out.")
+    if options.out and options.seeds > 1:
+        raise InputError("--out names one folder; leave it out where --seeds trains several.")
+    check_extra("--residual-on", "stable_baselines3")
+    requests = [
+        ResidualRequest(
+            str(base),
+            options.bound,
+            residual_settings(read_changes(options.change)),
+            options.change,
+            options.env_steps,
+            seed=options.seed + index,
+            validation=options.validation,
+            save_every=options.save_every or 5000,
+        )
+        for index in range(options.seeds)
+    ]
+    from surgicai_vision.rl.residual import base_of, run_of, train_residual
+
+    outs = []
+    for request in requests:
+        run = run_of(request, base_of(request).run)
+        out = options.out or folders.train_folder(run.task, run.name, run.seed)
+        folders.check_folder(out, REQUEST)
+        with console.stage(f"policy: {run.name}", "control steps") as progress:
+            train_residual(request, out, progress=progress)
+        console.say(f"checkpoint: {out}")
+        outs.append(out)
+    console.say(f"next: surgicai-vision evaluate {outs[0]}")
     return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}

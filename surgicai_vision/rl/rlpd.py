@@ -4,27 +4,38 @@ Ball et al., Efficient online reinforcement learning with offline data (ICML 202
 arXiv:2302.02948): SAC off the shelf, half of every batch from offline data (`buffers`), and
 LayerNorm after each hidden layer of the critics, which bounds the values of actions that no data
 show. Their ensembles of ten critics and 20 updates a step are settings (`critics`, `updates`).
+`residual` has such critics in TD3.
 """
 
 from typing import Any, final
 
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 
-@final
-class LayerNormPolicy(SACPolicy):
-    """SAC's policy with LayerNorm in its critics."""
+class LayerNormCritics:
+    """A policy of Stable-Baselines3 with LayerNorm in its critics; mixed in before its class."""
 
     def make_critic(self, features_extractor: Any = None) -> ContinuousCritic:
-        """Return SAC's critics with LayerNorm between each hidden layer and its ReLU."""
-        critic = super().make_critic(features_extractor)
+        """Return the library's critics with LayerNorm between each hidden layer and its ReLU."""
+        critic: ContinuousCritic = super().make_critic(features_extractor)  # type: ignore[misc]
         for index, network in enumerate(critic.q_networks):
             normed = _with_layer_norm(network)
             critic.q_networks[index] = normed
             critic.add_module(f"qf{index}", normed)
-        return critic.to(self.device)
+        return critic.to(critic.device)
+
+
+@final
+class LayerNormPolicy(LayerNormCritics, SACPolicy):
+    """SAC's policy with LayerNorm in its critics."""
+
+
+@final
+class LayerNormTD3Policy(LayerNormCritics, TD3Policy):
+    """TD3's policy with LayerNorm in its critics."""
 
 
 def _with_layer_norm(network: nn.Module) -> nn.Sequential:

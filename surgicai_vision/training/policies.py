@@ -36,6 +36,7 @@ POLICIES: Final = Registry["Plugin"](
         "hlp": "policies.hlp:HLP",
         "actor": "policies.actor:ACTOR",
         "bcq": "policies.actor:BCQ",
+        "residual": "policies.residual:RESIDUAL",
         "act": "policies.lerobot:ACT",
         "diffusion": "policies.lerobot:DIFFUSION",
         "vqbet": "policies.lerobot:VQBET",

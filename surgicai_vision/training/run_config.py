@@ -24,6 +24,8 @@ REFERENCES = ("expert", "random", "zero", "replay", "recover")
 """Policies that are not trained: what the trained ones stand beside."""
 LEROBOT_POLICIES = ("act", "diffusion")
 """Policies that a grid trains by `lerobot-train`, for a number of updates."""
+ACTORS = ("actor", "bcq")
+"""Policies that `rl.train` leaves: they are fed the state with the goal."""
 TERMINATIONS = ("privileged", "learned")
 """How a subtask ends under a hierarchical policy."""
 
@@ -91,8 +93,8 @@ class RunConfig:
         updates: updates of the weights and `batch_size`, for LeRobot's policies.
         batch_size: frames of an update, for LeRobot's policies.
         seed: training seed.
-        algo: the algorithm of reinforcement or offline learning (`rl.algorithms`) that trained an
-            `actor`; None for imitation from a dataset.
+        algo: the algorithm of reinforcement or offline learning (`rl.algorithms`) that trained it,
+            "residual-td3" for a correction; None for imitation from a dataset.
         env_steps: control steps that it took in the env to learn; 0 offline.
         termination: how subtasks end, where this is a hierarchical policy (`TERMINATIONS`).
         parts: digest of the file that names the policies of a hierarchical policy; empty where
@@ -182,7 +184,7 @@ class RunConfig:
             return f"{self.encoder}-{'+'.join(self.views)}"
         if self.privileged:
             return "state"
-        return "relative" if self.algo and self.policy != "hlp" else "proprioception"
+        return "relative" if self.policy in ACTORS and self.algo else "proprioception"
 
     @property
     def recipe_label(self) -> str:

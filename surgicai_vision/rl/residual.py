@@ -1,0 +1,392 @@
+"""A correction of a frozen image policy, learned by reinforcement with sparse reward.
+
+`CorrectionEnv` is the policy's own task: an action corrects what the frozen policy does, within the
+bound, and what is observed is what that policy sees and would do (`policies.residual`). TD3 with
+LayerNorm in its critics learns the correction; before its first update the frozen policy acts alone
+but for the noise.
+
+    train_residual(ResidualRequest("outputs/train/grasp-…"), out)
+
+leaves a checkpoint of the policy `residual`, which holds the frozen policy's weights too. It is fed
+what that one is fed. Every training state begins new episodes, in a training that was killed as in
+one that was not; the folder, and which policy is kept, are those of `rl.train`.
+"""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast, final
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import TD3
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from torch import nn
+
+from policies.base import ACTIONS
+from policies.bc import BCPolicy
+from policies.residual import RESIDUAL, Residual, ResidualRecipe
+from surgicai_vision import __version__
+from surgicai_vision.core import names
+from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.core.errors import InputError, PhysicsError
+from surgicai_vision.core.files import write_json
+from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
+from surgicai_vision.evaluation.rollout import run_share
+from surgicai_vision.evaluation.slot import env_of
+from surgicai_vision.rl.extractor import StandardExtractor
+from surgicai_vision.rl.learner import Arrays, State, linear, random_state, set_random_state
+from surgicai_vision.rl.residual_config import ALGO, ResidualRequest
+from surgicai_vision.rl.rlpd import LayerNormTD3Policy
+from surgicai_vision.rl.settings import read_by
+from surgicai_vision.rl.train import CURVE, Point, Weights, best_point
+from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
+from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
+from surgicai_vision.training.run_config import RunConfig
+from surgicai_vision.training.threads import one_thread
+
+PLAYED_EPISODES = 5
+"""Episodes of the frozen policy that give the statistics of what the correction sees."""
+SEEDS_EACH = 1000
+"""Start seeds of one training: one for each training state."""
+EVALUATED_AT_ONCE = 8
+BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+Vector = NDArray[np.float32]
+
+
+@final
+class CorrectionEnv(gymnasium.Env[Vector, Vector]):
+    """The task of a frozen policy, whose actions are corrected; see the module's docstring.
+
+    Args:
+        agent: the frozen policy's; it renders, encodes and measures what the policy is fed.
+        policy: the frozen policy with an untrained correction.
+        task: the task's config.
+    """
+
+    def __init__(self, agent: PolicyAgent, policy: Residual, task: TaskConfig):
+        self._agent = agent
+        self._policy = policy
+        self._exact = policy.exact()
+        self._env = env_of(agent, task)
+        self._ticks = 0
+        self._base = np.zeros(ACTIONS, np.float32)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (policy.sight,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Vector, dict[str, Any]]:
+        """Begin an episode from a training start; return what the correction sees."""
+        super().reset(seed=seed)
+        start = int(self.np_random.integers(names.VALIDATION_SEED))
+        seen, _ = self._env.reset(seed=start)
+        self._agent.reset(0, self._env, start)
+        self._ticks = 0
+        return self._sight(seen), {}
+
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Take one step by the frozen policy's action and its correction, (7,) in [-1, 1]."""
+        moved = np.clip(self._base + self._policy.bound * np.asarray(action), -1.0, 1.0)
+        try:
+            step = self._env.step(moved.astype(np.float32))
+        except PhysicsError:
+            sight = np.zeros(self._policy.sight, np.float32)
+            return sight, -1.0, True, False, {"is_success": False}
+        seen, _, terminated, truncated, info = step
+        self._ticks += 1
+        is_success = bool(info["is_success"])
+        reward = 0.0 if is_success else -1.0
+        return self._sight(seen), reward, terminated, truncated, {"is_success": is_success}
+
+    def _sight(self, seen: Any) -> Vector:
+        """Return what the correction sees of the present state, and keep the frozen action."""
+        agent = self._agent
+        features = agent.features([seen])
+        vectors = agent.vectors([self._env], [seen], [self._ticks])
+        exact = self._exact
+        with torch.inference_mode():
+            observed = torch.from_numpy(exact.observed(features, vectors))
+            sight = exact.look(exact.normalise(observed)).float().numpy()[0]
+        self._base = sight[-ACTIONS:]
+        return np.asarray(sight, np.float32)
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._env.close()
+
+
+@final
+class WarmTD3(TD3):
+    """TD3 whose first steps are those of its policy with noise, not random actions.
+
+    The policy of a correction begins at none: those steps are the frozen policy's.
+    """
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return super()._sample_action(0, action_noise, n_envs)
+
+
+def train_residual(
+    request: ResidualRequest, out: Path, *, progress: Progress | None = None
+) -> Checkpoint:
+    """Train a correction, or go on where it was broken off.
+
+    Args:
+        request: what is trained.
+        out: the checkpoint folder; new, or one of the same request.
+        progress: called with (control steps done, in all).
+
+    Raises:
+        BadFile: a base that is no checkpoint.
+        InputError: a base that is no policy of behaviour cloning of one subtask.
+        OutputExists: `out` holds something else.
+    """
+    spec = base_of(request)
+    wanted = {
+        "code_version": __version__,
+        "request": to_mapping(request),
+        "base": spec.about["checkpoint"],
+    }
+    if done := begin(out, wanted):
+        return done
+    with torch.random.fork_rng(devices=[]), one_thread():
+        training = _Training(request, spec)
+        try:
+            checkpoint = training.run(out, progress or silent)
+        finally:
+            training.close()
+    remove_state(out)
+    return checkpoint
+
+
+def base_of(request: ResidualRequest) -> PolicySpec:
+    """Return the policy that is corrected; see `train_residual` for the errors."""
+    spec = open_policy(request.base)
+    if spec.run.policy != "bc" or spec.run.task not in names.SUBTASKS:
+        raise InputError(
+            f"{request.base} is '{spec.run.policy}' of '{spec.run.task}'; a policy of behaviour "
+            "cloning (bc) of one subtask can be corrected."
+        )
+    if spec.run.recipe_changes.get("progress_input"):
+        raise InputError(f"{request.base} is fed another policy's progress; give one with a clock.")
+    return spec
+
+
+def run_of(request: ResidualRequest, base: RunConfig, env_steps: int | None = None) -> RunConfig:
+    """Return the run that a request is.
+
+    Args:
+        request: what is trained.
+        base: the run of the policy that is corrected.
+        env_steps: control steps that it took; None before it has.
+    """
+    return dataclasses.replace(
+        base,
+        policy=RESIDUAL.name,
+        algo=f"{RESIDUAL.name}-{ALGO}",
+        changes=(*base.changes, f"bound={request.bound:g}", *request.changes),
+        seed=request.seed,
+        env_steps=env_steps,
+    )
+
+
+class _Training:
+    """One training: the frozen policy, its task, and the model that learns."""
+
+    def __init__(self, request: ResidualRequest, spec: PolicySpec):
+        self.request = request
+        self.spec = spec
+        agent = spec.make_agent()
+        assert isinstance(agent, PolicyAgent)
+        base = agent.policy
+        assert isinstance(base, BCPolicy)
+        self.base = base.checkpoint
+        settings = request.settings
+        values = {
+            **self.base.recipe,
+            "bound": request.bound,
+            "correction": list(settings.hidden),
+            "algo": ALGO,
+            "settings": read_by(ALGO, settings),
+        }
+        self.recipe = from_mapping(ResidualRecipe, values, "residual policy")
+        torch.manual_seed(request.seed)
+        self.policy = Residual(self.recipe, self.base.visual)
+        self.policy.take_base(base)
+        self.policy.eval().requires_grad_(False)
+        self.env = CorrectionEnv(agent, self.policy, spec.config)
+        self.policy.standardise(self._played())
+        self.model = self._model()
+
+    def _played(self) -> Vector:
+        """Return what the correction sees in episodes of the frozen policy alone, (n, sight)."""
+        rows = []
+        for episode in range(PLAYED_EPISODES):
+            sight, _ = self.env.reset(seed=names.TRAIN_SEED + episode)
+            ended = False
+            while not ended:
+                rows.append(sight)
+                sight, _, terminated, truncated, _ = self.env.step(np.zeros(ACTIONS, np.float32))
+                ended = terminated or truncated
+        return np.stack(rows)
+
+    def _model(self) -> WarmTD3:
+        """Return the model, whose actor is the untrained correction."""
+        settings = self.request.settings
+        hidden = list(settings.hidden)
+        model = WarmTD3(
+            LayerNormTD3Policy,
+            self.env,
+            learning_rate=settings.learning_rate,
+            gamma=settings.gamma,
+            batch_size=settings.batch_size,
+            tau=settings.tau,
+            buffer_size=self.request.env_steps,
+            train_freq=settings.train_every,
+            gradient_steps=settings.updates,
+            learning_starts=settings.learning_starts,
+            policy_delay=settings.policy_delay,
+            target_policy_noise=settings.target_noise,
+            target_noise_clip=settings.target_noise_clip,
+            action_noise=NormalActionNoise(
+                np.zeros(ACTIONS), settings.exploration_noise * np.ones(ACTIONS)
+            ),
+            seed=self.request.seed,
+            device="cpu",
+            policy_kwargs={
+                "activation_fn": nn.ReLU,
+                "net_arch": {"pi": hidden, "qf": hidden},
+                "n_critics": settings.critics,
+                "features_extractor_class": StandardExtractor,
+                "features_extractor_kwargs": {
+                    "mean": self.policy.sight_mean.tolist(),
+                    "std": self.policy.sight_std.tolist(),
+                },
+            },
+        )
+        with torch.no_grad():
+            for actor in (model.actor, model.actor_target):
+                last = linear(actor.mu)[-1]
+                last.weight.zero_()
+                last.bias.zero_()
+        return model
+
+    def run(self, out: Path, progress: Progress) -> Checkpoint:
+        """Learn to the end, with an evaluation and a training state every so often."""
+        request, model = self.request, self.model
+        curve, best = self._resume(out)
+        minutes = curve[-1].minutes if curve else 0.0
+        while model.num_timesteps < request.env_steps:
+            progress(model.num_timesteps, request.env_steps)
+            began = time.process_time()
+            vector = model.get_env()
+            assert vector is not None
+            vector.seed(names.TRAIN_SEED + SEEDS_EACH * request.seed + len(curve))
+            model._last_obs = None  # new episodes begin, so that nothing of the env need be stored
+            chunk = min(request.save_every, request.env_steps - model.num_timesteps)
+            model.learn(chunk, reset_num_timesteps=False)
+            minutes += (time.process_time() - began) / 60.0
+            self.policy.take_correction(linear(model.actor.mu))
+            curve.append(self._evaluate(minutes))
+            if curve[-1] is best_point(curve):
+                best = {name: value.clone() for name, value in self.policy.state_dict().items()}
+            write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
+            if model.num_timesteps < request.env_steps:
+                self._save(curve, best, out)
+        progress(request.env_steps, request.env_steps)
+        return self._write(best, best_point(curve), out)
+
+    def _evaluate(self, minutes: float) -> Point:
+        """Count successes from validation starts."""
+        rows = []
+        if self.request.validation:
+            # Eval mode anew: the copy that acts is made of the present weights.
+            corrected = self.policy.eval()
+            make = functools.partial(_corrected, self.spec, corrected)
+            first = names.VALIDATION_SEED
+            seeds = range(first, first + self.request.validation)
+            episodes = run_share(
+                make, self.spec.config, seeds, EVALUATED_AT_ONCE, report=lambda _: None
+            )
+            rows = [episode.row for episode in episodes]
+        return Point(
+            env_steps=self.model.num_timesteps,
+            updates=int(self.model._n_updates),
+            minutes=minutes,
+            successes=sum(row.success for row in rows),
+            episodes=len(rows),
+            distance_mm=float(np.median([row.d_trans_mm for row in rows])) if rows else 0.0,
+        )
+
+    def _save(self, curve: Sequence[Point], best: Weights, out: Path) -> None:
+        """Write the training state, whole."""
+        model = self.model
+        buffer = cast(ReplayBuffer, model.replay_buffer)
+        rows = buffer.buffer_size if buffer.full else buffer.pos
+        state: State = {
+            "parameters": model.get_parameters(),
+            "steps": model.num_timesteps,
+            "updates": model._n_updates,
+            "buffer": Arrays.of(buffer, BUFFER, rows),
+            "position": [int(buffer.pos), int(buffer.full)],
+            "random": random_state(),
+            "curve": [dataclasses.asdict(point) for point in curve],
+            "best": dict(best),
+        }
+        write_state(out, state)
+
+    def _resume(self, out: Path) -> tuple[list[Point], Weights]:
+        """Go on from the training state, if there is a whole one; return the curve and the best."""
+        state = read_state(out)
+        if state is None:
+            return [], {}
+        model = self.model
+        model.set_parameters(state["parameters"], exact_match=True)
+        model.num_timesteps = state["steps"]
+        model._n_updates = state["updates"]
+        buffer = cast(ReplayBuffer, model.replay_buffer)
+        Arrays.put(buffer, state["buffer"])
+        buffer.pos, full = state["position"]
+        buffer.full = bool(full)
+        set_random_state(state["random"])
+        return [Point(**point) for point in state["curve"]], state["best"]
+
+    def _write(self, weights: Weights, kept: Point, out: Path) -> Checkpoint:
+        """Write the policy of these weights, those of the point that is kept."""
+        if not all(torch.isfinite(weight).all() for weight in weights.values()):
+            raise InputError("The correction diverged: weights are not finite; learn more slowly.")
+        checkpoint = dataclasses.replace(
+            self.base,
+            run=run_of(self.request, self.base.run, self.model.num_timesteps),
+            recipe=to_mapping(self.recipe),
+            epoch=0,
+            frames=kept.env_steps,
+            train_losses=(),
+            validation_losses=(),
+            device="cpu",
+            code_version=__version__,
+        )
+        return write_checkpoint(out, checkpoint, weights)
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self.env.close()
+
+
+def _corrected(spec: PolicySpec, policy: Residual) -> PolicyAgent:
+    """Make the agent of the frozen policy with the corrected one in its place."""
+    agent = spec.make_agent()
+    assert isinstance(agent, PolicyAgent)
+    agent.policy = policy
+    return agent

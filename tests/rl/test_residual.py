@@ -1,0 +1,143 @@
+"""A residual policy: the frozen policy where nothing is learned, and what is learned beside it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers.checkpoints import checkpoint
+
+from policies.residual import Residual, ResidualRecipe
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError, OutputExists
+from surgicai_vision.evaluation.policy_spec import open_policy
+from surgicai_vision.evaluation.rollout import run_share
+from surgicai_vision.rl import residual
+from surgicai_vision.rl.residual import CorrectionEnv, train_residual
+from surgicai_vision.rl.residual_config import ResidualRequest, residual_settings
+from surgicai_vision.training.policies import load_policy
+
+STILL = np.zeros(7, np.float32)
+
+
+def request_of(base, **changes):
+    settings = residual_settings({"hidden": [8], "batch_size": 8, "learning_starts": 4})
+    return ResidualRequest(
+        base, 0.2, settings, env_steps=24, validation=0, save_every=12, **changes
+    )
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    return checkpoint(tmp_path_factory.mktemp("base") / "grasp", "grasp")
+
+
+def of(policy, bound=0.2):
+    """Return a residual of a loaded policy, as its training makes it."""
+    values = {**policy.checkpoint.recipe, "bound": bound, "correction": (8,)}
+    corrected = Residual(ResidualRecipe(**values), policy.checkpoint.visual)
+    corrected.take_base(policy)
+    return corrected.eval().requires_grad_(False)
+
+
+def test_an_untrained_correction_changes_nothing_and_a_trained_one_at_most_the_bound(base):
+    policy = load_policy(base)
+    corrected = of(policy)
+    poses = np.random.default_rng(0).normal(size=(30, policy.inputs.width)).astype(np.float32)
+    acted = policy.act(None, poses)
+    assert np.array_equal(corrected.act(None, poses), acted)
+    last = corrected.correction[-1]
+    torch.nn.init.normal_(last.bias, std=9.0)
+    corrected.eval()
+    moved = corrected.act(None, poses)
+    assert 0.1 < np.abs(moved - acted).max() <= 0.2 + 1e-6
+
+
+def test_without_a_correction_the_env_is_the_frozen_policys_own_episode():
+    spec = open_policy("released:grasp")
+    agent = spec.make_agent()
+    env = CorrectionEnv(agent, of(agent.policy), spec.config)
+    sight, _ = env.reset(seed=3)
+    assert env.observation_space.contains(sight)
+    start = int(np.random.default_rng(3).integers(names.VALIDATION_SEED))
+    steps, ended = 0, False
+    while not ended:
+        sight, reward, terminated, truncated, info = env.step(STILL)
+        steps, ended = steps + 1, terminated or truncated
+        assert reward == (0.0 if info["is_success"] else -1.0)
+    env.close()
+    (episode,) = run_share(spec.make_agent, spec.config, [start], 1, report=lambda _: None)
+    assert (info["is_success"], steps) == (episode.row.success, episode.row.steps)
+
+
+def test_an_action_of_the_env_moves_the_frozen_action_within_the_bound(base):
+    spec = open_policy(base)
+    agent = spec.make_agent()
+    env = CorrectionEnv(agent, of(agent.policy), spec.config)
+    taken = []
+    step = env._env.step
+    env._env.step = lambda action: taken.append(action) or step(action)
+    for action in (STILL, np.ones(7, np.float32), -np.ones(7, np.float32)):
+        sight, _ = env.reset(seed=0)
+        env.step(action)
+    still, up, down = taken
+    assert np.array_equal(still, sight[-7:])
+    assert np.allclose(up, np.clip(still + 0.2, -1, 1), atol=1e-6)
+    assert np.allclose(down, np.clip(still - 0.2, -1, 1), atol=1e-6)
+    env.close()
+
+
+def test_what_is_trained_is_a_checkpoint_that_is_evaluated_as_any(base, tmp_path):
+    trained = train_residual(request_of(base), tmp_path / "residual")
+    assert trained.run.name == "residual-td3-proprioception-bound=0.2"
+    assert (trained.run.env_steps, trained.frames) == (24, 24)
+    policy = load_policy(tmp_path / "residual")
+    before = load_policy(base)
+    weights = before.state_dict()
+    assert all(torch.equal(policy.state_dict()[name], weights[name]) for name in weights)
+    assert policy.correction[-1].weight.abs().sum() > 0
+    poses = np.random.default_rng(0).normal(size=(9, policy.inputs.width)).astype(np.float32)
+    assert np.abs(policy.act(None, poses) - before.act(None, poses)).max() <= 0.2 + 1e-6
+    spec = open_policy(tmp_path / "residual")
+    (episode,) = run_share(spec.make_agent, spec.config, [5], 1, report=lambda _: None)
+    assert not episode.row.error
+    with pytest.raises(OutputExists):
+        train_residual(request_of(base, seed=1), tmp_path / "residual")
+
+
+def test_a_kill_changes_no_result_and_the_best_is_kept(base, tmp_path, monkeypatch):
+    evaluate = residual._Training._evaluate
+
+    def falling(training, minutes):
+        point = evaluate(training, minutes)
+        return dataclasses.replace(point, successes=24 - point.env_steps)
+
+    save = residual._Training._save
+
+    def die(*arguments):
+        save(*arguments)
+        raise KeyboardInterrupt
+
+    early = dataclasses.replace(request_of(base), env_steps=12)
+    first = train_residual(early, tmp_path / "early")
+    last = train_residual(request_of(base), tmp_path / "last")
+    monkeypatch.setattr(residual._Training, "_evaluate", falling)
+    whole = train_residual(request_of(base), tmp_path / "whole")
+    monkeypatch.setattr(residual._Training, "_save", die)
+    with pytest.raises(KeyboardInterrupt):
+        train_residual(request_of(base), tmp_path / "killed")
+    monkeypatch.setattr(residual._Training, "_save", save)
+    resumed = train_residual(request_of(base), tmp_path / "killed")
+    assert resumed.policy_sha256 == whole.policy_sha256 == first.policy_sha256
+    assert last.policy_sha256 != whole.policy_sha256 and whole.frames == 12
+
+
+def test_only_a_cloned_policy_of_one_subtask_is_corrected(base, tmp_path):
+    train_residual(request_of(base), tmp_path / "residual")
+    for other in (tmp_path / "residual", "expert"):
+        with pytest.raises(InputError, match="can be corrected"):
+            train_residual(request_of(str(other)), tmp_path / "again")
+    with pytest.raises(InputError, match="success_steps"):
+        ResidualRequest(base, settings=residual_settings({"success_steps": 3}))
+    with pytest.raises(InputError, match="bound"):
+        ResidualRequest(base, bound=0.0)
