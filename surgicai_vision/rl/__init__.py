@@ -1,8 +1,8 @@
 """Reinforcement and offline learning, by Stable-Baselines3 and d3rlpy (extra `rl`).
 
 It stands above evaluation: what is trained is evaluated by `evaluation.rollout`, and what comes out
-is a checkpoint like any other, of the policy `actor` (`policies.actor`). No verb but `train --algo`
-and `export-demos` imports it, and no module of it imports a library before it is used.
+is a checkpoint like any other, of the policy `actor`, `bcq`, `hlp` or `residual`. No verb but `train
+--algo` and `export-demos` imports it, and no module of it imports a library before it is used.
 
 Interface:
 
@@ -16,6 +16,8 @@ Interface:
 * `vec_env.SuturingVecEnv(task, n_envs, workers=…)`: our envs as Stable-Baselines3's `VecEnv`.
 * `extractor.RelativeExtractor`: the relative features of a goal dict as SB3's features extractor.
 * `train.train(request, demos, out) -> Checkpoint`: train, or go on where it was broken off.
+* `high_level.train_high_level(request, out)`: PPO as high-level policy over fixed low-level ones.
+* `residual.train_residual(request, out)`: a correction of a frozen image policy.
 
 Layout of the folder while it trains; the first and the last three stay:
 
