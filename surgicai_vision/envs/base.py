@@ -85,6 +85,9 @@ class SuturingEnv(gymnasium.Env):
             alone, and takes one that is reached for a success at once.
         tolerance_share: share of the tolerance within which a success counts; 1 is all of it.
             Learners set it too: what stops at the edge has nothing left for a start it never saw.
+        keeps_holes: a success counts only while the needle has passed as many holes as at the
+            subtask's start. The paper's handoff counts with the needle torn out of the tissue,
+            which no pull-out can then complete.
     """
 
     # gymnasium declares no ClassVar
@@ -109,6 +112,7 @@ class SuturingEnv(gymnasium.Env):
         self._truncates = truncates
         self.success_steps = 1
         self.tolerance_share = 1.0
+        self.keeps_holes = False
         self.scene = build_scene(config.scene)
         axes = config.randomisation
         self.simulation = Simulation(self.scene, own_model=bool(axes.on), latency=axes.latency)
@@ -522,10 +526,9 @@ class SuturingEnv(gymnasium.Env):
         subtask = self.subtask
         achieved, desired = target
         jaw = simulation.jaw(subtask.arm)
-        is_met = meets_demands(simulation, subtask, self.stitch, self.config.tolerance)
         return relative_features(
             self.agent_pos(),
-            observation.goal_vector(achieved, jaw, is_met),
+            observation.goal_vector(achieved, jaw, self._meets_demands()),
             observation.goal_vector(desired, 0.0, True),
             poses.square(simulation.bases[subtask.arm])[:3, :3],
         )
@@ -561,12 +564,18 @@ class SuturingEnv(gymnasium.Env):
 
     def _meets_demands(self) -> bool:
         """Return True if what success needs besides the pose holds now."""
-        return meets_demands(self.simulation, self.subtask, self.stitch, self.config.tolerance)
+        is_met = meets_demands(self.simulation, self.subtask, self.stitch, self.config.tolerance)
+        return is_met and self._has_kept_holes()
+
+    def _has_kept_holes(self) -> bool:
+        """Return True unless a hole passed at the start was lost, and that counts."""
+        passed = self.simulation.task_state.holes_passed
+        return not self.keeps_holes or passed >= self.subtask.passed_at_start
 
     def _progress(self, info: Info) -> bool:
         """Go on to the next subtask, where a task has several; return True if so."""
-        if self.tolerance_share < 1:
-            info["is_success"] = info["is_success"] and self._is_within_share(info)
+        if info["is_success"]:
+            info["is_success"] = self._is_within_share(info) and self._has_kept_holes()
         if self.success_steps > 1:
             info["is_success"] = self._count_dwell(info["is_success"]) >= self.success_steps
         return False

@@ -39,6 +39,7 @@ class Handoff(Subtask):
     name = "handoff"
     arm = PSM1
     phase = 3
+    passed_at_start = 2
     tolerances = MappingProxyType(
         {"paper": Tolerance.of(2.0, 15.0), "released": Tolerance.of(2.0, 40.0)}
     )
@@ -47,7 +48,7 @@ class Handoff(Subtask):
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the inserted needle with PSM2, PSM1 at home."""
         needle_pose = inserted_needle(stitch, rng)
-        simulation.task_state.holes_passed = 2
+        simulation.task_state.holes_passed = self.passed_at_start
         held = hold_needle(
             simulation, PSM2, needle_pose, draw_psm2_grasp(rng, needle_pose, stitch), STRAIGHT
         )

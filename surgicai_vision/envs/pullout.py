@@ -34,6 +34,7 @@ class Pullout(Subtask):
     arm = PSM1
     phase = 4
     starts_held = True
+    passed_at_start = 2
     tolerances = MappingProxyType(
         {"paper": Tolerance.of(5.0, 20.0), "released": Tolerance.of(5.0, 5.0)}
     )
@@ -42,7 +43,7 @@ class Pullout(Subtask):
     def start(self, simulation: Simulation, stitch: Stitch, rng: np.random.Generator) -> bool:
         """Hold the inserted needle with PSM1, PSM2 drawn back with open jaws."""
         needle_pose = inserted_needle(stitch, rng)
-        simulation.task_state.holes_passed = 2
+        simulation.task_state.holes_passed = self.passed_at_start
         away = draw_psm2_grasp(rng, needle_pose, stitch)
         away[:3, 3] -= RETREAT * away[:3, 2]
         try:

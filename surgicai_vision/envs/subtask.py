@@ -77,6 +77,8 @@ class Subtask(ABC):
 
     starts_held: ClassVar[bool] = False
     """The active jaws hold the needle at the start."""
+    passed_at_start: ClassVar[int] = 0
+    """Holes that the needle has passed at the start (`TaskState.holes_passed`)."""
     through: ClassVar[bool] = True
     """The needle is driven through the tissue, or already was."""
 

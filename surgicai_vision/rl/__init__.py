@@ -1,8 +1,9 @@
 """Reinforcement and offline learning, by Stable-Baselines3 and d3rlpy (extra `rl`).
 
 It stands above evaluation: what is trained is evaluated by `evaluation.rollout`, and what comes out
-is a checkpoint like any other, of the policy `actor`, `bcq`, `hlp` or `residual`. No verb but `train
---algo` and `export-demos` imports it, and no module of it imports a library before it is used.
+is a checkpoint like any other, of the policy `actor`, `bcq`, `hlp` or `residual`. No verb but
+`train --algo` and `export-demos` imports it, and no module of it imports a library before it is
+used.
 
 Interface:
 

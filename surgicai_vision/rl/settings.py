@@ -57,6 +57,9 @@ class Settings:
             the next subtask of a whole procedure finds it unfinished (`config.DWELL`).
         tolerance_share: share of the tolerance within which a success counts in learning. With 1,
             the paper's, an actor learns to stop at the edge of the tolerance.
+        keeps_holes: a success counts in learning only while the needle has passed as many holes as
+            at the start. Without, as in the paper, an actor may learn handoffs that pull the needle
+            out of the tissue.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -84,6 +87,7 @@ class Settings:
     samples: int = 10
     success_steps: int = 1
     tolerance_share: float = 1.0
+    keeps_holes: bool = False
 
     def __post_init__(self) -> None:
         check_name("relabel_demand", self.relabel_demand, DEMANDS)

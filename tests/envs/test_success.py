@@ -423,3 +423,42 @@ def test_no_arm_is_pushed_out_of_the_tissue_at_the_start_of_a_pullout():
             env.step(np.zeros(7, np.float32))
             forces.append(plate.force(env.data))
         assert max(forces) < 0.1
+
+
+@pytest.mark.parametrize("obs_type", ["state", "goal"])
+@pytest.mark.parametrize("keeps", [False, True])
+def test_a_needle_torn_out_of_a_hole_counts_as_handed_over_unless_holes_are_kept(keeps, obs_type):
+    env = make("handoff", obs_type=obs_type)
+    env.keeps_holes = keeps
+    env.reset(seed=0)
+    expert, ended = Expert(env), False
+    while not ended:
+        env.simulation.task_state.holes_passed = 0
+        seen, reward, terminated, truncated, info = env.step(expert.action())
+        ended = terminated or truncated
+    assert info["paper_success"]
+    assert info["is_success"] == terminated == (not keeps) and truncated == keeps
+    assert reward == (-1.0 if keeps else 0.0)
+    if obs_type == "goal":
+        assert env.compute_reward(seen["achieved_goal"], seen["desired_goal"]) == reward
+    env.close()
+
+
+@pytest.mark.parametrize("obs_type", ["state", "goal"])
+def test_a_share_of_the_tolerance_asks_for_so_much_of_it(obs_type):
+    env = make("insert", obs_type=obs_type)
+    whole = env.tolerance()
+    env.tolerance_share = 0.5
+    half = env.tolerance()
+    assert (half.distance, half.angle) == (whole.distance / 2, whole.angle / 2)
+    env.reset(seed=0)
+    expert, met, ended = Expert(env), 0, False
+    while not ended:
+        seen, reward, terminated, truncated, info = env.step(expert.action())
+        near = info["d_trans"] <= half.distance and info["d_angle"] <= half.angle
+        assert info["is_success"] == (info["paper_success"] and near)
+        assert reward == (0.0 if info["is_success"] else -1.0)
+        met += info["paper_success"] and not near
+        ended = terminated or truncated
+    assert met  # within the tolerance, and not yet within its half
+    env.close()
