@@ -454,7 +454,7 @@ def test_a_share_of_the_tolerance_asks_for_so_much_of_it(obs_type):
     env.reset(seed=0)
     expert, met, ended = Expert(env), 0, False
     while not ended:
-        seen, reward, terminated, truncated, info = env.step(expert.action())
+        _, reward, terminated, truncated, info = env.step(expert.action())
         near = info["d_trans"] <= half.distance and info["d_angle"] <= half.angle
         assert info["is_success"] == (info["paper_success"] and near)
         assert reward == (0.0 if info["is_success"] else -1.0)
