@@ -528,7 +528,7 @@ class SuturingEnv(gymnasium.Env):
         jaw = simulation.jaw(subtask.arm)
         return relative_features(
             self.agent_pos(),
-            observation.goal_vector(achieved, jaw, self._meets_demands()),
+            observation.goal_vector(achieved, jaw, self._meets_subtask()),
             observation.goal_vector(desired, 0.0, True),
             poses.square(simulation.bases[subtask.arm])[:3, :3],
         )
@@ -563,7 +563,11 @@ class SuturingEnv(gymnasium.Env):
         state.tip_path += ((x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2) ** 0.5
 
     def _meets_demands(self) -> bool:
-        """Return True if what success needs besides the pose holds now."""
+        """Return True if what the episode's success needs besides the pose holds now."""
+        return self._meets_subtask()
+
+    def _meets_subtask(self) -> bool:
+        """Return True if what the present subtask's success needs besides the pose holds now."""
         is_met = meets_demands(self.simulation, self.subtask, self.stitch, self.config.tolerance)
         return is_met and self._has_kept_holes()
 
