@@ -17,6 +17,7 @@ from surgicai_vision.envs.poses import square
 from surgicai_vision.envs.relative import FADE, relative_features
 
 SIZE = len(names.RELATIVE_NAMES)
+MET = names.RELATIVE_NAMES.index("met")
 HELD = ("place", "insert", "pullout")
 
 
@@ -68,6 +69,18 @@ def test_within_the_whole_procedure_it_is_that_of_the_present_subtask():
     env.enter(3)
     assert np.array_equal(env.observe(), env.relative_state())
     assert env.relative_state()[0] != seen[0]
+
+
+def test_within_the_whole_procedure_it_tells_what_the_present_subtask_asks_for():
+    env = make("suture", obs_type="relative")
+    env.reset(seed=0)
+    expert, told = Expert(env), set()
+    while env.phase == 0:
+        seen, *_, info = env.step(expert.action())
+        if env.phase == 0:
+            assert bool(seen[MET]) == info["contact"]
+            told.add(info["contact"])
+    assert told == {False, True}
 
 
 # -- no jumps --------------------------------------------------------------------------------------
