@@ -60,6 +60,9 @@ class SceneConfig:
             the tip) or "dvrk" (what its motors can give).
         tissue: "channels" (rigid, with open holes, SurgicAI's) or "soft" (pierced anywhere).
         tissue_forces: how soft tissue resists: "phantom", "skin" or "liver".
+        ink: which openings of channels are ringed with ink: all "alike" (SurgicAI's), or the pair
+            that is "due" alone, so that images tell which of several is to be sewn. Soft tissue
+            marks that pair in any case, and takes no other ink.
     """
 
     layout: str = "simple"
@@ -70,6 +73,7 @@ class SceneConfig:
     torque: str = "effective"
     tissue: str = "channels"
     tissue_forces: str = "phantom"
+    ink: str = "alike"
 
     def __post_init__(self) -> None:
         check_name("layout", self.layout, names.LAYOUTS)
@@ -78,6 +82,12 @@ class SceneConfig:
         check_name("torque preset", self.torque, names.TORQUES)
         check_name("tissue", self.tissue, names.TISSUES)
         check_name("tissue forces", self.tissue_forces, names.TISSUE_FORCES)
+        check_name("ink", self.ink, names.INKS)
+        if self.ink != "alike" and self.tissue != "channels":
+            raise InputError(
+                f"ink is {self.ink!r} in {self.tissue} tissue, which marks the pair to be sewn in "
+                "any case; leave it out."
+            )
         if self.hole_pair not in (1, 2, 3, 4):
             raise InputError(f"hole_pair is {self.hole_pair!r}; allowed: 1, 2, 3, 4.")
         if self.thread not in (0, 10, 20, 40):

@@ -75,6 +75,7 @@ REWARDS = ("sparse", "dense", "staged")
 GRASPS = ("friction", "attach")
 TORQUES = ("effective", "dvrk")
 TISSUES = ("channels", "soft")
+INKS = ("alike", "due")
 TISSUE_FORCES = ("phantom", "skin", "liver")
 LAYOUTS = ("simple", "3dmed", "3dmed_straight")
 

@@ -33,6 +33,7 @@ from surgicai_vision.scene.rotations import (
 from surgicai_vision.scene.visual import appearance, distractors
 from surgicai_vision.scene.visual.appearance import Appearance
 from surgicai_vision.scene.visual.distractors import Litter
+from surgicai_vision.scene.visual.skin import show_ink
 
 Array = NDArray[np.float64]
 Draws = tuple[float, ...]
@@ -214,13 +215,14 @@ def apply(scene: Scene, model: mujoco.MjModel, draws: Draws) -> None:
 
 
 def _place_phantom(scene: Scene, model: mujoco.MjModel, where: Placement) -> None:
-    """Move the phantom and the tray it stands in, and what lies about."""
+    """Move the phantom and the tray it stands in, and what lies about; ink the pair to sew."""
     source = scene.model
     poses = dict.fromkeys(STAND, where.T_world_phantom) | {distractors.BODY: where.T_world_bed}
     for name, pose in poses.items():
         body = source.body(name).id
         model.body_pos[body] = source.body_pos[body] + pose[:3, 3]
         model.body_quat[body] = matrix_to_quaternion(pose[:3, :3])
+    show_ink(model, scene.ink_geoms, where.pair)
 
 
 def _stands(name: str) -> bool:

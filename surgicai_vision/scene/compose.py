@@ -24,7 +24,7 @@ from surgicai_vision.core.config import SceneConfig
 from surgicai_vision.core.errors import UnknownName
 from surgicai_vision.scene import arm, holes, kinematics, needle, phantom, rotations, thread, tissue
 from surgicai_vision.scene.cameras import add_cameras
-from surgicai_vision.scene.visual import materials
+from surgicai_vision.scene.visual import materials, skin
 
 TIMESTEP = 0.002
 USER_DATA = 208
@@ -43,6 +43,10 @@ ARMS = 8
 """Instrument on instrument."""
 THREAD = 16
 """Thread on tissue and instruments."""
+
+
+LATER = ("ink",)
+"""Fields that scenes did not have at first (`config.to_identity`)."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,7 @@ class Scene:
         pair: the hole pair of this scene's stitch.
         needle_qpos: the needle's position and quaternion in qpos.
         needle_geoms: ids of the needle's capsules, from base to tip.
+        ink_geoms: ids of the ink about each hole pair, where each has its own; else none.
     """
 
     model: mujoco.MjModel
@@ -84,6 +89,7 @@ class Scene:
     pair: holes.HolePair
     needle_qpos: slice
     needle_geoms: range
+    ink_geoms: tuple[int, ...] = ()
 
     def named(self, kind: str, name: str) -> int:
         """Return the id of a named body, joint, geom, site, camera, actuator or sensor.
@@ -116,7 +122,7 @@ def _build_scene(config: SceneConfig, others: tuple[str, ...]) -> Scene:
     """Build the scene of `config` with the cameras `others` beside ours."""
     spec = build_spec(config)
     model = spec.compile()
-    text = spec.to_xml() + configuration.digest(config)
+    text = spec.to_xml() + configuration.digest(configuration.to_identity(config, LATER))
     if config.tissue == "soft":
         text += configuration.digest(tissue.FORCES[config.tissue_forces])
     if others:
@@ -134,6 +140,7 @@ def _build_scene(config: SceneConfig, others: tuple[str, ...]) -> Scene:
         pair=holes.PAIRS[config.layout][config.hole_pair - 1],
         needle_qpos=slice(free, free + 7),
         needle_geoms=range(first, first + needle.SEGMENTS),
+        ink_geoms=skin.ink_geoms(model, config.layout) if config.ink == "due" else (),
     )
 
 
@@ -174,7 +181,7 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     if config.grasp == "attach":
         for name in names.ARMS:
             arm.add_weld(spec, name)
-    materials.dress(spec, config.layout, config.instrument, config.tissue)
+    materials.dress(spec, config)
     add_cameras(spec, names.CAMERAS, config.instrument)
     return spec
 

@@ -31,6 +31,7 @@ from surgicai_vision.scene.kinematics import base_in_world, start_in_base
 from surgicai_vision.scene.needle import NeedleShape
 from surgicai_vision.scene.phantom import ORIGIN, SIZE
 from surgicai_vision.scene.reshape import reshape_needle
+from surgicai_vision.scene.visual.shapes import VISIBLE
 
 AXES = WORLD.on
 
@@ -345,3 +346,30 @@ def test_every_corner_of_the_arms_starts_is_reached(signs):
         shift = np.array(env.simulation.tip(arm)[:3]) - home
         np.testing.assert_allclose(shift, limit * np.array(signs), atol=5e-4)
     assert not env.simulation.touches_phantom(needle=False)
+
+
+def test_ink_rings_the_pair_that_is_due_alone():
+    config = TaskConfig(
+        "place",
+        scene=SceneConfig(ink="due", hole_pair=2),
+        randomisation=RandomisationConfig(pair="any", phantom_shift=10),
+    )
+    env = envs.make(config)
+    geoms = env.scene.ink_geoms
+    assert len(geoms) == 4
+
+    def ringed(model):
+        return [index for index, geom in enumerate(geoms) if model.geom_group[geom] == VISIBLE]
+
+    assert ringed(env.scene.model) == [1]
+    drawn = set()
+    for seed in range(12):
+        env.reset(seed=seed)
+        assert ringed(env.model) == [env.simulation.pair_index]
+        drawn.add(env.simulation.pair_index)
+    assert drawn == {0, 1, 2, 3}
+    assert ringed(env.scene.model) == [1]
+    env.close()
+    assert build_scene(SceneConfig()).ink_geoms == ()
+    with pytest.raises(InputError, match="marks the pair"):
+        SceneConfig(ink="due", tissue="soft")

@@ -11,8 +11,10 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
+from surgicai_vision.core.config import SceneConfig
 from surgicai_vision.core.names import ARMS, PSM1, PSM2
 from surgicai_vision.scene import needle
+from surgicai_vision.scene.holes import PAIRS
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.phantom import ORIGIN, SIZE, TABLE
 from surgicai_vision.scene.visual import (
@@ -24,7 +26,7 @@ from surgicai_vision.scene.visual import (
     textures,
     tool,
 )
-from surgicai_vision.scene.visual.shapes import hide, show
+from surgicai_vision.scene.visual.shapes import HIDDEN, hide, show
 
 DRAPE_X = (0.04, 0.08, 0.13, 0.19, 0.27, 0.40, 0.60, 0.90)
 """Columns of the drape's points on each side of the phantom's middle [m], closer where the cameras
@@ -124,20 +126,15 @@ def add_surroundings(spec: mujoco.MjSpec) -> None:
     distractors.add_distractors(spec)
 
 
-def dress(
-    spec: mujoco.MjSpec,
-    layout: str = "simple",
-    instrument: str = "400006",
-    tissue: str = "channels",
-) -> None:
+def dress(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     """Give finished bodies their visible shape and hide the physical geoms beneath it."""
-    if tissue == "soft":
+    if config.tissue == "soft":
         hide(spec.body("phantom"))
-        soft_skin.add_soft_skin(spec, spec.body("phantom"), layout)
+        soft_skin.add_soft_skin(spec, spec.body("phantom"), config.layout)
     else:
-        _dress_phantom(spec, layout)
+        _dress_phantom(spec, config)
     dress_needle(spec)
-    length = INSTRUMENTS[instrument].pitch_to_yaw
+    length = INSTRUMENTS[config.instrument].pitch_to_yaw
     tool.add_tool_meshes(spec, length)
     for arm in ARMS:
         shaft = spec.body(f"{arm}_outer_roll_link")
@@ -150,13 +147,23 @@ def dress(
             tool.dress_finger(spec.body(f"{arm}_{side}_finger"), sign)
 
 
-def _dress_phantom(spec: mujoco.MjSpec, layout: str) -> None:
+def _dress_phantom(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     body = spec.body("phantom")
     hide(body, keep="pad")
     spec.geom("phantom_pad").material = "flesh"
-    skin.add_skin(spec, layout)
-    for mesh, material in (("skin", "tissue"), ("inside", "inside"), ("ink", "ink")):
+    skin.add_skin(spec, config.layout)
+    for mesh, material in (("skin", "tissue"), ("inside", "inside")):
         show(body, Shape, material, meshname=mesh)
+    if config.ink == "alike":
+        skin.add_ink(spec, "ink", PAIRS[config.layout])
+        show(body, Shape, "ink", meshname="ink")
+        return
+    for number, pair in enumerate(PAIRS[config.layout], start=1):
+        name = skin.ink_of(number)
+        skin.add_ink(spec, name, (pair,))
+        show(body, Shape, "ink", meshname=name, name=name)
+        if number != config.hole_pair:
+            spec.geom(name).group = HIDDEN
 
 
 def dress_needle(spec: mujoco.MjSpec, shape: needle.NeedleShape = needle.OWN_SHAPE) -> None:

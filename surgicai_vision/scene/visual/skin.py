@@ -2,7 +2,8 @@
 
 At each hole the skin lies on the faces of the boxes; between two hole pairs, whose gaps differ, it
 runs straight where the boxes have a step of up to 0.5 mm. The holes are open, have walls, and show
-a dark inside; a ring of ink marks each as on a training phantom.
+a dark inside; a ring of ink marks each as on a training phantom, or those of the pair to be sewn
+alone (`SceneConfig.ink`).
 """
 
 import math
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.scene.holes import OPENING, PAIRS, SURFACE, Hole, HolePair
 from surgicai_vision.scene.phantom import CREST, ORIGIN, SIZE, WALL, flank_height, piece_edges
-from surgicai_vision.scene.visual.shapes import Mesh
+from surgicai_vision.scene.visual.shapes import HIDDEN, VISIBLE, Mesh
 
 Array = NDArray[np.float64]
 
@@ -39,11 +40,38 @@ STRIP = 0.0005
 
 
 def add_skin(spec: mujoco.MjSpec, layout: str) -> None:
-    """Add the meshes "skin" (textured), "inside" and "ink" of a layout to `spec`."""
+    """Add the meshes "skin" (textured) and "inside" of a layout to `spec`."""
     pairs = PAIRS[layout]
     _skin(pairs).add_to(spec, "skin")
     _inside(pairs).add_to(spec, "inside")
-    _ink(pairs).add_to(spec, "ink")
+
+
+def add_ink(spec: mujoco.MjSpec, name: str, pairs: Sequence[HolePair]) -> None:
+    """Add a mesh of rings of ink about the openings of pairs to `spec`."""
+    _ink(pairs).add_to(spec, name)
+
+
+def ink_of(number: int) -> str:
+    """Return the name of the ink about pair 1, 2, 3 or 4 alone, a mesh and a geom."""
+    return f"ink{number}"
+
+
+def ink_geoms(model: mujoco.MjModel, layout: str) -> tuple[int, ...]:
+    """Return the ids of the geoms of ink, of pair 1 first, where each pair has its own."""
+    numbers = range(1, len(PAIRS[layout]) + 1)
+    return tuple(model.geom(ink_of(number)).id for number in numbers)
+
+
+def show_ink(model: mujoco.MjModel, geoms: Sequence[int], pair: int) -> None:
+    """Show the ink about one pair alone.
+
+    Args:
+        model: of an env's own.
+        geoms: what `ink_geoms` returned; none changes nothing.
+        pair: index of the pair, 0 to 3.
+    """
+    for index, geom in enumerate(geoms):
+        model.geom_group[geom] = VISIBLE if index == pair else HIDDEN
 
 
 def flank_line(hole: Hole, height: float, offset: float) -> Array:
@@ -189,7 +217,7 @@ def _add_walls(mesh: Mesh, near: Array, far: Array, y: float) -> None:
     mesh.add_grid(grid[:, ::-1])
 
 
-def _ink(pairs: tuple[HolePair, ...]) -> Mesh:
+def _ink(pairs: Sequence[HolePair]) -> Mesh:
     """Return a flat ring about every hole."""
     mesh = Mesh()
     reach = np.array([-OPENING / 2 - INK_WIDTH, -OPENING / 2, OPENING / 2, OPENING / 2 + INK_WIDTH])
