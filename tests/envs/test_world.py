@@ -363,7 +363,7 @@ def test_ink_rings_the_pair_that_is_due_alone():
 
     assert ringed(env.scene.model) == [1]
     drawn = set()
-    for seed in range(12):
+    for seed in range(24):
         env.reset(seed=seed)
         assert ringed(env.model) == [env.simulation.pair_index]
         drawn.add(env.simulation.pair_index)
