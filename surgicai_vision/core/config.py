@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import yaml
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, UnknownName, check_name
+from surgicai_vision.core.errors import InputError, UnknownName, check_name, check_positive
 from surgicai_vision.core.tasks import SUBTASK_STEPS, check_task, task_steps
 
 if TYPE_CHECKING:
@@ -92,6 +92,29 @@ class SceneConfig:
             raise InputError(f"hole_pair is {self.hole_pair!r}; allowed: 1, 2, 3, 4.")
         if self.thread not in (0, 10, 20, 40):
             raise InputError(f"thread is {self.thread!r} segments; allowed: 0, 10, 20, 40.")
+
+
+@dataclass(frozen=True)
+class SuccessRule:
+    """What a success of one subtask asks for in learning beyond the paper's; by default nothing.
+
+    Attributes:
+        steps: control steps for which it must hold; the whole procedure has `DWELL`.
+        tolerance_share: share of the tolerance within which it counts. What stops at the edge has
+            nothing left for a start it never saw.
+        keeps_holes: it counts only while the needle has passed as many holes as at the start. The
+            paper's handoff counts with the needle torn out of the tissue, which no pull-out can
+            then complete.
+    """
+
+    steps: int = 1
+    tolerance_share: float = 1.0
+    keeps_holes: bool = False
+
+    def __post_init__(self) -> None:
+        check_positive(success_steps=self.steps, tolerance_share=self.tolerance_share)
+        if self.tolerance_share > 1:
+            raise InputError(f"tolerance_share is {self.tolerance_share}; it must be at most 1.")
 
 
 ACTION_REPEAT_LIMIT = 10

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import SuccessRule, TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError, check_name
 from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.core.tasks import task_text
@@ -79,15 +79,9 @@ class SuturingEnv(gymnasium.Env):
         truncates: end episodes at `config.max_steps`; False where gymnasium's `TimeLimit` does.
 
     Attributes:
-        success_steps: control steps for which the success of a task of one subtask must hold before
-            it counts; 1 is the paper's. Learners set it that want to know what comes after
-            (`rl.settings`); the whole procedure has `config.DWELL`. `compute_reward` knows goals
-            alone, and takes one that is reached for a success at once.
-        tolerance_share: share of the tolerance within which a success counts; 1 is all of it.
-            Learners set it too: what stops at the edge has nothing left for a start it never saw.
-        keeps_holes: a success counts only while the needle has passed as many holes as at the
-            subtask's start. The paper's handoff counts with the needle torn out of the tissue,
-            which no pull-out can then complete.
+        success_rule: what a success of a task of one subtask asks for beyond the paper's; learners
+            set it (`rl.settings`). `compute_reward` knows goals alone: it does not wait for a
+            success to hold.
     """
 
     # gymnasium declares no ClassVar
@@ -110,9 +104,7 @@ class SuturingEnv(gymnasium.Env):
         self.view = view
         self.render_mode = render_mode
         self._truncates = truncates
-        self.success_steps = 1
-        self.tolerance_share = 1.0
-        self.keeps_holes = False
+        self.success_rule = SuccessRule()
         self.scene = build_scene(config.scene)
         axes = config.randomisation
         self.simulation = Simulation(self.scene, own_model=bool(axes.on), latency=axes.latency)
@@ -398,8 +390,9 @@ class SuturingEnv(gymnasium.Env):
         return self.subtask.target(self.simulation, self.stitch)
 
     def tolerance(self) -> Tolerance:
-        """Return how near the present subtask's goal is near enough, `tolerance_share` of it."""
-        return self.subtask.tolerances[self.config.tolerance].scaled(self.tolerance_share)
+        """Return how near the present subtask's goal is near enough, by the rule of success."""
+        share = self.success_rule.tolerance_share
+        return self.subtask.tolerances[self.config.tolerance].scaled(share)
 
     def reward(self, info: Info) -> float:
         """Return the reward of a measurement."""
@@ -574,14 +567,14 @@ class SuturingEnv(gymnasium.Env):
     def _has_kept_holes(self) -> bool:
         """Return True unless a hole passed at the start was lost, and that counts."""
         passed = self.simulation.task_state.holes_passed
-        return not self.keeps_holes or passed >= self.subtask.passed_at_start
+        return not self.success_rule.keeps_holes or passed >= self.subtask.passed_at_start
 
     def _progress(self, info: Info) -> bool:
         """Go on to the next subtask, where a task has several; return True if so."""
         if info["is_success"]:
             info["is_success"] = self._is_within_share(info) and self._has_kept_holes()
-        if self.success_steps > 1:
-            info["is_success"] = self._count_dwell(info["is_success"]) >= self.success_steps
+        if self.success_rule.steps > 1:
+            info["is_success"] = self._count_dwell(info["is_success"]) >= self.success_rule.steps
         return False
 
     def _is_within_share(self, info: Info) -> bool:

@@ -16,9 +16,9 @@ SB3 = "stable_baselines3"
 SB3_CONTRIB = "sb3_contrib"
 D3RLPY = "d3rlpy"
 
-COUNTED = ("success_steps", "tolerance_share", "keeps_holes")
-"""What a success asks for in learning beyond the paper's: attributes of the env by these names."""
-COMMON = ("hidden", "learning_rate", "gamma", "batch_size", *COUNTED)
+SUCCESS = ("success_steps", "tolerance_share", "keeps_holes")
+"""What a success asks for in learning beyond the paper's (`core.config.SuccessRule`)."""
+COMMON = ("hidden", "learning_rate", "gamma", "batch_size", *SUCCESS)
 ONLINE = (*COMMON, "envs")
 OFF_POLICY = (*ONLINE, "tau", "train_every", "updates", "learning_starts", "critics")
 DETERMINISTIC = (*OFF_POLICY, "exploration_noise")

@@ -21,7 +21,6 @@ from torch import nn
 
 from policies.actor import Actor
 from policies.base import Policy
-from surgicai_vision.rl.algorithms import COUNTED
 from surgicai_vision.rl.buffers import HindsightBuffer, MixedBuffer, demonstrations_of
 from surgicai_vision.rl.extractor import FeatureMemo, RelativeExtractor, StandardExtractor
 from surgicai_vision.rl.learner import (
@@ -76,8 +75,7 @@ class OnlineLearner(Learner):
         has_goal = request.algorithm.has_hindsight
         obs_type = "goal" if has_goal else request.observation
         self.env = SuturingVecEnv.of(request.env, obs_type, settings.envs, workers)
-        for name in COUNTED:
-            self.env.set_attr(name, getattr(settings, name))
+        self.env.set_attr("success_rule", settings.success_rule)
         self.model = self._model()
         if transitions is not None:
             buffer = self._buffer

@@ -6,7 +6,7 @@ from typing import final
 
 from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError, check_at_least
-from surgicai_vision.rl.algorithms import COUNTED
+from surgicai_vision.rl.algorithms import SUCCESS
 from surgicai_vision.rl.settings import Settings, settings_of
 
 ALGO = "td3"
@@ -59,6 +59,6 @@ class ResidualRequest:
             raise InputError(f"bound is {self.bound}; it must be above 0 and at most 1.")
         check_at_least(1, env_steps=self.env_steps, save_every=self.save_every)
         check_at_least(0, validation=self.validation, seed=self.seed)
-        for name in ("envs", *COUNTED):
+        for name in ("envs", *SUCCESS):
             if getattr(self.settings, name) != getattr(Settings, name):
                 raise InputError(f"A residual policy reads no {name}; leave it out.")

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field
 from typing import final
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON, TaskConfig, from_mapping
+from surgicai_vision.core.config import JSON, SuccessRule, TaskConfig, from_mapping
 from surgicai_vision.core.errors import InputError, UnknownName, check_name, check_positive
 from surgicai_vision.core.tasks import load_subtask
 from surgicai_vision.rl.algorithms import ALGORITHMS, Algorithm
@@ -52,14 +52,13 @@ class Settings:
         clip_q: clip targets to the range of a return of the reward, [-1 / (1 - γ), 0].
         rollout: steps of all envs from update to update (PPO).
         samples: actions sampled a state by BCQ and Cal-QL (their papers' code: 100 and 10).
-        success_steps: control steps for which success must hold before an episode of learning, or
-            a demonstration, ends. With 1, the paper's, nothing is learned of what comes after, and
-            the next subtask of a whole procedure finds it unfinished (`config.DWELL`).
-        tolerance_share: share of the tolerance within which a success counts in learning. With 1,
-            the paper's, an actor learns to stop at the edge of the tolerance.
-        keeps_holes: a success counts in learning only while the needle has passed as many holes as
-            at the start. Without, as in the paper, an actor may learn handoffs that pull the needle
-            out of the tissue.
+        success_steps: `SuccessRule.steps`, for an episode of learning or a demonstration. With 1,
+            the paper's, nothing is learned of what comes after, and the next subtask of a whole
+            procedure finds it unfinished.
+        tolerance_share: `SuccessRule.tolerance_share`. With 1, the paper's, an actor learns to stop
+            at the edge of the tolerance.
+        keeps_holes: `SuccessRule.keeps_holes`. Without, as in the paper, an actor may learn
+            handoffs that pull the needle out of the tissue.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -102,18 +101,20 @@ class Settings:
             goals=self.goals,
             rollout=self.rollout,
             samples=self.samples,
-            success_steps=self.success_steps,
-            tolerance_share=self.tolerance_share,
         )
         for name in ("gamma", "tau", "demo_share", "bc_weight"):
             if not 0 < getattr(self, name) < 1:
                 raise InputError(
                     f"{name} is {getattr(self, name)}; it must be between 0 and 1, both left out."
                 )
-        if self.tolerance_share > 1:
-            raise InputError(f"tolerance_share is {self.tolerance_share}; it must be at most 1.")
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1.")
+        _ = self.success_rule  # refuses what is not allowed
+
+    @property
+    def success_rule(self) -> SuccessRule:
+        """What a success asks for in learning beyond the paper's."""
+        return SuccessRule(self.success_steps, self.tolerance_share, self.keeps_holes)
 
 
 @final

@@ -32,7 +32,6 @@ from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.envs.relative import relative_features
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.rollout import run_share
-from surgicai_vision.rl.algorithms import COUNTED
 from surgicai_vision.rl.extra import check_extra
 from surgicai_vision.rl.learner import Learner
 from surgicai_vision.rl.settings import Request, read_by
@@ -181,8 +180,8 @@ def _learner(request: Request, demos: Sequence[Path], workers: int) -> Learner:
     transitions = None
     if algorithm.needs_demos:
         obs_type = "goal" if algorithm.has_hindsight else request.observation
-        counted = {name: getattr(request.settings, name) for name in COUNTED}
-        transitions = of_demos(demos, request.env, obs_type, counted=counted)
+        rule = request.settings.success_rule
+        transitions = of_demos(demos, request.env, obs_type, success_rule=rule)
     mean, std = _statistics(request, transitions)
     if algorithm.is_online:
         from surgicai_vision.rl.online import OnlineLearner

@@ -18,27 +18,24 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision import envs
-from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, to_mapping
+from surgicai_vision.core.config import SuccessRule, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name
 from surgicai_vision.core.files import write_bytes
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.demos.store import Demo, demos_digest, read_demo
 from surgicai_vision.envs.base import Observation, SuturingEnv
-from surgicai_vision.rl.algorithms import COUNTED
 
 OBSERVATION = "observation"
 """Key of an observation that is one array, and of the proprioception of a goal dict."""
 OBS_TYPES = ("relative", "state", "goal")
 """What transitions may show: arrays of numbers."""
 VERSION = 1
-NOTHING_MORE: Mapping[str, JSON] = MappingProxyType({})
 
 Arrays = Mapping[str, NDArray[np.float32]]
 
@@ -116,7 +113,7 @@ def of_demos(
     config: TaskConfig | None = None,
     obs_type: str = "relative",
     progress: Progress | None = None,
-    counted: Mapping[str, JSON] = NOTHING_MORE,
+    success_rule: SuccessRule = SuccessRule(),
 ) -> Transitions:
     """Replay demonstrations and return their transitions.
 
@@ -126,8 +123,7 @@ def of_demos(
             those they were recorded in. None takes the recorded one.
         obs_type: what is observed, one of `OBS_TYPES`.
         progress: called with (demonstrations done, in all).
-        counted: what a success asks for beyond the paper's, as the env's attributes of these names
-            (`rl.algorithms.COUNTED`), such as {"success_steps": 15}.
+        success_rule: what a success asks for beyond the paper's.
 
     Raises:
         InputError: demonstrations of another task, scene, step size or randomisation, or none that
@@ -145,8 +141,7 @@ def of_demos(
         config = config or demo.config
         if env is None:
             env = envs.make(config, obs_type)
-            for name, value in counted.items():
-                setattr(env, check_name("demand of a success", name, COUNTED), value)
+            env.success_rule = success_rule
         _check(path, demo, env)
         episode = _replay(env, demo)
         if episode.terminated:

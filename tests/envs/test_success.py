@@ -13,7 +13,7 @@ from needle_polyline import crosses
 
 from surgicai_vision import envs
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import SuccessRule, TaskConfig
 from surgicai_vision.demos.expert import Expert
 from surgicai_vision.envs import hole_crossing, poses
 from surgicai_vision.envs.force_plate import ForcePlate
@@ -429,7 +429,7 @@ def test_no_arm_is_pushed_out_of_the_tissue_at_the_start_of_a_pullout():
 @pytest.mark.parametrize("keeps", [False, True])
 def test_a_needle_torn_out_of_a_hole_counts_as_handed_over_unless_holes_are_kept(keeps, obs_type):
     env = make("handoff", obs_type=obs_type)
-    env.keeps_holes = keeps
+    env.success_rule = SuccessRule(keeps_holes=keeps)
     env.reset(seed=0)
     expert, ended = Expert(env), False
     while not ended:
@@ -448,7 +448,7 @@ def test_a_needle_torn_out_of_a_hole_counts_as_handed_over_unless_holes_are_kept
 def test_a_share_of_the_tolerance_asks_for_so_much_of_it(obs_type):
     env = make("insert", obs_type=obs_type)
     whole = env.tolerance()
-    env.tolerance_share = 0.5
+    env.success_rule = SuccessRule(tolerance_share=0.5)
     half = env.tolerance()
     assert (half.distance, half.angle) == (whole.distance / 2, whole.angle / 2)
     env.reset(seed=0)

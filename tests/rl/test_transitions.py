@@ -8,7 +8,7 @@ import pytest
 
 from surgicai_vision import envs
 from surgicai_vision.commands.main import main
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import SuccessRule, TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.tasks import load_subtask
 from surgicai_vision.demos.store import list_demos, read_demo
@@ -81,7 +81,7 @@ def test_options_of_the_env_hold_in_the_replay(demos):
 def test_a_success_that_must_hold_ends_a_demonstration_so_many_steps_later(demos, task):
     paths = list_demos(demos[task])
     plain = of_demos(paths)
-    held = of_demos(paths, counted={"success_steps": 3})
+    held = of_demos(paths, success_rule=SuccessRule(3))
     assert held.episodes == 2 and len(held) >= len(plain) + 2 * 2
     for episode in range(2):
         met = int(np.argmax(read_demo(paths[episode]).success)) + 1
@@ -89,7 +89,7 @@ def test_a_success_that_must_hold_ends_a_demonstration_so_many_steps_later(demos
         assert len(rewards) >= met + 2
         assert rewards[-1] == 0 and (rewards[:-1] == -1).all()
     with pytest.raises(InputError, match="--post-success-steps"):
-        of_demos(paths, counted={"success_steps": 9})
+        of_demos(paths, success_rule=SuccessRule(9))
 
 
 def test_a_share_of_the_tolerance_ends_a_demonstration_nearer_to_its_goal(demos):
@@ -104,7 +104,7 @@ def test_a_share_of_the_tolerance_ends_a_demonstration_nearer_to_its_goal(demos)
 
     plain = of_demos(paths, obs_type="goal")
     share = float(0.99 * used(plain))
-    nearer = of_demos(paths, obs_type="goal", counted={"tolerance_share": share})
+    nearer = of_demos(paths, obs_type="goal", success_rule=SuccessRule(tolerance_share=share))
     assert nearer.episodes == plain.episodes and len(nearer) > len(plain)
     assert used(nearer) <= share < used(plain) <= 1
 
