@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from torch import nn
 
 from policies.base import ACTIONS, Inputs, Plugin, Policy, Recipe, fed_vector
-from policies.bc import BCPolicy
 from policies.layers import FeatureMLP
 from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError
@@ -106,11 +105,13 @@ class Residual(Policy):
         return nn.functional.mse_loss(self(observed), target)
 
     @torch.no_grad()
-    def take_base(self, base: BCPolicy) -> None:
-        """Take the weights of the policy that is corrected, and what its inputs are divided by."""
-        self.network.load_state_dict(base.network.state_dict())
-        self.input_mean.copy_(base.input_mean)
-        self.input_std.copy_(base.input_std)
+    def take_base(self, base: Policy) -> None:
+        """Take the weights of the policy that is corrected, and what its inputs are divided by.
+
+        Args:
+            base: a policy of behaviour cloning, `bc`; its tensors bear the names of this one's.
+        """
+        self.load_state_dict({**self.state_dict(), **base.state_dict()})
 
     @torch.no_grad()
     def take_correction(self, layers: Sequence[nn.Linear]) -> None:

@@ -29,7 +29,6 @@ from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from torch import nn
 
 from policies.base import ACTIONS
-from policies.bc import BCPolicy
 from policies.residual import RESIDUAL, Residual, ResidualRecipe
 from surgicai_vision import __version__
 from surgicai_vision.core import names
@@ -210,7 +209,6 @@ class _Training:
         agent = spec.make_agent()
         assert isinstance(agent, PolicyAgent)
         base = agent.policy
-        assert isinstance(base, BCPolicy)
         self.base = base.checkpoint
         settings = request.settings
         values = {
