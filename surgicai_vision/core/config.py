@@ -10,7 +10,7 @@ import hashlib
 import json
 import types
 import typing
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeVar, cast
 
@@ -44,6 +44,8 @@ CLOCK_PERIOD = 25
 """Period of the sine and cosine of `clock` [control steps]."""
 CLOCK_SIZE = 3
 """Length of what `clock` returns."""
+LATER: Mapping[str, bool] = types.MappingProxyType({"later": True})
+"""Metadata of a field that its dataclass did not have at first (`to_identity`)."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class SceneConfig:
     torque: str = "effective"
     tissue: str = "channels"
     tissue_forces: str = "phantom"
-    ink: str = "alike"
+    ink: str = field(default="alike", metadata=LATER)
 
     def __post_init__(self) -> None:
         check_name("layout", self.layout, names.LAYOUTS)
@@ -359,20 +361,20 @@ def to_mapping(config: "DataclassInstance") -> dict[str, JSON]:
     return plain
 
 
-def to_identity(config: "DataclassInstance", later: Collection[str]) -> dict[str, JSON]:
+def to_identity(config: "DataclassInstance") -> dict[str, JSON]:
     """Return a frozen dataclass as the plain data by which it is known.
 
-    Args:
-        config: the dataclass.
-        later: fields that it did not have at first, each with a default. Those that still have it
-            are left out, so that a digest of what does not use them stays what it was.
+    As `to_mapping`, but without the fields, its own and those of dataclasses in it, that are
+    marked `LATER` and have their default: a digest of what does not use them stays what it was.
     """
-    usual = {field.name: field.default for field in dataclasses.fields(config)}
-    return {
-        name: value
-        for name, value in to_mapping(config).items()
-        if name not in later or getattr(config, name) != usual[name]
-    }
+    plain = to_mapping(config)
+    for each in dataclasses.fields(config):
+        value = getattr(config, each.name)
+        if each.metadata == LATER and value == each.default:
+            del plain[each.name]
+        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+            plain[each.name] = to_identity(value)
+    return plain
 
 
 def read_changes(texts: Iterable[str]) -> dict[str, JSON]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON, TaskConfig, check_frame_stride, to_identity
+from surgicai_vision.core.config import JSON, LATER, TaskConfig, check_frame_stride
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.core.variants import Variants
 from surgicai_vision.demos.demonstrator import CHOOSING_DEMONSTRATORS, SCRIPTED_DEMONSTRATORS
@@ -25,8 +25,6 @@ are the training seed's own.
 """
 DEMONSTRATORS = (*SCRIPTED_DEMONSTRATORS, *sorted(CHOOSING_DEMONSTRATORS))
 """Who may demonstrate: a scripted expert, or what re-poses other demonstrations."""
-LATER = ("appearance", "distractors", "variants", "of")
-"""Fields that demonstrations did not have at first (`config.to_identity`)."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +71,10 @@ class Demonstrations:
     late: int = 0
     env: Mapping[str, JSON] = field(default_factory=dict)
     visits_of: str = ""
-    appearance: str = ""
-    distractors: int = 0
-    variants: int = 1
-    of: str = ""
+    appearance: str = field(default="", metadata=LATER)
+    distractors: int = field(default=0, metadata=LATER)
+    variants: int = field(default=1, metadata=LATER)
+    of: str = field(default="", metadata=LATER)
 
     def __post_init__(self) -> None:
         check_name("demonstrator", self.demonstrator, DEMONSTRATORS)
@@ -99,11 +97,6 @@ class Demonstrations:
         if not (self.appearance or self.distractors) and self.variants == 1:
             return None
         return Variants(self.appearance, self.distractors, self.variants)
-
-    @property
-    def identity(self) -> Mapping[str, JSON]:
-        """They as plain data by which they are known (`config.to_identity`)."""
-        return to_identity(self, LATER)
 
     @property
     def disturbance(self) -> Disturbance:

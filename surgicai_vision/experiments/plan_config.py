@@ -47,7 +47,14 @@ from pathlib import Path
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import view_names
-from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
+from surgicai_vision.core.config import (
+    JSON,
+    TaskConfig,
+    digest,
+    from_mapping,
+    to_identity,
+    to_mapping,
+)
 from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.experiments.dataset_config import (
@@ -306,7 +313,7 @@ class Plan:
         """Hash of what the whole procedure's policies are but for the training seed."""
         table = {
             **to_mapping(self),
-            "demonstrations": [each.identity for each in self.demonstrations],
+            "demonstrations": list(map(to_identity, self.demonstrations)),
         }
         decide = ("size", "encoder", "pool", "recipe", "demonstrations", "policies", "procedure")
         return digest({key: table[key] for key in (*decide, "epochs", "env")})

@@ -45,10 +45,6 @@ THREAD = 16
 """Thread on tissue and instruments."""
 
 
-LATER = ("ink",)
-"""Fields that scenes did not have at first (`config.to_identity`)."""
-
-
 @dataclass(frozen=True)
 class ArmIds:
     """Where one arm's numbers stand in MuJoCo's arrays."""
@@ -122,7 +118,7 @@ def _build_scene(config: SceneConfig, others: tuple[str, ...]) -> Scene:
     """Build the scene of `config` with the cameras `others` beside ours."""
     spec = build_spec(config)
     model = spec.compile()
-    text = spec.to_xml() + configuration.digest(configuration.to_identity(config, LATER))
+    text = spec.to_xml() + configuration.digest(configuration.to_identity(config))
     if config.tissue == "soft":
         text += configuration.digest(tissue.FORCES[config.tissue_forces])
     if others:

@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import check_view
-from surgicai_vision.core.config import JSON, TaskConfig, read_changes, to_identity
+from surgicai_vision.core.config import JSON, LATER, TaskConfig, read_changes
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.core.variants import Variants
 
@@ -120,8 +120,8 @@ class RunConfig:
     noise: float = 0.0
     post_success_steps: int = 0
     frame_stride: int = 1
-    variants: Variants | None = None
-    multiplied_from: int | None = None
+    variants: Variants | None = field(default=None, metadata=LATER)
+    multiplied_from: int | None = field(default=None, metadata=LATER)
     updates: int | None = None
     batch_size: int | None = None
     seed: int = 0
@@ -224,15 +224,6 @@ class RunConfig:
     def recipe_changes(self) -> dict[str, JSON]:
         """Keys of the recipe that are replaced, with their values: the only way to change one."""
         return read_changes(self.changes) | ({"privileged": True} if self.privileged else {})
-
-
-LATER = ("variants", "multiplied_from")
-"""Fields that runs did not have at first (`config.to_identity`)."""
-
-
-def identity(run: RunConfig) -> Mapping[str, JSON]:
-    """Return a run as plain data by which it is known (`config.to_identity`)."""
-    return to_identity(run, LATER)
 
 
 def with_epochs(changes: tuple[str, ...], epochs: int | None) -> tuple[str, ...]:

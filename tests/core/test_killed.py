@@ -97,7 +97,7 @@ def descendants(pid):
 
 def kill_and_look(started, number, delay):
     """Kill a process once it has descendants; return those that outlive it."""
-    until = time.monotonic() + 60
+    until = time.monotonic() + 300  # a loaded machine starts slowly
     while not descendants(started.pid):
         assert started.poll() is None, started.communicate()
         assert time.monotonic() < until, "it starts no process"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON, digest, from_mapping, to_mapping
+from surgicai_vision.core.config import JSON, digest, from_mapping, to_identity, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError, MissingWeights
 from surgicai_vision.core.executor import Job, register_job
 from surgicai_vision.core.files import read_json
@@ -22,7 +22,7 @@ from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import WeightsSource
 from surgicai_vision.rl.extra import check_extra
 from surgicai_vision.training import policies
-from surgicai_vision.training.run_config import OWN, RunConfig, identity
+from surgicai_vision.training.run_config import OWN, RunConfig
 
 REFERENCE_FILE = "reference.json"
 PROBE_FILE = "probe.json"
@@ -112,12 +112,12 @@ def read_experiment_of(folder: Path) -> Experiment:
 
 def training_key(training: Training) -> str:
     """Return the digest of everything that decides what a shared policy is."""
-    return digest({**to_mapping(training), "run": identity(training.run)})[:16]
+    return digest(to_identity(training))[:16]
 
 
 def run_key(run: RunConfig) -> str:
     """Return the digest of everything that decides what a run is."""
-    return digest(identity(run))[:16]
+    return digest(to_identity(run))[:16]
 
 
 def run_folder(out: Path, key: str) -> Path:
