@@ -148,10 +148,21 @@ ANY = "any"
 """A choice: each episode draws one of all."""
 NEEDLE_ARCS = ("1/3", "3/8", "1/2")
 """Arcs of surgical needles, as parts of a circle; the scene's own is the first."""
+CHOSEN_ARCS: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
+    {
+        "": NEEDLE_ARCS[:1],
+        ANY: NEEDLE_ARCS,
+        names.TRAIN: ("1/3", "1/2"),
+        names.HELDOUT: ("3/8",),
+        **{arc: (arc,) for arc in NEEDLE_ARCS},
+    }
+)
+"""What `needle_arc` may be → the arcs that it may draw; the one that is held out lies between
+those to train on."""
 RANDOMISATION_CHOICES: Mapping[str, tuple[str, ...]] = types.MappingProxyType(
     {
         "pair": ("", ANY),
-        "needle_arc": ("", ANY, *NEEDLE_ARCS),
+        "needle_arc": tuple(CHOSEN_ARCS),
         "appearance": ("", names.TRAIN, names.HELDOUT, *names.APPEARANCES),
     }
 )
@@ -182,8 +193,9 @@ class RandomisationConfig:
         phantom_turn: turn of the phantom about world z [deg]; see `envs.placement` for the axis.
         robot_start: place of each arm's tip at the start, along each axis of the world [mm].
         pair: "any" draws the pair of holes to be sewn from all four; "" takes the scene's.
-        needle_arc: how much of a circle the needle is: one of `NEEDLE_ARCS`, or "any" of them; ""
-            takes the scene's, a third.
+        needle_arc: how much of a circle the needle is: one of `NEEDLE_ARCS`, or "any" of them;
+            "train" draws one to train on, a third (in two of three episodes) or a half, "heldout"
+            the one that is kept for tests; "" takes the scene's, a third.
         appearance: "train" draws one of the five families of looks for training, "heldout" one of
             those kept for tests, a family's name takes that one; within it every episode has its
             own look. "" takes the plain look. See docs/looks.md.
@@ -231,6 +243,11 @@ class RandomisationConfig:
     def text(self) -> str:
         """What varies, in words: each axis that is on, with its value; empty where none is."""
         return ", ".join(f"{axis} {vars(self)[axis]}" for axis in self.on)
+
+    @property
+    def arcs(self) -> tuple[str, ...]:
+        """The arcs that the needle may have."""
+        return CHOSEN_ARCS[self.needle_arc]
 
     @property
     def shows_heldout(self) -> bool:

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.config import (
     ANY,
-    NEEDLE_ARCS,
     RandomisationConfig,
     SceneConfig,
     TaskConfig,
@@ -64,11 +63,6 @@ def refuse_impossible(config: TaskConfig, through: bool) -> None:
         _refuse_unreachable(config.scene, axes)
 
 
-def _arcs(axes: RandomisationConfig) -> tuple[str, ...]:
-    """Return the arcs that may be drawn."""
-    return NEEDLE_ARCS if axes.needle_arc == ANY else (axes.needle_arc or NEEDLE_ARCS[0],)
-
-
 def _pairs(scene: SceneConfig, axes: RandomisationConfig) -> tuple[int, ...]:
     """Return the indices of the pairs that may be sewn."""
     return (0, 1, 2, 3) if axes.pair == ANY else (scene.hole_pair - 1,)
@@ -104,7 +98,7 @@ def _refuse_narrow(config: TaskConfig) -> None:
     """Refuse pairs whose holes are too far apart for the smallest needle that may be drawn."""
     axes = config.randomisation
     layout = config.scene.layout
-    for index, arc in itertools.product(_pairs(config.scene, axes), _arcs(axes)):
+    for index, arc in itertools.product(_pairs(config.scene, axes), axes.arcs):
         pair = PAIRS[layout][index]
         smallest = needle.RADIUS * (1.0 - axes.needle_size)
         if has_room(pair, smallest, TIP_ANGLES[arc]):
@@ -124,7 +118,7 @@ def _refuse_narrow(config: TaskConfig) -> None:
         if allowed >= 0:
             limit = min(
                 largest_size(PAIRS[layout][one], TIP_ANGLES[other])
-                for one, other in itertools.product(_pairs(config.scene, axes), _arcs(axes))
+                for one, other in itertools.product(_pairs(config.scene, axes), axes.arcs)
             )
             raise InputError(
                 f"randomisation: needle_size {axes.needle_size} makes '{config.task}' impossible "
@@ -199,7 +193,7 @@ def in_view(scene: SceneConfig, view: str, point: Point) -> bool:
 def _refuse_unreachable(scene: SceneConfig, axes: RandomisationConfig) -> None:
     """Refuse places of the phantom at which an arm cannot follow the needle's way."""
     sizes = sorted({1.0 - axes.needle_size, 1.0 + axes.needle_size})
-    angles = [TIP_ANGLES[arc] for arc in _arcs(axes)]
+    angles = [TIP_ANGLES[arc] for arc in axes.arcs]
     for where, size, tip_angle in itertools.product(corners(scene, axes), sizes, angles):
         stitch = Stitch.of(_placed(scene, where), needle.RADIUS * size, tip_angle)
         low, high = (

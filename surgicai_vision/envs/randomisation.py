@@ -109,9 +109,8 @@ def draw(config: RandomisationConfig, rng: np.random.Generator) -> Draws:
     for axis, unit in UNITS.items():
         values += (rng.uniform(-1.0, 1.0, len(unit)) * unit * getattr(config, axis)).tolist()
     pair = int(rng.integers(1, 5))
-    arc = NEEDLE_ARCS[int(rng.integers(len(NEEDLE_ARCS)))]
-    if config.needle_arc != ANY:
-        arc = config.needle_arc or NEEDLE_ARCS[0]
+    # One number in any case, so that what is drawn next does not depend on the choice.
+    arc = config.arcs[int(rng.integers(len(NEEDLE_ARCS))) % len(config.arcs)]
     values += [pair if config.pair == ANY else 0, TIP_ANGLES[arc] - TIP_ANGLES[NEEDLE_ARCS[0]]]
     values += looks.draw_appearance(config, rng).numbers
     values += looks.draw_litter(config, rng).numbers

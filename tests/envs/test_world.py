@@ -79,6 +79,18 @@ def test_every_pair_and_every_arc_is_drawn():
     assert sorted(set(arcs)) == [0, 15, 60]
 
 
+def test_arcs_are_held_out_between_those_to_train_on():
+    rng = np.random.default_rng(0)
+    drawn = {choice: [] for choice in (names.TRAIN, names.HELDOUT)}
+    for choice, arcs in drawn.items():
+        axes = RandomisationConfig(needle_arc=choice)
+        for _ in range(200):
+            numbers = randomisation.report(axes, randomisation.draw(axes, rng))
+            arcs.append(round(math.degrees(numbers["needle_arc"][0])))
+    assert set(drawn[names.TRAIN]) == {0, 60} and set(drawn[names.HELDOUT]) == {15}
+    assert drawn[names.TRAIN].count(60) > 40
+
+
 @pytest.mark.parametrize("arc", NEEDLE_ARCS)
 def test_an_arc_may_be_chosen(arc):
     env = made(needle_arc=arc)

@@ -55,8 +55,7 @@ def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
         "held-in looks": 10,
         "held-out looks": 10,
         "all axes at half strength": 10,
-        "needles of 3/8 circle": 10,
-        "needles of 1/2 circle": 10,
+        "needles never seen": 10,
     }
     assert {run.task for run in UNMOVED.runs} == set(names.SUBTASKS)
     assert UNMOVED.seed == (0, 1)
@@ -66,13 +65,11 @@ def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
     trained = worlds["held-in looks"]
     assert {shows(dataset) for dataset in UNMOVED.datasets.values()} == {trained}
     heldout = worlds["held-out looks"]
-    assert heldout.shows_heldout and not trained.needle_arc
-    for arc in ("3/8", "1/2"):
-        unseen = worlds[f"needles of {arc} circle"]
-        assert unseen.needle_arc == arc and unseen.needle_size > trained.needle_size
-        same = {"needle_arc", "needle_size", "needle_thickness"}
-        differ = {key for key, value in vars(unseen).items() if vars(heldout)[key] != value}
-        assert differ == same, "the needle alone"
+    assert heldout.shows_heldout and not trained.shows_heldout
+    unseen = worlds["needles never seen"]
+    assert set(unseen.arcs).isdisjoint(trained.arcs) and unseen.needle_size > trained.needle_size
+    differ = {key for key, value in vars(unseen).items() if vars(heldout)[key] != value}
+    assert differ == {"needle_arc", "needle_size", "needle_thickness"}, "the needle alone"
     shifts = {run.condition: run.shift for run in UNMOVED.runs if run.shift}
     assert shifts == {"all axes at half strength": HALF}
 
