@@ -1,16 +1,18 @@
 """EfficientNet-Lite0 whose weights are installed by pip.
 
-`imagenet-lite` and `imagenet-lite-early` share it. The package ships one torch file whose tensors
-stand in the same order, with the same shapes, as those of timm's `tf_efficientnet_lite0`; only the
-names differ, so they are mapped by position. Checked by classification in the tests of encoders.
+`imagenet-lite`, `imagenet-lite-early` and `imagenet-lite-smooth` share it. The package ships one
+torch file whose tensors stand in the same order, with the same shapes, as those of timm's
+`tf_efficientnet_lite0`; only the names differ, so they are mapped by position. Checked by
+classification in the tests of encoders.
 """
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from encoders.card import EncoderCard
-from encoders.state import read_torch
+from encoders.state import map_network, read_torch
 from surgicai_vision.core.errors import BadFile, MissingWeights
 
 if TYPE_CHECKING:
@@ -37,6 +39,19 @@ CARD = EncoderCard(
     paper="Tan and Le, EfficientNet, ICML 2019 (the Lite variant of 2020)",
     layers="conv_head (spatial, tokens), its mean over places (global)",
     note="Supervised on ImageNet-1k; not an encoder of the paper.",
+)
+
+STAGES = 3
+"""Stages of the network that `first_stages` takes, of seven."""
+
+EARLY_CARD = replace(
+    CARD,
+    name="imagenet-lite-early",
+    architecture="timm tf_efficientnet_lite0, stem and the first three stages",
+    dim=40,
+    batch=2,
+    layers="the third stage (spatial, tokens), its mean over places (global)",
+    note="Supervised on ImageNet-1k; not an encoder of the paper. Meant for pool 'spatial'.",
 )
 
 
@@ -72,3 +87,17 @@ def build(card: EncoderCard, path: Path | None) -> "tuple[EncoderCard, nn.Module
     """Build the network from the packaged file or from `path`."""
     path = path or packaged_file()
     return card, network_from(read_torch(path), path)
+
+
+def first_stages(network: "nn.Module") -> "list[nn.Module]":
+    """Return the stem and the first stages: (B, 3, 224, 224) → a map (B, 40, 28, 28)."""
+    blocks = list(network.get_submodule("blocks").children())[:STAGES]
+    return [network.get_submodule("conv_stem"), network.get_submodule("bn1"), *blocks]
+
+
+def build_behind(
+    layers: "list[nn.Module]", card: EncoderCard, path: Path | None
+) -> "tuple[EncoderCard, nn.Module]":
+    """Build the first stages behind other layers: (B, 3, 224, 224) → (B, 40)."""
+    card, network = build(card, path)
+    return card, map_network(*layers, *first_stages(network))

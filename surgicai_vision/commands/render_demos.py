@@ -14,6 +14,7 @@ from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
     EXECUTOR,
+    FRACTION,
     IMAGE_SIZE,
     NOT_NEGATIVE,
     TASK,
@@ -55,6 +56,7 @@ class Options:
         appearance: Looks to draw, whatever was recorded: train, heldout or a family's name.
         distractors: Most things that lie about, drawn with the look.
         variants: Looks in which each demonstration is rendered.
+        corruption: Largest strength of smoke, blur and pixel noise, each drawn with the look.
         workers: Number of processes.
         out: Dataset to make.
     """
@@ -82,6 +84,7 @@ class Options:
     ] = None
     distractors: Annotated[int | None, within(0, 5), default_text("as recorded")] = None
     variants: Annotated[int, COUNT] = 1
+    corruption: Annotated[float, FRACTION] = 0.0
     video: Annotated[str | None, VIDEO, default_text("lossless images")] = None
     workers: Annotated[int, COUNT] = folders.CORES
     executor: Annotated[str, EXECUTOR] = "local"
@@ -106,8 +109,13 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             "--task, --episodes and env say what to record; with --demos DIR nothing is recorded."
         )
     variants = None
-    if options.appearance or options.distractors or options.variants > 1:
-        variants = Variants(options.appearance or "", options.distractors or 0, options.variants)
+    if options.appearance or options.distractors or options.corruption or options.variants > 1:
+        variants = Variants(
+            options.appearance or "",
+            options.distractors or 0,
+            options.variants,
+            options.corruption,
+        )
     task = folders.demos_task(options.demos[0]) if options.demos else options.task or "grasp"
     of_others = "" if options.layout == "surgicai" else f"-{options.layout}"
     out = options.out or folders.dataset_folder(f"{task}{of_others}")

@@ -27,33 +27,30 @@ class Variants:
         distractors: of `RandomisationConfig`: most things that lie about; 0 leaves what was
             recorded.
         count: variants of each demonstration.
+        corruption: largest strength of smoke, blur and pixel noise on the images
+            (`dataset.corruption`), 0 to 1; each variant draws a strength of each, uniform from 0.
 
     Raises:
-        InputError: no look to draw, or fewer than one variant.
+        InputError: nothing to draw, fewer than one variant, or a strength out of its range.
         UnknownName: no such appearance.
     """
 
     appearance: str = ""
     distractors: int = 0
     count: int = 1
+    corruption: float = 0.0
 
     def __post_init__(self) -> None:
         RandomisationConfig(appearance=self.appearance, distractors=self.distractors)
         check_at_least(1, variants=self.count)
-        if not (self.appearance or self.distractors):
+        if not 0 <= self.corruption <= 1:
+            raise InputError(f"corruption is {self.corruption}; allowed: 0 to 1.")
+        if not (self.appearance or self.distractors or self.corruption):
             raise InputError(
                 f"{self.count} variants are asked without a look to draw; give an appearance "
-                "(--appearance train) or distractors (--distractors 5)."
+                "(--appearance train), distractors (--distractors 5) or a corruption "
+                "(--corruption 0.5)."
             )
-
-    @property
-    def axes(self) -> Mapping[str, str | int]:
-        """Return axis of randomisation → what it is drawn from, of those that are drawn."""
-        asked: dict[str, str | int] = {
-            "appearance": self.appearance,
-            "distractors": self.distractors,
-        }
-        return {axis: value for axis, value in asked.items() if value}
 
     def shown(self, config: TaskConfig) -> TaskConfig:
         """Return the task as it looks in the variants."""
@@ -72,6 +69,7 @@ class Variants:
         """What they are, as a part of a name: "train-x5"."""
         parts = [self.appearance] if self.appearance else []
         parts += [f"distractors{self.distractors}"] if self.distractors else []
+        parts += [f"corruption{self.corruption:g}"] if self.corruption else []
         return "-".join([*parts, f"x{self.count}"])
 
     @property
@@ -80,9 +78,16 @@ class Variants:
         looks = f"{self.count} {'look' if self.count == 1 else 'looks'}"
         parts = [f"({self.appearance})"] if self.appearance else []
         parts += [f"with up to {self.distractors} distractors"] if self.distractors else []
+        if self.corruption:
+            parts += [f"behind smoke, blur and noise of up to {self.corruption:.0%}"]
         return " ".join([looks, *parts])
 
     @property
     def request(self) -> Mapping[str, JSON]:
         """Return what they are as plain data."""
-        return {**self.axes, "count": self.count}
+        asked: dict[str, JSON] = {
+            "appearance": self.appearance,
+            "distractors": self.distractors,
+            "corruption": self.corruption,
+        }
+        return {**{key: value for key, value in asked.items() if value}, "count": self.count}

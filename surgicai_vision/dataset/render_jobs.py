@@ -8,6 +8,7 @@ import atexit
 import functools
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -18,11 +19,13 @@ from numpy.typing import NDArray
 
 from surgicai_vision import envs
 from surgicai_vision.core import names
+from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.core.files import sha256_file, write_json
 from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset import codecs, schema
+from surgicai_vision.dataset.corruption import CORRUPTIONS, Image, Moment
 from surgicai_vision.dataset.layouts import LAYOUTS, SURGICAI
 from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
@@ -97,15 +100,17 @@ def render_episode(
     measured: dict[str, list[NDArray[np.float32]]] = {
         key: [] for key in (*chosen.measured, *schema.calibration_keys(views))
     }
-    look = _look(looks, Path(demo), variant) if looks else {}
-    for state in episode.state[:-1:frame_stride]:
-        env.set_state_vector(env.simulation.redrawn(state, look) if look else state)
+    shown = _Shown.drawn(looks, Path(demo), variant) if looks else _Shown()
+    for step, state in enumerate(episode.state[:-1:frame_stride]):
+        env.set_state_vector(env.simulation.redrawn(state, shown.look) if shown.look else state)
         observation = env.observe()
         assert isinstance(observation, dict)  # the env shows images
         for key, view, modality in keys:
             frame = observation[names.frame_key(view, modality)]
             # LeRobot admits one-channel images as depth only.
             frame = np.repeat(frame, 3, axis=2) if modality == names.SEGMENTATION else frame
+            if modality == names.RGB:
+                frame = shown.spoilt(frame, step * frame_stride, view)
             content[key].append(codecs.encode(frame))
             statistics[key].add(frame)
             digest.add(key, frame)
@@ -140,10 +145,36 @@ def render_episode(
     write_json(folder / SUMMARY_FILE, summary)
 
 
-def _look(looks: Variants, demo: Path, variant: int) -> Mapping[str, Sequence[float]]:
-    """Return the numbers of a variant's look, drawn from the demonstration's file and `variant`."""
-    rng = np.random.default_rng([LOOK_STREAM, int(sha256_file(demo), 16), variant])
-    return draw_look(looks.shown(TaskConfig()).randomisation, rng)
+@dataclass(frozen=True)
+class _Shown:
+    """How a variant is seen.
+
+    Attributes:
+        look: axis of randomisation → its numbers; empty leaves what was recorded.
+        strengths: corruption of its images → its strength.
+        seed: of the corruptions.
+    """
+
+    look: Mapping[str, Sequence[float]] = MappingProxyType({})
+    strengths: Mapping[str, float] = MappingProxyType({})
+    seed: int = 0
+
+    @classmethod
+    def drawn(cls, looks: Variants, demo: Path, variant: int) -> "_Shown":
+        """Draw a variant from the demonstration's file and the variant's number."""
+        rng = np.random.default_rng([LOOK_STREAM, int(sha256_file(demo), 16), variant])
+        look = draw_look(looks.shown(TaskConfig()).randomisation, rng)
+        if not looks.corruption:
+            return cls(look)
+        strengths = {kind: looks.corruption * rng.random() for kind in CORRUPTIONS}
+        return cls(look, strengths, int(rng.integers(2**32)))
+
+    def spoilt(self, image: Image, step: int, view: str) -> Image:
+        """Return an image (height, width, 3) as the corruptions leave it at a control step."""
+        moment = Moment(self.seed, step, camera_number(view))
+        for kind, strength in self.strengths.items():
+            image = CORRUPTIONS[kind](image, strength, moment)
+        return image
 
 
 def _write_episode(

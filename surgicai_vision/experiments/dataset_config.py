@@ -50,6 +50,7 @@ class Demonstrations:
             families; "" renders each as it was recorded.
         distractors: most things that lie about in what is rendered; 0 leaves what was recorded.
         variants: in how many looks each demonstration is rendered.
+        corruption: largest strength of smoke, blur and pixel noise on what is rendered.
         of: name of demonstrations of the same task, which are re-posed to new starts where the
             demonstrator is "multiply" (`demos.multiply`).
 
@@ -75,6 +76,7 @@ class Demonstrations:
     distractors: int = field(default=0, metadata=LATER)
     variants: int = field(default=1, metadata=LATER)
     of: str = field(default="", metadata=LATER)
+    corruption: float = field(default=0.0, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_name("demonstrator", self.demonstrator, DEMONSTRATORS)
@@ -94,9 +96,9 @@ class Demonstrations:
     @property
     def looks(self) -> Variants | None:
         """The looks each is rendered in; None as it was recorded."""
-        if not (self.appearance or self.distractors) and self.variants == 1:
+        if not (self.appearance or self.distractors or self.corruption) and self.variants == 1:
             return None
-        return Variants(self.appearance, self.distractors, self.variants)
+        return Variants(self.appearance, self.distractors, self.variants, self.corruption)
 
     @property
     def disturbance(self) -> Disturbance:

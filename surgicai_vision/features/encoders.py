@@ -26,6 +26,7 @@ ENCODERS: Final = Registry["Plugin"](
     {
         "imagenet-lite": "encoders.imagenet_lite:IMAGENET_LITE",
         "imagenet-lite-early": "encoders.imagenet_lite_early:IMAGENET_LITE_EARLY",
+        "imagenet-lite-smooth": "encoders.imagenet_lite_smooth:IMAGENET_LITE_SMOOTH",
         "random": "encoders.random_resnet:RANDOM",
         "random-conv": "encoders.random_conv:RANDOM_CONV",
         "r3m": "encoders.r3m:R3M",
@@ -47,7 +48,13 @@ OPEN_ENCODERS: Mapping[str, str] = MappingProxyType({"timm:": "encoders.timm_mod
 POOLS = ("global", "spatial", "tokens")
 """What may be taken from an encoder; a test compares this with `encoders.base`."""
 
-OFFLINE_ENCODERS = ("imagenet-lite", "imagenet-lite-early", "random", "random-conv")
+OFFLINE_ENCODERS = (
+    "imagenet-lite",
+    "imagenet-lite-early",
+    "imagenet-lite-smooth",
+    "random",
+    "random-conv",
+)
 """Encoders that never download; a test compares this with their cards."""
 
 

@@ -73,6 +73,25 @@ def test_what_was_recorded_is_the_same_in_every_variant_and_what_is_seen_is_not(
     assert check_dataset(dataset.path).ok
 
 
+def test_a_corruption_of_its_own_lies_on_every_variant_and_on_nothing_else(demos, tmp_path):
+    spoilt = Variants("train", distractors=5, count=3, corruption=0.5)
+    render(demos, tmp_path / "clean", variants=THREE, depth=True)
+    render(demos, tmp_path / "spoilt", variants=spoilt, depth=True)
+    clean, dataset = open_dataset(tmp_path / "clean"), open_dataset(tmp_path / "spoilt")
+    for key, column in clean.columns().items():
+        np.testing.assert_array_equal(dataset.columns()[key], column, err_msg=key)
+    np.testing.assert_array_equal(dataset.frames("front_depth"), clean.frames("front_depth"))
+    seen, own = (d.frames("front").astype(int).reshape(6, STEPS, -1) for d in (dataset, clean))
+    off = np.abs(seen - own).mean(axis=-1)
+    assert (off > 1).all()
+    assert np.unique(off.mean(axis=1).round(2)).size == 6  # each variant by strengths of its own
+    noise = (seen - own)[:, 0] - (seen - own)[:, 1]
+    assert (np.abs(noise).mean(axis=-1) > 0).all()  # and each frame by a draw of its own
+    assert check_dataset(dataset.path).ok
+    again = render(demos, tmp_path / "again", variants=spoilt, depth=True)
+    assert again.digest == dataset.meta["digest"]
+
+
 def test_splits_and_counts_go_by_the_demonstration(dataset):
     np.testing.assert_array_equal(dataset.demonstration_index, np.repeat([0, 1], 3 * STEPS))
     assert len(dataset.bounds()) == 6

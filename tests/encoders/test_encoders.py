@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -13,6 +14,7 @@ from photographs import hopper
 from encoders.base import Encoder, read_torch
 from encoders.card import EncoderCard
 from encoders.imagenet_lite_early import IMAGENET_LITE_EARLY
+from encoders.imagenet_lite_smooth import IMAGENET_LITE_SMOOTH, smoothing
 from encoders.packaged import network_from, packaged_file
 from surgicai_vision.core.errors import BadFile, InputError, MissingWeights, UnknownName
 from surgicai_vision.features import encoders
@@ -235,6 +237,29 @@ def test_early_features_are_the_whole_networks_on_the_way() -> None:
     np.testing.assert_allclose(
         early(hopper()).reshape(1, 40, 28, 28), wanted[0].numpy(), rtol=2e-3, atol=2e-3
     )
+
+
+def test_smoothing_is_a_gaussian_and_then_the_early_network() -> None:
+    image = hopper()[0].astype(np.float32)
+    given = torch.from_numpy(image).permute(2, 0, 1)[None]
+    with torch.inference_mode():
+        smoothed = torch.nn.Sequential(*smoothing())(given)
+        smooth = IMAGENET_LITE_SMOOTH.build(IMAGENET_LITE_SMOOTH.card, None)[1].eval()
+        early = IMAGENET_LITE_EARLY.build(IMAGENET_LITE_EARLY.card, None)[1].eval()
+        torch.testing.assert_close(smooth(given), early(smoothed))
+    wanted = cv2.GaussianBlur(image, (11, 11), 1.5)
+    np.testing.assert_allclose(smoothed[0].permute(1, 2, 0).numpy(), wanted, atol=1e-2)
+
+
+def test_smooth_features_keep_more_of_a_noisy_image() -> None:
+    noise = np.random.default_rng(0).normal(0, 32, hopper().shape)
+    noisy = np.clip(np.round(hopper() + noise), 0, 255).astype(np.uint8)
+    changed = {}
+    for name in ("imagenet-lite-early", "imagenet-lite-smooth"):
+        encoder = load_encoder(name, "spatial")
+        clean = encoder(hopper())
+        changed[name] = np.abs(encoder(noisy) - clean).mean() / clean.std()
+    assert changed["imagenet-lite-smooth"] < 0.8 * changed["imagenet-lite-early"]
 
 
 def test_unknown_encoder_suggests() -> None:

@@ -12,12 +12,13 @@ from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
+from surgicai_vision.dataset.corruption import CORRUPTIONS, Moment
 from surgicai_vision.envs.randomisation import LOOKS
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.evaluation.robustness import ALL, AXES, CURVES, axes_of, curves, shifted
-from surgicai_vision.evaluation.robustness.corruption import CORRUPTIONS, CorruptedAgent, Moment
+from surgicai_vision.evaluation.robustness.corrupted_agent import CorruptedAgent
 from surgicai_vision.evaluation.rollout import evaluate
 from surgicai_vision.evaluation.statistics import clopper_pearson, mcnemar
 from surgicai_vision.evaluation.storage import MARKER, read_rows

@@ -1,9 +1,9 @@
 """Axes: what can shift, and how far strength 1 goes. A new axis is one line of `AXES`.
 
 An axis changes the world, by the randomisation the env already has (`config.RandomisationConfig`),
-or only the images the agent is given (`corruption`); `all` does everything at once. In the world
-every episode draws its own direction from its seed, uniform in ± the axis's size; the strength
-scales the size. It comes on top of the task's own randomisation of the axis.
+or only the images the agent is given (`dataset.corruption`); `all` does everything at once. In the
+world every episode draws its own direction from its seed, uniform in ± the axis's size; the
+strength scales the size. It comes on top of the task's own randomisation of the axis.
 
 Strength 1 is where a person still recognises the scene, barely; `surgicai-vision scene --axis all`
 draws every axis at every strength.
@@ -29,7 +29,8 @@ from surgicai_vision.training.run_config import Shift
 
 if TYPE_CHECKING:
     from surgicai_vision.evaluation.policy_spec import PolicySpec
-from surgicai_vision.evaluation.robustness.corruption import CORRUPTIONS, CorruptedAgent
+from surgicai_vision.dataset.corruption import CORRUPTIONS
+from surgicai_vision.evaluation.robustness.corrupted_agent import CorruptedAgent
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Axis:
     Attributes:
         text: what it is, for people.
         world: field of `config.RandomisationConfig` → what is added to it.
-        images: keys of `corruption.CORRUPTIONS`, in the order in which they spoil an image.
+        images: keys of `dataset.corruption.CORRUPTIONS`, in the order in which they spoil an image.
         seen: whether it changes images only, so that a policy without them cannot notice it.
     """
 

@@ -1,0 +1,93 @@
+"""An agent that sees through a corruption (`dataset.corruption`).
+
+The env, its rewards and its films stay clean.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import final
+
+import numpy as np
+
+from surgicai_vision.core.cameras import camera_number
+from surgicai_vision.core.lazy import LazyMapping
+from surgicai_vision.dataset.corruption import Change, Image, Moment
+from surgicai_vision.evaluation.agent import (
+    Actions,
+    Agent,
+    FeatureTable,
+    Observation,
+    Robot,
+    frame_of,
+)
+
+
+@final
+class CorruptedAgent(Agent):
+    """An agent that sees through a corruption.
+
+    Args:
+        agent: who acts.
+        change: one of `CORRUPTIONS`.
+        strength: 0 to 1.
+    """
+
+    def __init__(self, agent: Agent, change: Change, strength: float):
+        self.name = agent.name
+        self.cameras = agent.cameras
+        self.image_size = agent.image_size
+        self.depth = agent.depth
+        self.privileged = agent.privileged
+        self.action_mode = agent.action_mode
+        self._agent = agent
+        self._change = change
+        self._strength = strength
+        self._seeds: dict[int, int] = {}
+        self._steps: dict[int, int] = {}
+
+    def reset(self, slot: int, robot: Robot, seed: int) -> None:
+        """Count the slot's steps from 0."""
+        self._seeds[slot] = seed
+        self._steps[slot] = 0
+        self._agent.reset(slot, robot, seed)
+
+    def restart(self, slot: int) -> None:
+        """Tell the agent behind; the slot's steps count on."""
+        self._agent.restart(slot)
+
+    def share(self, features: FeatureTable) -> None:
+        """Let the agent behind share features."""
+        self._agent.share(features)
+
+    def act(
+        self, slots: Sequence[int], robots: Sequence[Robot], observations: Sequence[Observation]
+    ) -> Actions:
+        """Return the agent's actions (n, 7) on what it sees."""
+        seen = [
+            self._seen(slot, observation)
+            for slot, observation in zip(slots, observations, strict=True)
+        ]
+        for slot in slots:
+            self._steps[slot] += 1
+        return self._agent.act(slots, robots, seen)
+
+    def _seen(self, slot: int, observation: Observation) -> Observation:
+        """Return an observation whose images are changed when they are looked at."""
+        if not self.cameras:
+            return observation
+        moments = {
+            view: Moment(self._seeds[slot], self._steps[slot], camera_number(view))
+            for view in self.cameras
+        }
+
+        def changed(view: str) -> Image:
+            image = frame_of(observation, view).astype(np.uint8, copy=False)
+            return self._change(image, self._strength, moments[view])
+
+        makers = {
+            key: functools.partial(changed, key)
+            if key in moments
+            else functools.partial(frame_of, observation, key)
+            for key in observation
+        }
+        return LazyMapping(makers, {})
