@@ -116,12 +116,15 @@ def _list(
 ) -> dict[str, object]:
     """Print what each run is, and how long the rest takes where a finished run tells it."""
     from surgicai_vision.experiments.sweep.estimate import estimate
-    from surgicai_vision.experiments.sweep.plan import STATES, plan
+    from surgicai_vision.experiments.sweep.plan import NOT_RUN, STATES, lacking, plan
 
     states = plan(grid, out, choice)
     for state in states:
         line = f"{state.state:<8} {state.key}  {state.where}"
-        console.say(f"{line}: {state.reason}" if state.reason else line)
+        again = state.reason and state.state != NOT_RUN
+        console.say(f"{line}: {state.reason}" if again else line)
+    for reason, runs in lacking(states).items():
+        console.say(f"not run, {len(runs)} runs: {reason}")
     counts = {
         name.replace(" ", "_"): sum(state.state == name for state in states) for name in STATES
     }

@@ -40,6 +40,7 @@ from surgicai_vision.experiments.sweep.plan import (
     TRAINING,
     Jobs,
     RunState,
+    lacking,
     plan,
     read_experiment_of,
     run_folder,
@@ -105,7 +106,7 @@ def run_sweep(
         )
         shutil.rmtree(out / WORK)
     skipped = [state for state in states if state.state == NOT_RUN]
-    problems = [f"not run: {state.where}: {state.reason}" for state in skipped]
+    problems = [f"not run, {len(runs)} runs: {why}" for why, runs in lacking(states).items()]
     problems += [
         f"failed: {state.where}: {sweep.errors[state.key]}"
         for state in to_do

@@ -1,7 +1,7 @@
 """Plan: which runs there are, what stands in the folder already, and the job that makes each."""
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -93,6 +93,15 @@ class RunState:
         parts += [f"{run.demonstrations} demonstrations"] if run.demonstrations else []
         parts += [run.condition] if run.condition else []
         return ", ".join([*parts, f"seed {run.seed}"])
+
+
+def lacking(states: Sequence[RunState]) -> dict[str, list[RunState]]:
+    """Return why runs are not run → these runs; each reason once."""
+    runs: dict[str, list[RunState]] = {}
+    for state in states:
+        if state.state == NOT_RUN:
+            runs.setdefault(state.reason, []).append(state)
+    return runs
 
 
 def read_experiment_of(folder: Path) -> Experiment:
