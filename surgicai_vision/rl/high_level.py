@@ -19,7 +19,6 @@ the same command gives the same result; the folder, and which policy is kept, ar
 
 import dataclasses
 import functools
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +36,6 @@ from surgicai_vision import __version__
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import PhysicsError
-from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.envs.suture import Suture
 from surgicai_vision.evaluation.agent import Agent
@@ -50,13 +48,8 @@ from surgicai_vision.evaluation.slot import env_of
 from surgicai_vision.rl.extractor import StandardExtractor
 from surgicai_vision.rl.high_level_config import HighLevelRequest
 from surgicai_vision.rl.learner import linear, random_state, set_random_state
-from surgicai_vision.rl.train import (
-    CURVE,
-    EVALUATED_AT_ONCE,
-    IMAGE_SIZE,
-    Weights,
-    best_point,
-)
+from surgicai_vision.rl.stages import Stages
+from surgicai_vision.rl.train import EVALUATED_AT_ONCE, IMAGE_SIZE, Weights
 from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
 from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
 from surgicai_vision.training.policies import policy_plugin
@@ -69,8 +62,6 @@ SMALLEST_STD = 1e-3
 """Inputs that vary less [m, rad] are divided by this."""
 PLAYED_EPISODES = 2
 """Episodes in the subtasks' order that give the statistics of the inputs."""
-SEEDS_EACH = 1000
-"""Start seeds of one training: one for each training state."""
 
 Vector = NDArray[np.float32]
 
@@ -215,27 +206,16 @@ def _run(
     mean, std = _statistics(env)
     env.control_steps = 0
     model = _model(request, env, mean, std)
-    curve, best = _resume(model, env, out)
-    minutes = curve[-1].minutes if curve else 0.0
-    while model.num_timesteps < request.decisions:
-        progress(model.num_timesteps, request.decisions)
-        began = time.process_time()
-        vector = model.get_env()
-        assert vector is not None
-        vector.seed(names.TRAIN_SEED + SEEDS_EACH * request.seed + len(curve))
-        model._last_obs = None  # new episodes begin, so that nothing of the env need be stored
-        chunk = min(request.save_every, request.decisions - model.num_timesteps)
-        model.learn(chunk, reset_num_timesteps=False)
-        minutes += (time.process_time() - began) / 60.0
+
+    def evaluate(minutes: float) -> tuple[Point, Weights]:
         policy = _policy(request, model)
-        curve.append(_evaluate(request, task, policy, model.num_timesteps, env, minutes))
-        if curve[-1] is best_point(curve):
-            best = policy.state_dict()
-        write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
-        if model.num_timesteps < request.decisions:
-            _save(model, env, curve, best, out)
-    progress(request.decisions, request.decisions)
-    return _write(request, task, best, best_point(curve), env, out)
+        point = _evaluate(request, task, policy, model.num_timesteps, env, minutes)
+        return point, policy.state_dict()
+
+    stages = Stages(request.decisions, request.save_every, request.seed, out, progress)
+    save = functools.partial(_save, model, env, out)
+    best, kept = stages.run(model, _resume(model, env, out), evaluate, save)
+    return _write(request, task, best, kept, env, out)
 
 
 def _model(
@@ -282,7 +262,7 @@ def _statistics(env: DecisionEnv) -> tuple[list[float], list[float]]:
 # -- the state -------------------------------------------------------------------------------------
 
 
-def _save(model: PPO, env: DecisionEnv, curve: Sequence[Point], best: Weights, out: Path) -> None:
+def _save(model: PPO, env: DecisionEnv, out: Path, curve: Sequence[Point], best: Weights) -> None:
     """Write the training state, whole."""
     state = {
         "parameters": model.get_parameters(),

@@ -14,7 +14,6 @@ one that was not; the folder, and which policy is kept, are those of `rl.train`.
 
 import dataclasses
 import functools
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast, final
@@ -34,7 +33,6 @@ from surgicai_vision import __version__
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, PhysicsError
-from surgicai_vision.core.files import write_json
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
@@ -45,7 +43,8 @@ from surgicai_vision.rl.learner import Arrays, State, linear, random_state, set_
 from surgicai_vision.rl.residual_config import ALGO, ResidualRequest
 from surgicai_vision.rl.rlpd import LayerNormTD3Policy
 from surgicai_vision.rl.settings import read_by
-from surgicai_vision.rl.train import CURVE, Point, Weights, best_point
+from surgicai_vision.rl.stages import Stages
+from surgicai_vision.rl.train import Point, Weights
 from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
 from surgicai_vision.training.folder import begin, read_state, remove_state, write_state
 from surgicai_vision.training.run_config import RunConfig
@@ -53,8 +52,6 @@ from surgicai_vision.training.threads import one_thread
 
 PLAYED_EPISODES = 5
 """Episodes of the frozen policy that give the statistics of what the correction sees."""
-SEEDS_EACH = 1000
-"""Start seeds of one training: one for each training state."""
 EVALUATED_AT_ONCE = 8
 BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
@@ -282,31 +279,15 @@ class _Training:
 
     def run(self, out: Path, progress: Progress) -> Checkpoint:
         """Learn to the end, with an evaluation and a training state every so often."""
-        request, model = self.request, self.model
-        curve, best = self._resume(out)
-        minutes = curve[-1].minutes if curve else 0.0
-        while model.num_timesteps < request.env_steps:
-            progress(model.num_timesteps, request.env_steps)
-            began = time.process_time()
-            vector = model.get_env()
-            assert vector is not None
-            vector.seed(names.TRAIN_SEED + SEEDS_EACH * request.seed + len(curve))
-            model._last_obs = None  # new episodes begin, so that nothing of the env need be stored
-            chunk = min(request.save_every, request.env_steps - model.num_timesteps)
-            model.learn(chunk, reset_num_timesteps=False)
-            minutes += (time.process_time() - began) / 60.0
-            self.policy.take_correction(linear(model.actor.mu))
-            curve.append(self._evaluate(minutes))
-            if curve[-1] is best_point(curve):
-                best = {name: value.clone() for name, value in self.policy.state_dict().items()}
-            write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
-            if model.num_timesteps < request.env_steps:
-                self._save(curve, best, out)
-        progress(request.env_steps, request.env_steps)
-        return self._write(best, best_point(curve), out)
+        request = self.request
+        stages = Stages(request.env_steps, request.save_every, request.seed, out, progress)
+        save = functools.partial(self._save, out)
+        best, kept = stages.run(self.model, self._resume(out), self._evaluate, save)
+        return self._write(best, kept, out)
 
-    def _evaluate(self, minutes: float) -> Point:
-        """Count successes from validation starts."""
+    def _evaluate(self, minutes: float) -> tuple[Point, Weights]:
+        """Count successes of the policy as it is from validation starts; return its weights too."""
+        self.policy.take_correction(linear(self.model.actor.mu))
         rows = []
         if self.request.validation:
             # Eval mode anew: the copy that acts is made of the present weights.
@@ -318,7 +299,7 @@ class _Training:
                 make, self.spec.config, seeds, EVALUATED_AT_ONCE, report=lambda _: None
             )
             rows = [episode.row for episode in episodes]
-        return Point(
+        point = Point(
             env_steps=self.model.num_timesteps,
             updates=int(self.model._n_updates),
             minutes=minutes,
@@ -326,8 +307,9 @@ class _Training:
             episodes=len(rows),
             distance_mm=float(np.median([row.d_trans_mm for row in rows])) if rows else 0.0,
         )
+        return point, {name: value.clone() for name, value in self.policy.state_dict().items()}
 
-    def _save(self, curve: Sequence[Point], best: Weights, out: Path) -> None:
+    def _save(self, out: Path, curve: Sequence[Point], best: Weights) -> None:
         """Write the training state, whole."""
         model = self.model
         buffer = cast(ReplayBuffer, model.replay_buffer)

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -264,15 +264,21 @@ def _run(
     return _write(request, best, learner.squash, best_point(curve), out)
 
 
-class Counted(Protocol):
-    """A point of a learning curve that says how many episodes succeeded."""
+class CurvePoint(Protocol):
+    """A point of some learning curve, a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
     @property
     def successes(self) -> int:
         """Episodes that succeeded."""
 
+    @property
+    def minutes(self) -> float:
+        """CPU time of learning so far."""
 
-def best_point[P: Counted](curve: Sequence[P]) -> P:
+
+def best_point[P: CurvePoint](curve: Sequence[P]) -> P:
     """Return the point whose policy is kept: the most successes, of equals the last."""
     return max(reversed(curve), key=lambda point: point.successes)
 

@@ -96,6 +96,21 @@ def drive(
     return episode, [json.loads(line) for line in log.getvalue().splitlines()], told, served
 
 
+def by_expert(task):
+    """Return the env, and phase and action of every step of the expert's success from `SEED`."""
+    env = env_of(task)
+    env.reset(seed=SEED)
+    expert = Expert(env)
+    rows = []
+    ended = False
+    while not ended:
+        rows.append((env.phase if task == "suture" else -1, expert.action()))
+        _, _, terminated, truncated, info = env.step(rows[-1][1])
+        ended = terminated or truncated
+    assert info["is_success"]
+    return env, rows
+
+
 def test_a_driven_policy_moves_as_in_process():
     episode, lines, _, served = drive(RandomAgent(), "grasp", 50)
     assert episode.steps == 50
@@ -220,16 +235,7 @@ def test_an_agent_reads_the_same_poses_as_in_process():
 
 def test_a_whole_procedure_succeeds_as_in_process():
     """Both arms, all five subtasks and PSM2's letting go, through topics alone."""
-    env = env_of("suture")
-    env.reset(seed=SEED)
-    expert = Expert(env)
-    rows = []
-    ended = False
-    while not ended:
-        rows.append((env.phase, expert.action()))
-        _, _, ended, truncated, info = env.step(rows[-1][1])
-        ended = ended or truncated
-    assert info["is_success"]
+    env, rows = by_expert("suture")
     final = env.data.qpos.copy()
     episode, lines, _, served = drive(Script(rows), "suture", len(rows) + 100)
     assert episode.success
@@ -242,15 +248,7 @@ def test_a_whole_procedure_succeeds_as_in_process():
 
 def test_what_a_client_does_is_recorded_as_it_was_told(tmp_path):
     """Actions of the record are those that the client added; states are the simulation's."""
-    env = env_of("grasp")
-    env.reset(seed=SEED)
-    expert = Expert(env)
-    rows = []
-    ended = False
-    while not ended:
-        rows.append((-1, expert.action()))
-        _, _, ended, _, info = env.step(rows[-1][1])
-    assert info["is_success"]
+    env, rows = by_expert("grasp")
     told = []
     with open_recordings(tmp_path / "demos", env.config, env.scene.hash) as recordings:
         served = Served("grasp", recordings=recordings, tell=told.append)
@@ -267,14 +265,7 @@ def test_what_a_client_does_is_recorded_as_it_was_told(tmp_path):
 
 def test_the_log_of_a_drive_becomes_demonstrations(tmp_path):
     """Every subtask that was driven, with the arms where they were measured."""
-    env = env_of("suture")
-    env.reset(seed=SEED)
-    expert = Expert(env)
-    rows = []
-    ended = False
-    while not ended:
-        rows.append((env.phase, expert.action()))
-        _, _, ended, _, _ = env.step(rows[-1][1])
+    env, rows = by_expert("suture")
     _, lines, _, _ = drive(Script(rows), "suture", len(rows) + 100)
     about = json.dumps({"policy": "script"})
     text = "\n".join([about, *map(json.dumps, lines), '{"cut off'])
