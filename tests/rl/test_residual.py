@@ -109,8 +109,8 @@ def test_a_kill_changes_no_result_and_the_best_is_kept(base, tmp_path, monkeypat
     evaluate = residual._Training._evaluate
 
     def falling(training, minutes):
-        point = evaluate(training, minutes)
-        return dataclasses.replace(point, successes=24 - point.env_steps)
+        point, weights = evaluate(training, minutes)
+        return dataclasses.replace(point, successes=24 - point.env_steps), weights
 
     save = residual._Training._save
 
