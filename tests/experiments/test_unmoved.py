@@ -8,7 +8,7 @@ import pytest
 from surgicai_vision.commands.main import main
 from surgicai_vision.commands.sweep import read_experiment
 from surgicai_vision.core import names
-from surgicai_vision.core.config import RANDOMISATION_LIMITS, TaskConfig
+from surgicai_vision.core.config import RANDOMISATION_LIMITS
 from surgicai_vision.core.files import configs_folder
 from surgicai_vision.envs.feasibility import refuse_impossible
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, shifted_config
@@ -63,14 +63,7 @@ def test_every_subtask_is_counted_in_looks_and_with_needles_never_shown():
         assert shows(dataset).appearance == names.TRAIN
     worlds = {run.condition: run.env.randomisation for run in UNMOVED.runs}
     trained = worlds["held-in looks"]
-    half = shifted_config(TaskConfig(randomisation=trained), AXES[ALL], 0.5).randomisation
-    for dataset in UNMOVED.datasets.values():
-        shown = shows(dataset)
-        assert shown.on and not shown.appearance_shift and not shown.latency
-        for axis in trained.on:
-            assert getattr(shown, axis) == getattr(trained, axis), "what is counted is learned"
-        for axis in set(shown.on) - set(trained.on):
-            assert getattr(shown, axis) == getattr(half, axis), "and what shifts, as far"
+    assert {shows(dataset) for dataset in UNMOVED.datasets.values()} == {trained}
     heldout = worlds["held-out looks"]
     assert heldout.shows_heldout and not trained.shows_heldout
     unseen = worlds["needles never seen"]
