@@ -28,7 +28,7 @@ class Variants:
             recorded.
         count: variants of each demonstration.
         corruption: largest strength of smoke, blur and pixel noise on the images
-            (`dataset.corruption`), 0 to 1; each variant draws a strength of each, uniform from 0.
+            (`core.corruption`), 0 to 1; each variant draws a strength of each, uniform from 0.
 
     Raises:
         InputError: nothing to draw, fewer than one variant, or a strength out of its range.

@@ -6,6 +6,7 @@ the state before action t. This module needs MuJoCo, so only the processes that 
 
 import atexit
 import functools
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,16 +22,16 @@ from surgicai_vision import envs
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.core.config import TaskConfig, from_mapping, to_mapping
+from surgicai_vision.core.corruption import CORRUPTIONS, Image, Moment
 from surgicai_vision.core.errors import BadFile
-from surgicai_vision.core.files import sha256_file, write_json
+from surgicai_vision.core.files import write_json
 from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset import codecs, schema
-from surgicai_vision.dataset.corruption import CORRUPTIONS, Image, Moment
 from surgicai_vision.dataset.layouts import LAYOUTS, SURGICAI
 from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.stats import ImageStatistics, column_statistics
 from surgicai_vision.dataset.writer import EPISODE_FILE, SUMMARY_FILE, column_array, compression
-from surgicai_vision.demos.store import read_demo
+from surgicai_vision.demos.store import Demo, read_demo
 from surgicai_vision.envs.looks import draw as draw_look
 from surgicai_vision.scene.cameras import crop_of
 from surgicai_vision.scene.rendering import renderer_string
@@ -100,7 +101,7 @@ def render_episode(
     measured: dict[str, list[NDArray[np.float32]]] = {
         key: [] for key in (*chosen.measured, *schema.calibration_keys(views))
     }
-    shown = _Shown.drawn(looks, Path(demo), variant) if looks else _Shown()
+    shown = _Shown.drawn(looks, episode, variant) if looks else _Shown()
     for step, state in enumerate(episode.state[:-1:frame_stride]):
         env.set_state_vector(env.simulation.redrawn(state, shown.look) if shown.look else state)
         observation = env.observe()
@@ -160,9 +161,10 @@ class _Shown:
     seed: int = 0
 
     @classmethod
-    def drawn(cls, looks: Variants, demo: Path, variant: int) -> "_Shown":
-        """Draw a variant from the demonstration's file and the variant's number."""
-        rng = np.random.default_rng([LOOK_STREAM, int(sha256_file(demo), 16), variant])
+    def drawn(cls, looks: Variants, demo: Demo, variant: int) -> "_Shown":
+        """Draw a variant from the states that were recorded and the variant's number."""
+        recorded = int(hashlib.sha256(demo.state.tobytes()).hexdigest(), 16)
+        rng = np.random.default_rng([LOOK_STREAM, recorded, variant])
         look = draw_look(looks.shown(TaskConfig()).randomisation, rng)
         if not looks.corruption:
             return cls(look)

@@ -84,12 +84,17 @@ def test_a_corruption_of_its_own_lies_on_every_variant_and_on_nothing_else(demos
     seen, own = (d.frames("front").astype(int).reshape(6, STEPS, -1) for d in (dataset, clean))
     off = np.abs(seen - own).mean(axis=-1)
     assert (off > 1).all()
-    assert np.unique(off.mean(axis=1).round(2)).size == 6  # each variant by strengths of its own
+    assert np.ptp(off.mean(axis=1)) > 3  # each variant by strengths of its own
     noise = (seen - own)[:, 0] - (seen - own)[:, 1]
     assert (np.abs(noise).mean(axis=-1) > 0).all()  # and each frame by a draw of its own
     assert check_dataset(dataset.path).ok
-    again = render(demos, tmp_path / "again", variants=spoilt, depth=True)
-    assert again.digest == dataset.meta["digest"]
+    other = tmp_path / "by other code"
+    other.mkdir()
+    for index, path in enumerate(list_demos(demos)):
+        write_demo(other, index, dataclasses.replace(read_demo(path), code_version="another"))
+    write_marker(other, "grasp", "expert")
+    again = render(other, tmp_path / "again", variants=spoilt, depth=True)
+    assert again.digest == dataset.meta["digest"], "what was recorded decides, not its file"
 
 
 def test_splits_and_counts_go_by_the_demonstration(dataset):

@@ -11,8 +11,8 @@ from surgicai_vision import envs
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
+from surgicai_vision.core.corruption import CORRUPTIONS, Moment
 from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
-from surgicai_vision.dataset.corruption import CORRUPTIONS, Moment
 from surgicai_vision.envs.randomisation import LOOKS
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent

@@ -19,7 +19,7 @@ from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.store import read_demo, read_marker
 from surgicai_vision.experiments.dagger import MixturePolicy, learner_of
 
-CONFIG = TaskConfig("place", max_steps=120)
+CONFIG = TaskConfig("place", max_steps=160)
 
 
 class Backwards:

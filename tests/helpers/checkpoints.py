@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import torch
+
 from policies.bc import BC
 from policies.hlp import HLP
 from surgicai_vision.core.config import TaskConfig, to_mapping
@@ -10,7 +12,10 @@ from surgicai_vision.training.run_config import RunConfig
 
 
 def checkpoint(folder: Path, task: str, policy: str = "bc", env: TaskConfig | None = None) -> str:
-    """Write an untrained policy that sees no image, by default of the plain env of its task."""
+    """Write an untrained policy that sees no image, by default of the plain env of its task.
+
+    Its weights are drawn from a fixed seed.
+    """
     plugin = {"bc": BC, "hlp": HLP}[policy]
     written = Checkpoint(
         run=RunConfig(env or TaskConfig(task), policy=policy, demonstrations=1),
@@ -27,5 +32,8 @@ def checkpoint(folder: Path, task: str, policy: str = "bc", env: TaskConfig | No
         device="cpu",
         code_version="",
     )
-    write_checkpoint(folder, written, plugin.make(plugin.recipe(), ()).state_dict())
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        untrained = plugin.make(plugin.recipe(), ())
+    write_checkpoint(folder, written, untrained.state_dict())
     return str(folder)

@@ -1,7 +1,7 @@
 """Axes: what can shift, and how far strength 1 goes. A new axis is one line of `AXES`.
 
 An axis changes the world, by the randomisation the env already has (`config.RandomisationConfig`),
-or only the images the agent is given (`dataset.corruption`); `all` does everything at once. In the
+or only the images the agent is given (`core.corruption`); `all` does everything at once. In the
 world every episode draws its own direction from its seed, uniform in ± the axis's size; the
 strength scales the size. It comes on top of the task's own randomisation of the axis.
 
@@ -29,7 +29,7 @@ from surgicai_vision.training.run_config import Shift
 
 if TYPE_CHECKING:
     from surgicai_vision.evaluation.policy_spec import PolicySpec
-from surgicai_vision.dataset.corruption import CORRUPTIONS
+from surgicai_vision.core.corruption import CORRUPTIONS
 from surgicai_vision.evaluation.robustness.corrupted_agent import CorruptedAgent
 
 
@@ -40,7 +40,7 @@ class Axis:
     Attributes:
         text: what it is, for people.
         world: field of `config.RandomisationConfig` → what is added to it.
-        images: keys of `dataset.corruption.CORRUPTIONS`, in the order in which they spoil an image.
+        images: keys of `core.corruption.CORRUPTIONS`, in the order in which they spoil an image.
         seen: whether it changes images only, so that a policy without them cannot notice it.
     """
 

@@ -1,4 +1,4 @@
-"""An agent that sees through a corruption (`dataset.corruption`).
+"""An agent that sees through a corruption (`core.corruption`).
 
 The env, its rewards and its films stay clean.
 """
@@ -10,8 +10,8 @@ from typing import final
 import numpy as np
 
 from surgicai_vision.core.cameras import camera_number
+from surgicai_vision.core.corruption import Change, Image, Moment
 from surgicai_vision.core.lazy import LazyMapping
-from surgicai_vision.dataset.corruption import Change, Image, Moment
 from surgicai_vision.evaluation.agent import (
     Actions,
     Agent,

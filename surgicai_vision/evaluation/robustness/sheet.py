@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from surgicai_vision import envs
 from surgicai_vision.core.cameras import camera_number
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.dataset.corruption import CORRUPTIONS, Moment
+from surgicai_vision.core.corruption import CORRUPTIONS, Moment
 from surgicai_vision.evaluation.robustness.axes import AXES, shifted_config
 
 Image = NDArray[np.uint8]
