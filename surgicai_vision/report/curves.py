@@ -1,4 +1,4 @@
-"""Curves: success against demonstrations, against a shift's strength, over the procedure."""
+"""Curves: success against demonstrations, training and a shift's strength; over the procedure."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -41,6 +41,22 @@ def data_curves(groups: Sequence[Group]) -> list[Chart]:
         lines = _series(members, lambda item: float(item.condition.demonstrations or 0))
         if lines:
             found.append(_chart(task, lines, "demonstrations", logarithmic=True))
+    return found
+
+
+def budget_curves(groups: Sequence[Group]) -> list[Chart]:
+    """Return success against the minutes of training, one chart a task with several budgets."""
+    found = []
+    for task in task_names():
+        budgeted = [
+            item
+            for item in groups
+            if evaluated(item, task) and item.condition.plain and item.condition.minutes
+        ]
+        members = _by_condition(budgeted, lambda item: item.condition.without_budget)
+        lines = _series(members, lambda item: item.condition.minutes or 0.0)
+        if lines:
+            found.append(_chart(task, lines, "minutes of one core"))
     return found
 
 

@@ -1,11 +1,15 @@
 """The key of an experiment: what was evaluated, but for the training seed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from surgicai_vision.core.cameras import view_names
+from surgicai_vision.core.config import read_changes
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.training.run_config import RunConfig
+
+BUDGET = "minutes"
+"""Setting of a recipe that bounds its training (`policies.chunks.ChunkRecipe`)."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,18 @@ class Condition:
     def plain(self) -> bool:
         """Whether the world was not shifted, the expert not swapped in, and nothing upset."""
         return not (self.axis or self.expert_swap or self.upset)
+
+    @property
+    def minutes(self) -> float | None:
+        """What its training was allowed on one core [min]; None where it was given no budget."""
+        minutes = read_changes(self.changes).get(BUDGET)
+        return float(minutes) if isinstance(minutes, int | float) else None
+
+    @property
+    def without_budget(self) -> "Condition":
+        """The condition but for the budget of its training."""
+        kept = tuple(change for change in self.changes if BUDGET not in read_changes([change]))
+        return replace(self, changes=kept)
 
 
 def condition_of(run: RunConfig, place: str = "") -> Condition:

@@ -66,6 +66,7 @@ def numbers(
         ],
         "measures": sections.measures(groups),
         "data_curves": curves.data_curves(groups),
+        "budget_curves": curves.budget_curves(groups),
         "robustness": curves.robustness_curves(groups),
         "retentions": retentions(groups),
         "looks": looks(groups),

@@ -37,7 +37,15 @@ from surgicai_vision.evaluation import statistics
 from surgicai_vision.evaluation.storage import FORMAT
 from surgicai_vision.experiments.sweep.grid import Grid
 from surgicai_vision.experiments.sweep.plan import RunState
-from surgicai_vision.report import charts, filmstrips, formats, paper, paper_comparison, tables
+from surgicai_vision.report import (
+    charts,
+    curves,
+    filmstrips,
+    formats,
+    paper,
+    paper_comparison,
+    tables,
+)
 from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import best_trained, group, of_task
@@ -275,6 +283,24 @@ def test_a_cell_and_its_record_have_the_same_condition(tmp_path):
     assert (len(item.results), len(item.missing)) == (1, 1)
     assert item.condition.variant == "act · clock=true"
     assert item.condition.demonstrations == 30
+
+
+def test_a_curve_runs_over_the_minutes_that_one_training_was_given(tmp_path):
+    generator = np.random.default_rng(0)
+    for index, (minutes, rate) in enumerate(((3, 0.2), (10, 0.5), (30, 0.9))):
+        given = ("clock=true", f"minutes={minutes}")
+        run = run_of("handoff", "random", ("front",), 0, policy="act", changes=given)
+        store_run(tmp_path, f"act-{index}", run, rate, generator)
+    store_run(tmp_path, "bc", run_of("handoff", "random", ("front",), 0), 0.9, generator)
+    groups = group(collect(tmp_path))
+    (chart,) = curves.budget_curves(groups)
+    assert chart.head == ("policy", "3", "10", "30")
+    (row,) = chart.rows
+    assert "clock=true" in row[0] and "minutes" not in row[0]
+    by_budget = {item.condition.minutes: f"{item.successes}/20" for item in groups}
+    assert [cell.split(",")[0] for cell in row[1:]] == [by_budget[m] for m in (3, 10, 30)]
+    assert curves.budget_curves([item for item in groups if item.condition.minutes != 3]) != []
+    assert curves.budget_curves([item for item in groups if item.condition.minutes == 30]) == []
 
 
 def test_a_reference_that_several_sweeps_evaluated_stands_once(tmp_path):
