@@ -296,7 +296,7 @@ class Policy(nn.Module, abc.ABC):
     @final
     def normalise(self, observed: torch.Tensor) -> torch.Tensor:
         """Return raw inputs (B, inputs.dim) with the training frames' mean and variance removed."""
-        return (observed - self.input_mean) / self.input_std
+        return (observed - self.input_mean).div_(self.input_std)
 
     @final
     def act(
