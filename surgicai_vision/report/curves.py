@@ -31,32 +31,40 @@ class Chart:
 
 def data_curves(groups: Sequence[Group]) -> list[Chart]:
     """Return success against the number of demonstrations, one chart a task with several."""
-    found = []
-    for task in task_names():
-        candidates = [item for item in groups if evaluated(item, task) and item.condition.plain]
-        candidates = [item for item in candidates if item.condition.demonstrations]
-        members = _by_condition(
-            candidates, lambda item: replace(item.condition, demonstrations=None)
-        )
-        lines = _series(members, lambda item: float(item.condition.demonstrations or 0))
-        if lines:
-            found.append(_chart(task, lines, "demonstrations", logarithmic=True))
-    return found
+    return _curves_along(
+        [item for item in groups if item.condition.demonstrations],
+        lambda item: float(item.condition.demonstrations or 0),
+        lambda item: replace(item.condition, demonstrations=None),
+        "demonstrations",
+        logarithmic=True,
+    )
 
 
 def budget_curves(groups: Sequence[Group]) -> list[Chart]:
     """Return success against the minutes of training, one chart a task with several budgets."""
+    return _curves_along(
+        [item for item in groups if item.condition.minutes],
+        lambda item: item.condition.minutes or 0.0,
+        lambda item: item.condition.without_budget,
+        "minutes of one core",
+    )
+
+
+def _curves_along(
+    groups: Sequence[Group],
+    x: Callable[[Group], float],
+    same: Callable[[Group], Condition],
+    x_name: str,
+    *,
+    logarithmic: bool = False,
+) -> list[Chart]:
+    """Return a chart for each task in which plain evaluations differ by `x` and nothing else."""
     found = []
     for task in task_names():
-        budgeted = [
-            item
-            for item in groups
-            if evaluated(item, task) and item.condition.plain and item.condition.minutes
-        ]
-        members = _by_condition(budgeted, lambda item: item.condition.without_budget)
-        lines = _series(members, lambda item: item.condition.minutes or 0.0)
+        mine = [item for item in groups if evaluated(item, task) and item.condition.plain]
+        lines = _series(_by_condition(mine, same), x)
         if lines:
-            found.append(_chart(task, lines, "minutes of one core"))
+            found.append(_chart(task, lines, x_name, logarithmic=logarithmic))
     return found
 
 

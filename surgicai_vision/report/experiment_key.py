@@ -6,10 +6,7 @@ from pathlib import Path
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import read_changes
 from surgicai_vision.core.tasks import task_names
-from surgicai_vision.training.run_config import RunConfig
-
-BUDGET = "minutes"
-"""Setting of a recipe that bounds its training (`policies.chunks.ChunkRecipe`)."""
+from surgicai_vision.training.run_config import BUDGET, RunConfig
 
 
 @dataclass(frozen=True)

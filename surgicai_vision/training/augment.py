@@ -53,22 +53,20 @@ def with_shift(
         shapes: of the features, in their order; only maps (C, h, w) are moved.
         places: largest move [places].
     """
-    moved = torch.zeros_like(observed)
+    moved = observed.clone()
     at = 0
     for shape in shapes:
         size = math.prod(shape)
         if len(shape) == 3:
             maps = observed[:, at : at + size].unflatten(1, shape)
             target = moved[:, at : at + size].unflatten(1, shape)
+            target.zero_()
             moves = torch.randint(-places, places + 1, (len(maps), 2)).tolist()
             for row, (down, right) in enumerate(moves):
                 to_y, from_y = _overlap(down, shape[1])
                 to_x, from_x = _overlap(right, shape[2])
                 target[row, :, to_y, to_x] = maps[row, :, from_y, from_x]
-        else:
-            moved[:, at : at + size] = observed[:, at : at + size]
         at += size
-    moved[:, at:] = observed[:, at:]
     return moved
 
 

@@ -22,7 +22,7 @@ from surgicai_vision.training.checkpoint import (
     read_checkpoint,
     read_tensors,
 )
-from surgicai_vision.training.run_config import RunConfig
+from surgicai_vision.training.run_config import BUDGET, RunConfig
 
 if TYPE_CHECKING:
     from encoders.base import Encoder
@@ -97,7 +97,7 @@ def load_recipe(
     values: Mapping[str, object] = read_yaml(path, may_be_empty=True)
     given = changes or {}
     if "epochs" in given:  # whoever says the epochs wants them, and no budget
-        values = {key: value for key, value in values.items() if key != "minutes"}
+        values = {key: value for key, value in values.items() if key != BUDGET}
     return from_mapping(plugin.recipe, {**values, **given}, f"recipe {recipe}")
 
 

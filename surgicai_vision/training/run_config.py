@@ -28,6 +28,8 @@ ACTORS = ("actor", "bcq")
 """Policies that `rl.train` leaves: they are fed the state with the goal."""
 TERMINATIONS = ("privileged", "learned")
 """How a subtask ends under a hierarchical policy."""
+BUDGET = "minutes"
+"""Setting of a recipe that bounds its training (`policies.chunks.ChunkRecipe`)."""
 
 BANKS: Mapping[str, int] = MappingProxyType(
     {"test": names.TEST_SEED, "validation": names.VALIDATION_SEED}
@@ -242,7 +244,7 @@ def with_budget(
     if epochs is not None and minutes is not None:
         raise InputError(f"--epochs {epochs} and --minutes {minutes:g} are given; give one.")
     changes = with_epochs(changes, epochs)
-    return changes if minutes is None else (*changes, f"minutes={minutes:g}")
+    return changes if minutes is None else (*changes, f"{BUDGET}={minutes:g}")
 
 
 def of_training(run: RunConfig) -> RunConfig:

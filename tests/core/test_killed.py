@@ -14,7 +14,7 @@ from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import render_demos
 from surgicai_vision.demos.record import record
 
-GONE_S = 120.0
+GONE_S = 30.0
 """Longest that anything may be alive after the kill [s]."""
 
 VECTOR_ENV = """

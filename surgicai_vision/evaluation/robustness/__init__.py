@@ -1,7 +1,7 @@
 """Robustness: the same policy on the same starts while one thing at a time shifts.
 
-`axes` says what can shift, `corruption` how images are spoiled, `curves` evaluates a policy along
-the axes.
+`axes` says what can shift, `corrupted_agent` sees spoilt images (`core.corruption`), `curves`
+evaluates a policy along the axes.
 """
 
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, axes_of, shifted
