@@ -19,10 +19,10 @@ SEEDS_EACH = 20_000
 """Start seeds that belong to one training seed."""
 TRAINING_SEEDS = 20
 """Training seeds that have start seeds of their own: the bank of training is below 400,000."""
+SEEDS_TRIED = 4
+"""Most seeds that are tried for each demonstration and for one more (`demos.record`)."""
 MOST_EPISODES = 4_000
-"""Most demonstrations of a dataset: at most four seeds each are tried (`demos.record`), so that all
-are the training seed's own.
-"""
+"""Most demonstrations of a dataset: few enough that all are the training seed's own."""
 DEMONSTRATORS = (*SCRIPTED_DEMONSTRATORS, *sorted(CHOOSING_DEMONSTRATORS))
 """Who may demonstrate: a scripted expert, or what re-poses other demonstrations."""
 
@@ -53,10 +53,14 @@ class Demonstrations:
         corruption: largest strength of smoke, blur and pixel noise on what is rendered.
         of: name of demonstrations of the same task, which are re-posed to new starts where the
             demonstrator is "multiply" (`demos.multiply`).
+        learner: name of a policy of the same task that acts at first, from starts that it was not
+            trained on, while the labels stay the demonstrator's (`experiments.dagger`); what it
+            was trained on is rendered beside these.
 
     Raises:
         InputError: a number out of its range, variants without a look to draw, a demonstrator
-            without the demonstrations it re-poses, or such demonstrations without one.
+            without the demonstrations it re-poses, or such demonstrations without one, or with a
+            learner.
         UnknownName: no such demonstrator or appearance.
     """
 
@@ -77,6 +81,7 @@ class Demonstrations:
     variants: int = field(default=1, metadata=LATER)
     of: str = field(default="", metadata=LATER)
     corruption: float = field(default=0.0, metadata=LATER)
+    learner: str = field(default="", metadata=LATER)
 
     def __post_init__(self) -> None:
         check_name("demonstrator", self.demonstrator, DEMONSTRATORS)
@@ -90,6 +95,11 @@ class Demonstrations:
                 f"demonstrations {self.name}: demonstrator is '{self.demonstrator}' and of is "
                 f"'{self.of}'; with demonstrator {choosing}, and with no other, name the "
                 "demonstrations that are re-posed (of: NAME)."
+            )
+        if self.of and self.learner:
+            raise InputError(
+                f"demonstrations {self.name}: '{self.learner}' acts in what is re-posed of "
+                f"'{self.of}'; leave out learner or of."
             )
         _ = self.looks  # refuses variants that cannot be drawn
 
@@ -117,6 +127,8 @@ class Demonstrations:
         parts += [f"going on for {after} steps after their success"] if after else []
         parts += [f"a frame every {self.frame_stride} steps"] if self.frame_stride > 1 else []
         parts += [f"with the visits in '{self.visits_of}'"] if self.visits_of else []
+        if self.learner:
+            parts.append(f"'{self.learner}' acting at first, beside what that was trained on")
         parts += [f"each in {self.looks.text}"] if self.looks else []
         return ", ".join(parts)
 
@@ -133,6 +145,7 @@ class DatasetConfig:
         first_seed: start seed of the first demonstration.
         visited: the whole procedures whose visits are rendered too, where `demonstrations` says so.
         multiplied: the demonstrations that are re-posed, where `demonstrations` says so.
+        learned: what the learner was trained on, where one acts in the demonstrations.
     """
 
     env: TaskConfig
@@ -142,6 +155,12 @@ class DatasetConfig:
     first_seed: int = names.TRAIN_SEED
     visited: "DatasetConfig | None" = None
     multiplied: "DatasetConfig | None" = None
+    learned: "DatasetConfig | None" = None
+
+    @property
+    def next_seed(self) -> int:
+        """The first start seed after those that the demonstrations may have tried."""
+        return self.first_seed + SEEDS_TRIED * (self.demonstrations.episodes + 1)
 
 
 def first_seed(training_seed: int) -> int:

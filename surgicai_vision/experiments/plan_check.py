@@ -6,8 +6,13 @@ from typing import TYPE_CHECKING
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.evaluation.robustness.axes import AXES
-from surgicai_vision.experiments.dataset_config import MOST_EPISODES, Demonstrations, first_seed
-from surgicai_vision.experiments.plan_parts import PARTS, Condition, PlannedPolicy
+from surgicai_vision.experiments.dataset_config import (
+    MOST_EPISODES,
+    SEEDS_EACH,
+    Demonstrations,
+    first_seed,
+)
+from surgicai_vision.experiments.plan_parts import HLP, PARTS, Condition, PlannedPolicy
 from surgicai_vision.features import encoders
 from surgicai_vision.training.run_config import BANKS
 
@@ -43,6 +48,8 @@ def check_plan(plan: "Plan") -> None:
         _check_multiplied(plan, recorded)
     for policy in plan.policies:
         _check_policy(plan, policy)
+    for recorded in plan.demonstrations:
+        _check_learner(plan, recorded)
     for condition in plan.conditions:
         _check_condition(plan, condition)
     if len(set(plan.runs)) != len(plan.runs):
@@ -81,6 +88,38 @@ def _check_multiplied(plan: "Plan", recorded: Demonstrations) -> None:
         each.name for each in plan.demonstrations if each.task == recorded.task and not each.of
     ]
     check_name(f"demonstrations of {recorded.task} that are not multiplied", recorded.of, first)
+
+
+def _check_learner(plan: "Plan", recorded: Demonstrations) -> None:
+    """Refuse a learner of another task, or one that is trained on what it acts in."""
+    policies = {policy.name: policy for policy in plan.policies}
+    behind = [recorded.name]
+    learner = recorded.learner
+    while learner:
+        acting = [
+            policy.name
+            for policy in plan.policies
+            if policy.policy != HLP
+            and (policy.subtask or plan.recorded(policy).task) == recorded.task
+        ]
+        check_name(f"policy that acts in {recorded.task}", learner, acting)
+        learned = plan.recorded(policies[learner])
+        if learned.name in behind:
+            raise InputError(
+                f"demonstrations {recorded.name}: its learner '{recorded.learner}' is trained on "
+                f"'{learned.name}', which is recorded with that learner; give one that is "
+                "trained before."
+            )
+        behind.append(learned.name)
+        learner = learned.learner
+    if not recorded.learner:
+        return
+    first = plan.dataset(recorded, plan.seed[0])
+    if first.next_seed > first_seed(plan.seed[0]) + SEEDS_EACH:
+        raise InputError(
+            f"demonstrations {recorded.name}: with those that its learner was trained on they try "
+            f"more than the {SEEDS_EACH} starts of a training seed; record fewer episodes."
+        )
 
 
 def _check_policy(plan: "Plan", policy: PlannedPolicy) -> None:

@@ -155,6 +155,25 @@ class Plan:
         """Return what a policy is trained on."""
         return self._named(policy.demonstrations)
 
+    def learned(self, recorded: Demonstrations) -> Demonstrations | None:
+        """Return what the learner that acts in demonstrations was trained on; None without one."""
+        return self.recorded(self.policy(recorded.learner)) if recorded.learner else None
+
+    @functools.cached_property
+    def learners(self) -> Mapping[str, Training]:
+        """The policies that act in demonstrations, by the names of the datasets of these."""
+        return {
+            _dataset_name(recorded, seed): self._training(self.policy(recorded.learner), seed)
+            for seed in self.seed
+            for recorded in self.demonstrations
+            if recorded.learner
+        }
+
+    @property
+    def evaluated_names(self) -> tuple[str, ...]:
+        """Names of the policies that are evaluated by themselves where a condition names none."""
+        return tuple(policy.name for policy in self._built if policy.acts)
+
     def _named(self, name: str) -> Demonstrations:
         return next(each for each in self.demonstrations if each.name == name)
 
@@ -165,13 +184,16 @@ class Plan:
             for each in self.demonstrations
             if each.name in (recorded.visits_of, recorded.of)
         }
+        first = self.learned(recorded)
+        learned = self.dataset(first, seed) if first else None
         return DatasetConfig(
             self.recorded_env(recorded),
             recorded,
             self.size,
-            first_seed=first_seed(seed),
+            first_seed=learned.next_seed if learned else first_seed(seed),
             visited=built_on.get(recorded.visits_of),
             multiplied=built_on.get(recorded.of),
+            learned=learned,
         )
 
     def training(self, policy: PlannedPolicy, seed: int) -> RunConfig:
@@ -188,20 +210,32 @@ class Plan:
             pool=(policy.pool or self.pool) if policy.view else "global",
             recipe=policy.recipe or self.recipe,
             changes=with_epochs(changes, self.epochs),
-            demonstrations=None if recorded.visits_of else recorded.episodes,
+            demonstrations=None if recorded.visits_of or recorded.learner else recorded.episodes,
             demonstrator=recorded.demonstrator,
             noise=recorded.noise,
             post_success_steps=recorded.post_success_steps,
             frame_stride=recorded.frame_stride,
             variants=recorded.looks,
             multiplied_from=self._named(recorded.of).episodes if recorded.of else None,
+            dagger_rounds=self._rounds(recorded),
             seed=seed,
         )
 
     @property
+    def _built(self) -> tuple[PlannedPolicy, ...]:
+        """The policies but for those that only act in demonstrations."""
+        learners = {recorded.learner for recorded in self.demonstrations}
+        return tuple(policy for policy in self.policies if policy.name not in learners)
+
+    def _rounds(self, recorded: Demonstrations) -> int:
+        """Return how many learners, one trained on what the other acted in, there were."""
+        first = self.learned(recorded)
+        return 1 + self._rounds(first) if first else 0
+
+    @property
     def names(self) -> tuple[str, ...]:
-        """Names of everything that is built, the whole procedure last."""
-        built = tuple(policy.name for policy in self.policies)
+        """Names of everything that is released, the whole procedure last."""
+        built = tuple(policy.name for policy in self._built)
         return (*built, names.SUTURE) if len(self.suture) == len(PARTS) else built
 
     @functools.cached_property
@@ -245,7 +279,7 @@ class Plan:
     def _evaluated(self) -> dict[RunConfig, tuple[str, Condition]]:
         """Each run → the name of what is evaluated, and the condition."""
         found: dict[RunConfig, tuple[str, Condition]] = {}
-        evaluated = [policy.name for policy in self.policies if policy.acts]
+        evaluated = [*self.evaluated_names]
         evaluated += [names.SUTURE] if names.SUTURE in self.names else []
         for seed in self.seed:
             for condition in self.conditions:
@@ -294,7 +328,7 @@ class Plan:
                 upset=condition.upset,
                 condition=condition.name,
             )
-        training = self.training(self._policy(name), seed)
+        training = self.training(self.policy(name), seed)
         env = self.task_config(training.task, condition)
         return replace(
             training,
@@ -305,7 +339,8 @@ class Plan:
             condition=condition.name,
         )
 
-    def _policy(self, name: str) -> PlannedPolicy:
+    def policy(self, name: str) -> PlannedPolicy:
+        """Return the policy of that name."""
         return next(policy for policy in self.policies if policy.name == name)
 
     @property
@@ -330,7 +365,7 @@ class Plan:
     def dataset_of(self, run: RunConfig) -> str:
         """Return the name of the dataset of a run's policy."""
         name, _ = self._evaluated[run]
-        return _dataset_name(self.recorded(self._policy(name)), run.seed)
+        return _dataset_name(self.recorded(self.policy(name)), run.seed)
 
     def parts(self, run: RunConfig) -> Mapping[str, Training]:
         """Return the policies that a run evaluates, by their names."""
@@ -338,7 +373,7 @@ class Plan:
             return {}
         name, condition = self._evaluated[run]
         if name != names.SUTURE:
-            return {name: self._training(self._policy(name), run.seed)}
+            return {name: self._training(self.policy(name), run.seed)}
         replaced = {**self.procedure, **condition.procedure}
         return {
             part: self._training(policy, run.seed)

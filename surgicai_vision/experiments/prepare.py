@@ -11,7 +11,7 @@ from surgicai_vision.core.variants import Variants
 from surgicai_vision.dataset.render import render_demos
 from surgicai_vision.demos.cut import cut_demos
 from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance
-from surgicai_vision.demos.record import record
+from surgicai_vision.demos.record import Learner, record
 from surgicai_vision.demos.store import list_demos
 from surgicai_vision.envs.upset import check_upset_task
 from surgicai_vision.experiments.dataset_config import DatasetConfig, Demonstrations
@@ -27,18 +27,21 @@ def check_dataset(dataset: DatasetConfig) -> None:
         check_upset_task(dataset.demonstrations.task)
 
 
-def make_dataset(dataset: DatasetConfig, folder: Path, context: RunContext) -> Path:
+def make_dataset(
+    dataset: DatasetConfig, folder: Path, context: RunContext, learner: Learner | None = None
+) -> Path:
     """Record and render what `dataset` says, into `folder`/demos and `folder`/dataset.
 
     Visits in whole procedures lie in `folder`/visits. The procedures themselves, and demonstrations
     that are re-posed, are recorded into the folder beside `folder` that has their name, where they
-    are not there yet.
+    are not there yet. What a learner was trained on was made there before it.
 
     Returns:
         The dataset's folder; that of the demonstrations where nothing is rendered.
     """
     recorded = dataset.demonstrations
     beside = [] if dataset.visited is None else [_cut(dataset.visited, recorded, folder, context)]
+    beside += _learned(dataset, folder)
     few = dataset.multiplied
     demos = [] if few is None else list_demos(_recorded(few, folder, context))
     return prepare_dataset(
@@ -57,7 +60,18 @@ def make_dataset(dataset: DatasetConfig, folder: Path, context: RunContext) -> P
         beside=beside,
         demos=demos,
         variants=recorded.looks,
+        learner=learner,
     )
+
+
+def _learned(dataset: DatasetConfig, folder: Path) -> list[Path]:
+    """Return the demonstrations that the learner was trained on, and its learner, and so on."""
+    first = dataset.learned
+    if first is None:
+        return []
+    made = folder.parent / first.demonstrations.name
+    visits = [] if first.visited is None else [made / "visits"]
+    return [made / "demos", *visits, *_learned(first, made)]
 
 
 def _recorded(other: DatasetConfig, folder: Path, context: RunContext) -> Path:
@@ -92,11 +106,13 @@ def prepare_dataset(
     beside: Sequence[Path] = (),
     demos: Sequence[Path] = (),
     variants: Variants | None = None,
+    learner: Learner | None = None,
 ) -> Path:
     """Record demonstrations into `folder`/demos and render them into `folder`/dataset.
 
     Without views nothing is rendered. Folders of demonstrations in `beside` are rendered with them,
-    each demonstration in every look of `variants`. `demos` are files that a demonstrator re-poses.
+    each demonstration in every look of `variants`. `demos` are files that a demonstrator re-poses;
+    `learner` acts at first.
 
     Returns:
         The dataset's folder; that of the demonstrations where nothing is rendered.
@@ -110,6 +126,7 @@ def prepare_dataset(
         disturbance=disturbance,
         post_success_steps=post_success_steps,
         demos=demos,
+        learner=learner,
         context=context,
     )
     if not views:

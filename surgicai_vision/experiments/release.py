@@ -30,6 +30,7 @@ from surgicai_vision.evaluation.policy_spec import hierarchical_policy, open_pol
 from surgicai_vision.evaluation.provenance import command_line
 from surgicai_vision.evaluation.run import evaluate_once
 from surgicai_vision.evaluation.storage import read_rows
+from surgicai_vision.experiments.dagger import learner_of
 from surgicai_vision.experiments.dataset_config import Demonstrations
 from surgicai_vision.experiments.plan_config import Plan, plan_of
 from surgicai_vision.experiments.plan_parts import PlannedPolicy
@@ -129,13 +130,7 @@ class _Build:
     def subtask(self, policy: PlannedPolicy) -> ReleaseCard:
         """Train, count and release one policy."""
         recorded = self.plan.recorded(policy)
-        folder = self.out / "policies" / policy.name
-        if not (folder / CARD).exists():
-            dataset: Dataset = open_dataset(self._dataset(recorded))
-            if policy.subtask:  # before the encoding: no other frame is encoded
-                dataset = of_subtask(dataset, policy.subtask)
-            run = self.plan.training(policy, self.plan.seed[0])
-            train_run(run, dataset, folder, self.context.stage)
+        folder = self._trained(policy)
         checkpoint = read_checkpoint(folder)
         whose = f"the {policy.subtask} of " if policy.subtask else ""
         card = ReleaseCard(
@@ -178,10 +173,25 @@ class _Build:
         write_released(card, {PROCEDURE: content})
         return read_card(names.SUTURE)
 
+    def _trained(self, policy: PlannedPolicy) -> Path:
+        """Train a policy where that is not done yet; return its folder."""
+        folder = self.out / "policies" / policy.name
+        if not (folder / CARD).exists():
+            dataset: Dataset = open_dataset(self._dataset(self.plan.recorded(policy)))
+            if policy.subtask:  # before the encoding: no other frame is encoded
+                dataset = of_subtask(dataset, policy.subtask)
+            run = self.plan.training(policy, self.plan.seed[0])
+            train_run(run, dataset, folder, self.context.stage)
+        return folder
+
     def _dataset(self, recorded: Demonstrations) -> Path:
-        """Record and render; return the dataset's folder."""
+        """Record, by a learner trained before where one acts, and render; return the folder."""
         dataset = self.plan.dataset(recorded, self.plan.seed[0])
-        return make_dataset(dataset, self.out / recorded.name, self.context)
+        learner = None
+        if recorded.learner:
+            policy = self.plan.policy(recorded.learner)
+            learner = learner_of(self._trained(policy), dataset.env)
+        return make_dataset(dataset, self.out / recorded.name, self.context, learner)
 
     def _counted(self, card: ReleaseCard, given: str | Path, folder: str) -> ReleaseCard:
         """Evaluate a policy on the held-out starts; return its card with the count."""

@@ -26,6 +26,7 @@ class Condition:
         demonstrations: demonstrations trained on, validation included; None where not known.
         looks: the looks in which each demonstration was rendered, or "".
         multiplied_from: how many demonstrations those were re-posed from; None where they were not.
+        dagger_rounds: rounds of DAgger that those hold.
         axis: what is shifted in a robustness evaluation, or "".
         strength: how much.
         expert_swap: subtask of a hierarchical policy in which the expert acts, or "".
@@ -47,6 +48,7 @@ class Condition:
     demonstrations: int | None = None
     looks: str = ""
     multiplied_from: int | None = None
+    dagger_rounds: int = 0
     axis: str = ""
     strength: float = 0.0
     expert_swap: str = ""
@@ -66,6 +68,7 @@ class Condition:
             " + ".join(self.changes),
             self.looks,
             f"multiplied from {self.multiplied_from}" if self.multiplied_from else "",
+            f"rounds of DAgger: {self.dagger_rounds}" if self.dagger_rounds else "",
             self.name,
             self.place,
         ]
@@ -132,6 +135,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         demonstrations=run.demonstrations,
         looks=run.variants.text if run.variants else "",
         multiplied_from=run.multiplied_from,
+        dagger_rounds=run.dagger_rounds,
         axis=run.shift.axis if run.shift else "",
         strength=run.shift.strength if run.shift else 0.0,
         expert_swap=run.expert_swap or "",

@@ -30,12 +30,13 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "demonstrations": "demonstrations",
         "looks": "looks",
         "multiplied_from": "multiplied demonstrations",
+        "dagger_rounds": "rounds of DAgger",
         "name": "condition",
         "place": "place",
     }
 )
 """Field of a condition → how a difference in it is called."""
-AMOUNTS = ("demonstrations", "looks", "multiplied_from")
+AMOUNTS = ("demonstrations", "looks", "multiplied_from", "dagger_rounds")
 """Fields that say how much there was to learn from."""
 
 
@@ -90,6 +91,8 @@ def factor(first: Condition, second: Condition) -> str:
         whole = ("encoder", "views", "pool", "recipe", "changes", "demonstrations")
         differ = [name for name in differ if name == "recipe" or name not in whole]
     if "multiplied_from" in differ and _originals(first) == _originals(second):
+        differ = [name for name in differ if name != "demonstrations"]
+    if "dagger_rounds" in differ:  # a round brings demonstrations of its own
         differ = [name for name in differ if name != "demonstrations"]
     if set(differ) & set(AMOUNTS) and _without_epochs(first) == _without_epochs(second):
         differ = [name for name in differ if name != "changes"]

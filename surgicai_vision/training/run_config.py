@@ -92,6 +92,7 @@ class RunConfig:
             it was recorded, or where it is not known.
         multiplied_from: how many demonstrations those trained on were re-posed from
             (`demos.multiply`), where a plan says so; None where they were not.
+        dagger_rounds: rounds of DAgger that the demonstrations hold, where a plan says so.
         updates: updates of the weights and `batch_size`, for LeRobot's policies.
         batch_size: frames of an update, for LeRobot's policies.
         seed: training seed.
@@ -124,6 +125,7 @@ class RunConfig:
     frame_stride: int = 1
     variants: Variants | None = field(default=None, metadata=LATER)
     multiplied_from: int | None = field(default=None, metadata=LATER)
+    dagger_rounds: int = field(default=0, metadata=LATER)
     updates: int | None = None
     batch_size: int | None = None
     seed: int = 0
@@ -218,6 +220,7 @@ class RunConfig:
             parts += [self.recipe_label] if self.recipe_label != "paper" else []
             parts += [self.variants.name] if self.variants else []
             parts += [f"from-{self.multiplied_from}"] if self.multiplied_from else []
+            parts += [f"dagger-{self.dagger_rounds}"] if self.dagger_rounds else []
         if self.expert_swap:
             parts.append(f"expert-{self.expert_swap}")
         return "-".join(parts).replace(":", "-")

@@ -28,8 +28,9 @@ from surgicai_vision.evaluation.storage import (
     parquet_bytes,
     read_rows,
 )
+from surgicai_vision.experiments.dagger import learner_of
 from surgicai_vision.experiments.prepare import check_dataset, make_dataset
-from surgicai_vision.experiments.sweep.experiment import Experiment
+from surgicai_vision.experiments.sweep.experiment import Experiment, Training
 from surgicai_vision.experiments.sweep.plan import (
     CACHED,
     LEFT,
@@ -217,8 +218,7 @@ class _Sweep:
         used = [name for state in to_do for name in users[state.key]]
         for name in dict.fromkeys([*used, *replayed]):
             try:
-                dataset = self.experiment.datasets[name]
-                make_dataset(dataset, self.jobs.data_folder(name), self.context)
+                self._make_dataset(name)
             except SurgicaiError as error:
                 for state in to_do:
                     if name in users[state.key] and state.key not in self.errors:
@@ -227,6 +227,23 @@ class _Sweep:
         live = [state for state in to_do if state.key not in self.errors]
         self._share("features", [job for state in live for job in self.jobs.features(state.run)])
         self._train_parts(live)
+
+    def _make_dataset(self, name: str) -> None:
+        """Make a dataset, and before it the policy that acts in its demonstrations, if one does.
+
+        Raises:
+            SurgicaiError: the first thing that went wrong.
+        """
+        dataset = self.experiment.datasets[name]
+        learner = None
+        if name in self.experiment.learners:
+            policy = self.experiment.learners[name]
+            self._make_dataset(policy.dataset)
+            self._renew()  # the digest of what it is trained on is part of its key
+            for error in self._train([policy]).values():
+                raise error
+            learner = learner_of(self.jobs.policy_folder(policy), dataset.env)
+        make_dataset(dataset, self.jobs.data_folder(name), self.context, learner)
 
     def _run(
         self,
@@ -264,11 +281,17 @@ class _Sweep:
 
     def _train_parts(self, states: Sequence[RunState]) -> None:
         """Train the policies that runs share and file them; a run that lacks one fails."""
-        parts = {
-            self.jobs.policy(part).key(): part
-            for state in states
-            for part in self.experiment.parts(state.run).values()
-        }
+        parts = {state.key: list(self.experiment.parts(state.run).values()) for state in states}
+        errors = self._train([part for each in parts.values() for part in each])
+        for state in states:
+            for part in parts[state.key]:
+                error = errors.get(self.jobs.policy(part).key())
+                if error and state.key not in self.errors:
+                    self._fail(state, error)
+
+    def _train(self, policies: Iterable[Training]) -> dict[str, SurgicaiError]:
+        """Train policies that are not there yet and file them; return the errors by key."""
+        parts = {self.jobs.policy(policy).key(): policy for policy in policies}
         places = {
             key: _Place(self.jobs.policy_folder(part), JOB_FILE) for key, part in parts.items()
         }
@@ -284,11 +307,7 @@ class _Sweep:
         errors: dict[str, SurgicaiError] = {}
         if missing:
             self._run("policies", [self.jobs.policy(part) for part in missing], ended)
-        for state in states:
-            for part in self.experiment.parts(state.run).values():
-                error = errors.get(self.jobs.policy(part).key())
-                if error and state.key not in self.errors:
-                    self._fail(state, error)
+        return errors
 
     def do(self, to_do: Sequence[RunState]) -> None:
         """Do the runs and the references, and file each as it ends."""

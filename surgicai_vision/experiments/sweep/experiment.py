@@ -65,6 +65,13 @@ class Experiment(Protocol):
         """Name of each dataset, its folder below `data/` → what it is."""
 
     @property
+    def learners(self) -> Mapping[str, Training]:
+        """Name of a dataset → the policy that acts in its demonstrations, trained before (DAgger).
+
+        A dataset is missing where the demonstrator alone acts.
+        """
+
+    @property
     def accept_licence(self) -> bool:
         """Whether weights under a non-commercial licence are accepted."""
 

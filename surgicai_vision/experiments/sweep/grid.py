@@ -311,6 +311,11 @@ class Grid:
         """Each task's dataset, by the task's name."""
         return {task: self._dataset(task) for task in self.task}
 
+    @property
+    def learners(self) -> Mapping[str, Training]:
+        """No policy acts in the demonstrations."""
+        return {}
+
     def _dataset(self, task: str) -> DatasetConfig:
         recorded = Demonstrations(
             task,

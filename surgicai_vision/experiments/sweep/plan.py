@@ -159,8 +159,19 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
 
 
 def trained_by(experiment: Experiment, run: RunConfig) -> list[RunConfig]:
-    """Return the policies that must be trained for a run: its parts, or its own."""
-    return [part.run for part in experiment.parts(run).values()] or [run]
+    """Return the policies that must be trained for a run.
+
+    These are its parts, or its own, and the learners that act in what they are trained on.
+    """
+    parts = experiment.parts(run).values()
+    own = [part.run for part in parts] or [run]
+    datasets = [part.dataset for part in parts]
+    for name in datasets:  # grows by what the learners are trained on
+        if name in experiment.learners:
+            learner = experiment.learners[name]
+            own.append(learner.run)
+            datasets.append(learner.dataset)
+    return own
 
 
 def _check_acts(policy: str) -> None:

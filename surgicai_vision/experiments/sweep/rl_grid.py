@@ -213,6 +213,11 @@ class RLGrid:
         return False
 
     @property
+    def learners(self) -> Mapping[str, Training]:
+        """No policy acts in the demonstrations."""
+        return {}
+
+    @property
     def probe(self) -> bool:
         """Return False: there are no features."""
         return False
