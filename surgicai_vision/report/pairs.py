@@ -94,7 +94,7 @@ def factor(first: Condition, second: Condition) -> str:
         differ = [name for name in differ if name != "demonstrations"]
     if "dagger_rounds" in differ:  # a round brings demonstrations of its own
         differ = [name for name in differ if name != "demonstrations"]
-    if set(differ) & set(AMOUNTS) and _without_epochs(first) == _without_epochs(second):
+    if set(differ) & set(AMOUNTS) and _without_amounts(first) == _without_amounts(second):
         differ = [name for name in differ if name != "changes"]
     if "name" in differ:
         differ = [name for name in differ if name != "hierarchical"]
@@ -103,9 +103,13 @@ def factor(first: Condition, second: Condition) -> str:
     return FACTORS.get(differ[0], differ[0]) if len(differ) == 1 else ""
 
 
-def _without_epochs(condition: Condition) -> list[str]:
-    """Return what is changed in the recipe but for its epochs, of which more data need fewer."""
-    return [change for change in condition.changes if not change.startswith("epochs=")]
+def _without_amounts(condition: Condition) -> list[str]:
+    """Return what is changed in the recipe but for how many frames of how many epochs it takes.
+
+    More demonstrations need fewer of both.
+    """
+    amounts = ("epochs=", "frame_stride=")
+    return [change for change in condition.changes if not change.startswith(amounts)]
 
 
 def _originals(condition: Condition) -> int | None:

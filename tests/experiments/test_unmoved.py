@@ -123,8 +123,10 @@ def test_few_demonstrations_are_counted_as_they_are_and_multiplied():
     kinds = ((10, None), (50, None), (350, 10), (350, 50))
     assert counts == {(task, *kind): 2 for task in ("grasp", "place", "insert") for kind in kinds}
     for policy in built.policies:
-        own = next((each for each in policy.change if each.startswith("epochs=")), "epochs=20")
-        assert built.recorded(policy).episodes * int(own.removeprefix("epochs=")) == 350 * 20
+        recipe = policies.recipe_of(built.training(policy, 0))
+        recorded = built.recorded(policy)
+        assert recorded.frame_stride == recipe.frame_stride
+        assert recorded.episodes * recipe.epochs / recipe.frame_stride == 350 * 20 / 5
 
 
 @pytest.mark.parametrize("name", SWEEPS)
