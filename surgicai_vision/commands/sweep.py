@@ -19,7 +19,7 @@ from surgicai_vision.commands.options import (
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, UnknownName
 from surgicai_vision.core.files import configs_folder, read_yaml
-from surgicai_vision.experiments.plan_config import plan_of
+from surgicai_vision.experiments.plan_config import is_plan, read_plan
 from surgicai_vision.experiments.sweep.grid import AXES, Grid
 from surgicai_vision.experiments.sweep.rl_grid import RLGrid
 from surgicai_vision.features.devices import find_device
@@ -169,7 +169,7 @@ def read_experiment(path: Path) -> "Experiment":
     table = read_yaml(path)
     if "algo" in table:
         return from_mapping(RLGrid, _with_lists(table), str(path))
-    return plan_of(table, str(path)) if "policies" in table else read_grid(path)
+    return read_plan(path) if is_plan(table) else read_grid(path)
 
 
 def _with_lists(table: dict[str, object]) -> dict[str, object]:

@@ -26,6 +26,12 @@ on what (`policies`), and what is evaluated in which conditions (`conditions`):
 A policy takes part in the whole procedure by its `part`, else by its name: the five subtasks and
 `hlp` make `suture`. So a plan may have both a `grasp`, counted on its own task, and a
 `{name: suture-grasp, part: grasp, …}` of whole procedures.
+A plan that differs from another in a few keys names it, and these alone:
+
+    base: endoscope                      # a shipped plan, or a file's path from this one's folder
+    env: {scene: {tissue: soft}}         # a key stands in place of the base's, whole
+    conditions: [{name: soft}]
+
 Two commands take a plan:
 
 * `surgicai-vision sweep PLAN.yaml`: every training seed in every condition, in one folder
@@ -55,6 +61,7 @@ from surgicai_vision.core.config import (
     to_identity,
     to_mapping,
 )
+from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.core.files import configs_folder, read_yaml
 from surgicai_vision.evaluation.hierarchical_config import HierarchicalConfig
 from surgicai_vision.experiments.dataset_config import (
@@ -78,6 +85,9 @@ from surgicai_vision.training.run_config import (
     Starts,
     with_epochs,
 )
+
+BASE = "base"
+"""A plan file's key that names the plan it differs from."""
 
 RELEASED_PLAN = Path("sweep") / "procedure.yaml"
 """Below `configs/`: the plan of the policies that come with the product."""
@@ -481,6 +491,29 @@ def read_plan(path: Path | None = None) -> Plan:
     Raises:
         BadFile: it cannot be read.
         InputError: a key or a value that is not allowed.
+        UnknownName: its base is no shipped sweep.
     """
     path = path or configs_folder() / RELEASED_PLAN
-    return plan_of(read_yaml(path), str(path))
+    table = read_yaml(path)
+    if BASE not in table:
+        return plan_of(table, str(path))
+    base = _base_file(str(table.pop(BASE)), path)
+    below = read_yaml(base)
+    if BASE in below:
+        raise InputError(f"{path}: its base, {base}, has a base itself; name that one.")
+    return plan_of({**below, **table}, str(path))
+
+
+def is_plan(table: Mapping[str, object]) -> bool:
+    """Return whether a file's table is a plan's, not a grid's."""
+    return "policies" in table or BASE in table
+
+
+def _base_file(base: str, path: Path) -> Path:
+    """Return the file of a plan's base: a shipped plan's name, or a path from the plan's folder."""
+    if Path(base).suffix:
+        return path.parent / base
+    shipped = {file.stem: file for file in (configs_folder() / "sweep").glob("*.yaml")}
+    if base not in shipped:
+        raise UnknownName("sweep", base, shipped)
+    return shipped[base]
