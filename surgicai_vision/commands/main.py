@@ -6,6 +6,7 @@ command's module, and what it needs, is imported only when that command runs, so
 instant.
 """
 
+import errno
 import json
 import os
 import signal
@@ -35,6 +36,8 @@ TITLE = (
     "scene → env → demos → dataset → features → policy → evaluation → report"
 )
 INTERRUPTED = "interrupted; run the same command again to continue"
+FULL = (errno.ENOSPC, errno.EDQUOT)
+NO_ROOM = "The disk is full; make room, and run the same command again to continue."
 TERMINATED = 128 + signal.SIGTERM
 """Exit code after SIGTERM, as a shell gives it."""
 EVERYWHERE = Group("Options of every command", sort_key=1)
@@ -81,6 +84,8 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
+        if error.errno in FULL:
+            return _fail(SurgicaiError(NO_ROOM))
         if error.filename is None:
             raise
         return _fail(SurgicaiError(f"{error.filename}: {error.strerror}."))
