@@ -18,7 +18,7 @@ D3RLPY = "d3rlpy"
 
 SUCCESS = ("success_steps", "tolerance_share", "keeps_holes")
 """What a success asks for in learning beyond the paper's (`core.config.SuccessRule`)."""
-COMMON = ("hidden", "learning_rate", "gamma", "batch_size", *SUCCESS)
+COMMON = ("hidden", "learning_rate", "gamma", "batch_size", "stop_at", *SUCCESS)
 ONLINE = (*COMMON, "envs")
 OFF_POLICY = (*ONLINE, "tau", "train_every", "updates", "learning_starts", "critics")
 DETERMINISTIC = (*OFF_POLICY, "exploration_noise")

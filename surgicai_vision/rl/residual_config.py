@@ -59,6 +59,6 @@ class ResidualRequest:
             raise InputError(f"bound is {self.bound}; it must be above 0 and at most 1.")
         check_at_least(1, env_steps=self.env_steps, save_every=self.save_every)
         check_at_least(0, validation=self.validation, seed=self.seed)
-        for name in ("envs", *SUCCESS):
+        for name in ("envs", "stop_at", *SUCCESS):
             if getattr(self.settings, name) != getattr(Settings, name):
                 raise InputError(f"A residual policy reads no {name}; leave it out.")

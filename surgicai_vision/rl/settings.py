@@ -12,6 +12,8 @@ from surgicai_vision.rl.algorithms import ALGORITHMS, Algorithm
 
 OBSERVATIONS = ("relative", "state")
 DEMANDS = ("auto", "achieved", "kept")
+STOP_AFTER = 2
+"""Evaluations in a row that must reach `Settings.stop_at`."""
 
 
 @final
@@ -52,6 +54,8 @@ class Settings:
         clip_q: clip targets to the range of a return of the reward, [-1 / (1 - γ), 0].
         rollout: steps of all envs from update to update (PPO).
         samples: actions sampled a state by BCQ and Cal-QL (their papers' code: 100 and 10).
+        stop_at: share of validation starts; learning ends once `STOP_AFTER` evaluations in a row
+            have solved so many. With 0 it goes on to the last step.
         success_steps: `SuccessRule.steps`, for an episode of learning or a demonstration. With 1,
             the paper's, nothing is learned of what comes after, and the next subtask of a whole
             procedure finds it unfinished.
@@ -84,6 +88,7 @@ class Settings:
     clip_q: bool = True
     rollout: int = 2048
     samples: int = 10
+    stop_at: float = 0.0
     success_steps: int = 1
     tolerance_share: float = 1.0
     keeps_holes: bool = False
@@ -109,6 +114,8 @@ class Settings:
                 )
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden is {self.hidden}; give at least one layer of width 1.")
+        if not 0 <= self.stop_at <= 1:
+            raise InputError(f"stop_at is {self.stop_at}; it is a share, from 0 to 1.")
         _ = self.success_rule  # refuses what is not allowed
 
     @property
@@ -178,6 +185,9 @@ class Request:
                 f"save_every is {self.save_every}, validation {self.validation}, seed {self.seed}; "
                 "at least 1, 0 and 0."
             )
+
+        if self.settings.stop_at and not self.validation:
+            raise InputError("stop_at counts validation starts; give validation of at least 1.")
 
     @property
     def algorithm(self) -> Algorithm:

@@ -6,7 +6,7 @@ the folder.
 
 The policy that is kept is that of the evaluation with the most successes from validation starts,
 of equals the last: learning goes up and down, and where it happens to end says little. Without
-`validation` it is the last.
+`validation` it is the last. With the setting `stop_at` learning ends early, once it is solved.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.rollout import run_share
 from surgicai_vision.rl.extra import check_extra
 from surgicai_vision.rl.learner import Learner
-from surgicai_vision.rl.settings import Request, read_by
+from surgicai_vision.rl.settings import STOP_AFTER, Request, read_by
 from surgicai_vision.rl.transitions import Transitions, of_demos
 from surgicai_vision.scene.kinematics import base_in_world
 from surgicai_vision.training.checkpoint import Checkpoint, write_checkpoint
@@ -245,7 +245,8 @@ def _run(
     minutes = curve[-1].minutes if curve else 0.0
     if progress:
         progress(min(learner.done, request.total), request.total)
-    while learner.done < request.total:
+    is_over = learner.done >= request.total or _is_solved(request, curve)
+    while not is_over:
         target = min((learner.done // request.save_every + 1) * request.save_every, request.total)
         began = time.process_time()
         losses = learner.advance(target)
@@ -256,12 +257,24 @@ def _run(
             best = actor.state_dict()
         log.draw(curve[-1], losses)
         write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
-        if learner.done < request.total:
+        is_over = learner.done >= request.total or _is_solved(request, curve)
+        if not is_over:
             _save(learner, curve, best, out)
         if progress:
-            progress(min(learner.done, request.total), request.total)
+            progress(request.total if is_over else learner.done, request.total)
     log.close()
     return _write(request, best, learner.squash, best_point(curve), out)
+
+
+def _is_solved(request: Request, curve: Sequence[Point]) -> bool:
+    """Return True if the last evaluations reached the share of successes that ends learning."""
+    share = request.settings.stop_at
+    last = curve[-STOP_AFTER:]
+    return (
+        share > 0
+        and len(last) == STOP_AFTER
+        and all(point.successes >= share * point.episodes for point in last)
+    )
 
 
 class CurvePoint(Protocol):

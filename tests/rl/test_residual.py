@@ -139,5 +139,7 @@ def test_only_a_cloned_policy_of_one_subtask_is_corrected(base, tmp_path):
             train_residual(request_of(str(other)), tmp_path / "again")
     with pytest.raises(InputError, match="success_steps"):
         ResidualRequest(base, settings=residual_settings({"success_steps": 3}))
+    with pytest.raises(InputError, match="stop_at"):
+        ResidualRequest(base, settings=residual_settings({"stop_at": 0.9}))
     with pytest.raises(InputError, match="bound"):
         ResidualRequest(base, bound=0.0)

@@ -163,6 +163,35 @@ def test_the_policy_kept_is_that_of_the_most_successes(killed_at, tmp_path, monk
     assert not all(torch.equal(kept[name], value) for name, value in seen[48].items())
 
 
+@pytest.mark.parametrize("killed_at", [None, 24])
+def test_learning_ends_once_it_is_solved_twice_in_a_row(killed_at, tmp_path, monkeypatch):
+    request, _ = request_of("td3", {}, save_every=12, validation=5)
+    request = replace(request, settings=replace(request.settings, stop_at=0.6))
+    successes = {12: 3, 24: 2, 36: 3, 48: 4}
+    shown = []
+
+    def evaluate(asked, actor, learner, minutes):
+        count = successes.get(learner.done, 5)
+        return training.Point(learner.done, learner.updates, minutes, count, 5, 1.0)
+
+    def show(done, total, unit=""):
+        shown.append((done, total))
+        if done == killed_at and killed_at not in shown:
+            shown.append(killed_at)
+            raise Killed
+
+    monkeypatch.setattr(training, "_evaluate", evaluate)
+    request = replace(request, env_steps=96)
+    if killed_at:
+        with pytest.raises(Killed):
+            train(request, [], tmp_path / "out", progress=show, tensorboard=False)
+    checkpoint = train(request, [], tmp_path / "out", progress=show, tensorboard=False)
+    assert checkpoint.frames == 48 and shown[-1] == (96, 96)
+    assert len(json.loads((tmp_path / "out" / training.CURVE).read_text())) == 4
+    with pytest.raises(InputError, match="validation of at least 1"):
+        replace(request, validation=0)
+
+
 def test_workers_change_no_result(demos, tmp_path):
     request, _ = request_of("td3", demos)
     settings = replace(request.settings, envs=2)
