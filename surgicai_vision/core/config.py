@@ -323,6 +323,20 @@ class TaskConfig:
             object.__setattr__(self, "max_steps", task_steps(self.task))
 
 
+def world_text(env: TaskConfig) -> str:
+    """Return what is not as usual in the world of an env: its scene, and what varies.
+
+    Each field with its value; "" for the usual scene in which nothing varies.
+    """
+    usual = SceneConfig()
+    scene = [
+        f"{each.name} {getattr(env.scene, each.name)}"
+        for each in dataclasses.fields(usual)
+        if getattr(env.scene, each.name) != getattr(usual, each.name)
+    ]
+    return ", ".join([*scene, *([env.randomisation.text] if env.randomisation.on else [])])
+
+
 def from_mapping(cls: type[T], mapping: Mapping[str, object], where: str = "configuration") -> T:
     """Build the dataclass `cls` from plain data, nested dataclasses included.
 

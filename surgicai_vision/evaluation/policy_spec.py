@@ -43,7 +43,7 @@ from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.training import policies, released
 from surgicai_vision.training.checkpoint import read_checkpoint
 from surgicai_vision.training.progress_input import progress_policy_folder
-from surgicai_vision.training.run_config import OWN, RunConfig
+from surgicai_vision.training.run_config import OWN, RunConfig, evaluated_in
 
 if TYPE_CHECKING:
     from surgicai_vision.dataset.protocol import Dataset
@@ -185,7 +185,7 @@ def in_env(spec: PolicySpec, env: Mapping[str, JSON] | None) -> PolicySpec:
             )
         limit = {"max_steps": spec.config.max_steps, "advance": spec.config.advance}
     config = from_mapping(TaskConfig, {**limit, **env, "task": spec.config.task}, "env")
-    return replace(spec, run=replace(spec.run, env=config))
+    return replace(spec, run=evaluated_in(spec.run, config))
 
 
 def _replay(dataset: "Dataset") -> PolicySpec:

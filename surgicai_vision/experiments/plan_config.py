@@ -83,6 +83,7 @@ from surgicai_vision.training.run_config import (
     OWN,
     RunConfig,
     Starts,
+    evaluated_in,
     with_epochs,
 )
 
@@ -341,10 +342,8 @@ class Plan:
         training = self.training(self.policy(name), seed)
         env = self.task_config(training.task, condition)
         return replace(
-            training,
-            env=env,
+            evaluated_in(training, env, condition.shift),
             starts=starts,
-            shift=condition.shift,
             upset=condition.upset,
             condition=condition.name,
         )

@@ -4,9 +4,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from surgicai_vision.core.cameras import view_names
-from surgicai_vision.core.config import read_changes
+from surgicai_vision.core.config import read_changes, world_text
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.training.run_config import BUDGET, RunConfig
+
+USUAL = "the usual world"
+"""A world in which nothing varies, in words."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,10 @@ class Condition:
         looks: the looks in which each demonstration was rendered, or "".
         multiplied_from: how many demonstrations those were re-posed from; None where they were not.
         dagger_rounds: rounds of DAgger that those hold.
+        world: what is not as usual in the world of the evaluation, before a shift; "" where nothing
+            is.
+        recorded_in: the same of the demonstrations' world, where it is another; else "", and of a
+            hierarchical policy, whose parts have each their own.
         axis: what is shifted in a robustness evaluation, or "".
         strength: how much.
         expert_swap: subtask of a hierarchical policy in which the expert acts, or "".
@@ -49,6 +56,8 @@ class Condition:
     looks: str = ""
     multiplied_from: int | None = None
     dagger_rounds: int = 0
+    world: str = ""
+    recorded_in: str = ""
     axis: str = ""
     strength: float = 0.0
     expert_swap: str = ""
@@ -69,6 +78,8 @@ class Condition:
             self.looks,
             f"multiplied from {self.multiplied_from}" if self.multiplied_from else "",
             f"rounds of DAgger: {self.dagger_rounds}" if self.dagger_rounds else "",
+            f"demonstrated in {self.recorded_in}" if self.recorded_in else "",
+            f"in {self.world}" if self.world and not self.name else "",
             self.name,
             self.place,
         ]
@@ -78,6 +89,11 @@ class Condition:
     def policy(self) -> str:
         """The policy without its views."""
         return self.encoder + (f" · {self.variant}" if self.variant else "")
+
+    @property
+    def learned_in(self) -> str:
+        """What is not as usual where it was demonstrated; "" for a hierarchy of several worlds."""
+        return "" if self.hierarchical else self.recorded_in or self.world or USUAL
 
     @property
     def view(self) -> str:
@@ -136,6 +152,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         looks=run.variants.text if run.variants else "",
         multiplied_from=run.multiplied_from,
         dagger_rounds=run.dagger_rounds,
+        **_worlds(run),
         axis=run.shift.axis if run.shift else "",
         strength=run.shift.strength if run.shift else 0.0,
         expert_swap=run.expert_swap or "",
@@ -144,6 +161,20 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         trained=run.is_trained,
         place=place,
     )
+
+
+def _worlds(run: RunConfig) -> dict[str, str]:
+    """Return a condition's `world` and `recorded_in`; what is shifted is so from where it learned.
+
+    An evaluation of an earlier version may not say what a shift was added to.
+    """
+    learned = world_text(run.recorded_in) if run.recorded_in else ""
+    if run.shift:
+        return {"world": learned}
+    return {
+        "world": world_text(run.env),
+        "recorded_in": (learned or USUAL) if run.recorded_in and not run.is_hierarchical else "",
+    }
 
 
 type Order = tuple[int, bool, bool, str, int, list[int], str, int, str, float, str, bool]

@@ -31,6 +31,7 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "looks": "looks",
         "multiplied_from": "multiplied demonstrations",
         "dagger_rounds": "rounds of DAgger",
+        "world": "world",
         "name": "condition",
         "place": "place",
     }
@@ -96,11 +97,14 @@ def factor(first: Condition, second: Condition) -> str:
         differ = [name for name in differ if name != "demonstrations"]
     if set(differ) & set(AMOUNTS) and _without_amounts(first) == _without_amounts(second):
         differ = [name for name in differ if name != "changes"]
-    if "name" in differ:
-        differ = [name for name in differ if name != "hierarchical"]
+    if "name" in differ:  # it says in which world
+        differ = [name for name in differ if name not in ("hierarchical", "world")]
+    if first.learned_in != second.learned_in:
+        differ.append("recorded_in")
     if blind:
         differ = ["images" if name == "encoder" else name for name in differ if name != "views"]
-    return FACTORS.get(differ[0], differ[0]) if len(differ) == 1 else ""
+    called = {**FACTORS, "recorded_in": "world of the demonstrations"}
+    return called.get(differ[0], differ[0]) if len(differ) == 1 else ""
 
 
 def _without_amounts(condition: Condition) -> list[str]:

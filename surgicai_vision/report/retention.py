@@ -19,6 +19,7 @@ from surgicai_vision.evaluation.robustness import ALL
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Bar
 from surgicai_vision.report.curves import Chart, base_of, evaluated, with_zero
+from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.groups import Group
 from surgicai_vision.report.reader import Result
 
@@ -166,22 +167,23 @@ def looks(groups: Sequence[Group]) -> list[tuple[str, ...]]:
     A policy is in a row if it was evaluated in both; it is the same by all but where it stands,
     what the condition is called and what it looked at, in worlds that vary alike in all else.
     """
-    seen: dict[tuple[str, str, RandomisationConfig], dict[bool, list[Result]]] = {}
+    seen: dict[tuple[Condition, str, RandomisationConfig], dict[bool, list[Result]]] = {}
     for item in groups:
         if not (item.episodes and item.condition.plain and item.condition.trained):
             continue
-        label = replace(item.condition, place="", name="").label
+        known = replace(item.condition, place="", name="", world="", recorded_in="")
         for result in item.results:
             axes = result.config.randomisation
             if axes.appearance in (names.TRAIN, *names.TRAIN_APPEARANCES) or axes.shows_heldout:
                 world = replace(axes, appearance="", appearance_shift=0.0)
-                by_look = seen.setdefault((item.condition.task, label, world), {})
+                by_look = seen.setdefault((known, item.condition.learned_in, world), {})
                 by_look.setdefault(axes.shows_heldout, []).append(result)
     rows: list[tuple[str, ...]] = []
-    for (task, label, _), by_look in seen.items():
+    for (known, _, _), by_look in seen.items():
         if len(by_look) == 2:
             held_in, held_out = _wins(by_look[False]), _wins(by_look[True])
-            rows.append((task, label, _count(held_in), _count(held_out), _ratio(held_in, held_out)))
+            counts = _count(held_in), _count(held_out), _ratio(held_in, held_out)
+            rows.append((known.task, known.label, *counts))
     return rows
 
 

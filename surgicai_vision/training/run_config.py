@@ -73,7 +73,10 @@ class RunConfig:
     """Everything that decides what a run is.
 
     Attributes:
-        env: the task, its scene and what differs from episode to episode.
+        env: the task, its scene and what differs from episode to episode: those of the
+            demonstrations before an evaluation, those of the evaluation after it.
+        recorded_in: the env of the demonstrations, where the evaluation's world is another or
+            shifted (`evaluated_in`); None where it is the same.
         encoder: encoder's name; `OWN` for a policy with a network of its own on the images; None
             for a policy without images.
         views: its views, in the order of the features; empty without images.
@@ -112,6 +115,7 @@ class RunConfig:
 
     env: TaskConfig = field(default_factory=TaskConfig)
     encoder: str | None = None
+    recorded_in: TaskConfig | None = field(default=None, kw_only=True, metadata=LATER)
     views: tuple[str, ...] = ()
     policy: str = "bc"
     pool: str = "global"
@@ -250,8 +254,31 @@ def with_budget(
     return changes if minutes is None else (*changes, f"{BUDGET}={minutes:g}")
 
 
+def evaluated_in(run: RunConfig, env: TaskConfig, shift: Shift | None = None) -> RunConfig:
+    """Return a run in the env of an evaluation; it remembers the world that it learned in.
+
+    Args:
+        run: the run.
+        env: the evaluation's, as the shift leaves it.
+        shift: what is shifted there, if anything.
+    """
+    learned = run.recorded_in or run.env
+    is_away = (learned.scene, learned.randomisation) != (env.scene, env.randomisation)
+    remembers = run.is_trained and (is_away or shift is not None)
+    return dataclasses.replace(
+        run, env=env, recorded_in=learned if remembers else None, shift=shift
+    )
+
+
 def of_training(run: RunConfig) -> RunConfig:
     """Return a run without what belongs to one evaluation of it."""
     return dataclasses.replace(
-        run, starts=None, shift=None, expert_swap=None, upset=False, condition=""
+        run,
+        env=run.recorded_in or run.env,
+        recorded_in=None,
+        starts=None,
+        shift=None,
+        expert_swap=None,
+        upset=False,
+        condition="",
     )

@@ -16,7 +16,7 @@ from surgicai_vision.evaluation import statistics
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.reader import collect
 from surgicai_vision.report.retention import looks, retentions
-from surgicai_vision.training.run_config import Shift
+from surgicai_vision.training.run_config import Shift, evaluated_in
 
 LEFT_AT_ONE = {"light": 1.5, "blur": 0.1, "all": -0.5}
 
@@ -31,10 +31,13 @@ def folder(tmp_path_factory):
         for strength, rate in ((0.0, 1.5), (0.5, 0.5 * (1.5 + left)), (1.0, left)):
             run = run_of("grasp", "imagenet", ("back",), 0, shift=Shift(axis, strength))
             evaluation(out / axis / f"{strength:g}", run, rate, generator, about)
+    shown = {
+        look: TaskConfig("insert", randomisation=RandomisationConfig(appearance=look))
+        for look in (names.TRAIN, names.HELDOUT)
+    }
+    trained = replace(run_of("insert", "imagenet", ("back",), 0), env=shown[names.TRAIN])
     for look, rate in ((names.TRAIN, 1.5), (names.HELDOUT, 0.5)):
-        shown = TaskConfig("insert", randomisation=RandomisationConfig(appearance=look))
-        run = replace(run_of("insert", "imagenet", ("back",), 0), env=shown)
-        evaluation(out / "looks" / look, run, rate, generator, about)
+        evaluation(out / "looks" / look, evaluated_in(trained, shown[look]), rate, generator, about)
     return out
 
 

@@ -25,7 +25,7 @@ from surgicai_vision.core.config import (
 )
 from surgicai_vision.core.errors import InputError, check_name
 from surgicai_vision.evaluation.agent import Agent, MakeAgent
-from surgicai_vision.training.run_config import Shift
+from surgicai_vision.training.run_config import Shift, evaluated_in
 
 if TYPE_CHECKING:
     from surgicai_vision.evaluation.policy_spec import PolicySpec
@@ -137,11 +137,8 @@ def shifted(spec: "PolicySpec", axis: str, strength: float) -> "PolicySpec":
         # The agent made last sees the image first.
         for kind in reversed(chosen.images):
             make = functools.partial(_corrupted, make, kind, strength)
-    run = dataclasses.replace(
-        spec.run,
-        env=shifted_config(spec.config, chosen, strength),
-        shift=Shift(axis, float(strength)),
-    )
+    env = shifted_config(spec.config, chosen, strength)
+    run = evaluated_in(spec.run, env, Shift(axis, float(strength)))
     return dataclasses.replace(spec, run=run, make=make)
 
 

@@ -33,7 +33,7 @@ from surgicai_vision.experiments.sweep.plan import PROBE_FILE, REFERENCE_FILE
 from surgicai_vision.features.devices import AUTO
 from surgicai_vision.features.encoders import WeightsSource
 from surgicai_vision.features.probe import probe
-from surgicai_vision.training.run_config import RunConfig
+from surgicai_vision.training.run_config import RunConfig, evaluated_in
 
 type Table = Mapping[str, JSON]
 
@@ -170,7 +170,7 @@ def _trained(
 def evaluate_as(folder: Path, spec: PolicySpec, run: RunConfig, about: Table) -> dict[str, JSON]:
     """Evaluate what is called and stored as `run`, in the env of `spec`."""
     assert run.starts is not None, "the experiment says where a run is evaluated"
-    stored = dataclasses.replace(run, env=spec.config)
+    stored = evaluated_in(run, spec.config, run.shift)
     spec = dataclasses.replace(spec, run=stored, about=about)
     return evaluate_into(folder, spec, run.starts.seeds, workers=1)
 
