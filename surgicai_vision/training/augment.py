@@ -42,16 +42,19 @@ def with_noise(observed: torch.Tensor, inputs: Inputs, deviation: float) -> torc
 
 
 def with_shift(
-    observed: torch.Tensor, shapes: Sequence[tuple[int, ...]], places: int
+    observed: torch.Tensor, shapes: Sequence[tuple[int, ...]], places: int, moments: int = 1
 ) -> torch.Tensor:
-    """Move every feature map by up to `places` places each way, each row and map by its own draw.
+    """Move every feature map by up to `places` places each way, each by a draw of its own.
 
-    What comes in from outside is the channel's mean, which is 0 in normalised inputs.
+    What comes in from outside is the channel's mean, which is 0 in normalised inputs. The moments
+    of a history move together: what a camera is off by does not change from one to the next, and
+    the way the needle has gone between them is what a history is there to show.
 
     Args:
         observed: (B, inputs.dim) normalised inputs, the views' features first.
         shapes: of the features, in their order; only maps (C, h, w) are moved.
         places: largest move [places].
+        moments: rows one after the other that are one history; B is a multiple of it.
     """
     moved = observed.clone()
     at = 0
@@ -61,8 +64,8 @@ def with_shift(
             maps = observed[:, at : at + size].unflatten(1, shape)
             target = moved[:, at : at + size].unflatten(1, shape)
             target.zero_()
-            moves = torch.randint(-places, places + 1, (len(maps), 2)).tolist()
-            for row, (down, right) in enumerate(moves):
+            moves = torch.randint(-places, places + 1, (len(maps) // moments, 2))
+            for row, (down, right) in enumerate(moves.repeat_interleave(moments, 0).tolist()):
                 to_y, from_y = _overlap(down, shape[1])
                 to_x, from_x = _overlap(right, shape[2])
                 target[row, :, to_y, to_x] = maps[row, :, from_y, from_x]

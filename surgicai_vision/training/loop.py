@@ -265,20 +265,19 @@ class Training:
         """Return normalised inputs as the recipe's augmentation leaves them.
 
         Args:
-            observed: (B, inputs.dim), or (B, history, inputs.dim), each moment by its own draw.
+            observed: (B, inputs.dim), or (B, history, inputs.dim).
         """
-        if observed.ndim == 3:
-            moments = self._augmented(observed.flatten(0, 1))
-            augmented: torch.Tensor = moments.unflatten(0, observed.shape[:2])
-            return augmented
         recipe = self.request.recipe
         inputs = self.policy.inputs
+        moments = observed.shape[1] if observed.ndim == 3 else 1
+        rows = observed.reshape(-1, inputs.dim)
         if recipe.map_shift:
             shapes = visual_shapes(recipe, inputs.visual)
-            observed = with_shift(observed, shapes, recipe.map_shift)
+            rows = with_shift(rows, shapes, recipe.map_shift, moments)
         if recipe.proprioception_noise:
-            observed = with_noise(observed, inputs, recipe.proprioception_noise)
-        return observed
+            rows = with_noise(rows, inputs, recipe.proprioception_noise)
+        augmented: torch.Tensor = rows.reshape(observed.shape)
+        return augmented
 
     @torch.no_grad()
     def _validate(self) -> float:

@@ -64,6 +64,16 @@ def test_views_move_together_where_they_are_joined_only() -> None:
     assert not torch.equal(apart[:, 0], apart[:, 1])
 
 
+def test_the_moments_of_a_history_move_together() -> None:
+    torch.manual_seed(3)
+    observed = torch.ones(300, 2 * 16)
+    shapes = ((1, 4, 4), (1, 4, 4))
+    histories = with_shift(observed, shapes, 1, moments=3).view(100, 3, 32)
+    assert torch.equal(histories, histories[:, :1].expand_as(histories))
+    assert len(torch.unique(histories[:, 0], dim=0)) > 30, "each history by its own draw"
+    assert not torch.equal(histories[..., :16], histories[..., 16:]), "so each view"
+
+
 def test_joined_views_are_one_map_with_all_channels(tmp_path: Path) -> None:
     recipe = replace(QUICK, join_views=True, map_head="convolutions")
     two = ((40, 28, 28), (40, 28, 28))
