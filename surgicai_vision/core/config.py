@@ -334,7 +334,7 @@ def world_text(env: TaskConfig) -> str:
         for each in dataclasses.fields(usual)
         if getattr(env.scene, each.name) != getattr(usual, each.name)
     ]
-    return ", ".join([*scene, *([env.randomisation.text] if env.randomisation.on else [])])
+    return ", ".join(filter(None, [*scene, env.randomisation.text]))
 
 
 def from_mapping(cls: type[T], mapping: Mapping[str, object], where: str = "configuration") -> T:

@@ -32,11 +32,12 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "multiplied_from": "multiplied demonstrations",
         "dagger_rounds": "rounds of DAgger",
         "world": "world",
+        "learned_in": "world of the demonstrations",
         "name": "condition",
         "place": "place",
     }
 )
-"""Field of a condition → how a difference in it is called."""
+"""Attribute of a condition → how a difference in it is called."""
 AMOUNTS = ("demonstrations", "looks", "multiplied_from", "dagger_rounds")
 """Fields that say how much there was to learn from."""
 
@@ -99,12 +100,9 @@ def factor(first: Condition, second: Condition) -> str:
         differ = [name for name in differ if name != "changes"]
     if "name" in differ:  # it says in which world
         differ = [name for name in differ if name not in ("hierarchical", "world")]
-    if first.learned_in != second.learned_in:
-        differ.append("recorded_in")
     if blind:
         differ = ["images" if name == "encoder" else name for name in differ if name != "views"]
-    called = {**FACTORS, "recorded_in": "world of the demonstrations"}
-    return called.get(differ[0], differ[0]) if len(differ) == 1 else ""
+    return FACTORS.get(differ[0], differ[0]) if len(differ) == 1 else ""
 
 
 def _without_amounts(condition: Condition) -> list[str]:

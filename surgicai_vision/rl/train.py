@@ -245,7 +245,7 @@ def _run(
     minutes = curve[-1].minutes if curve else 0.0
     if progress:
         progress(min(learner.done, request.total), request.total)
-    is_over = learner.done >= request.total or _is_solved(request, curve)
+    is_over = _is_over(request, learner, curve)
     while not is_over:
         target = min((learner.done // request.save_every + 1) * request.save_every, request.total)
         began = time.process_time()
@@ -257,7 +257,7 @@ def _run(
             best = actor.state_dict()
         log.draw(curve[-1], losses)
         write_json(out / CURVE, [dataclasses.asdict(point) for point in curve])
-        is_over = learner.done >= request.total or _is_solved(request, curve)
+        is_over = _is_over(request, learner, curve)
         if not is_over:
             _save(learner, curve, best, out)
         if progress:
@@ -266,15 +266,14 @@ def _run(
     return _write(request, best, learner.squash, best_point(curve), out)
 
 
-def _is_solved(request: Request, curve: Sequence[Point]) -> bool:
-    """Return True if the last evaluations reached the share of successes that ends learning."""
+def _is_over(request: Request, learner: Learner, curve: Sequence[Point]) -> bool:
+    """Return True after the last step, or once the last evaluations have reached `stop_at`."""
+    if learner.done >= request.total:
+        return True
     share = request.settings.stop_at
     last = curve[-STOP_AFTER:]
-    return (
-        share > 0
-        and len(last) == STOP_AFTER
-        and all(point.successes >= share * point.episodes for point in last)
-    )
+    solved = [point.successes >= share * point.episodes for point in last]
+    return share > 0 and len(solved) == STOP_AFTER and all(solved)
 
 
 class CurvePoint(Protocol):

@@ -75,8 +75,6 @@ class RunConfig:
     Attributes:
         env: the task, its scene and what differs from episode to episode: those of the
             demonstrations before an evaluation, those of the evaluation after it.
-        recorded_in: the env of the demonstrations, where the evaluation's world is another or
-            shifted (`evaluated_in`); None where it is the same.
         encoder: encoder's name; `OWN` for a policy with a network of its own on the images; None
             for a policy without images.
         views: its views, in the order of the features; empty without images.
@@ -96,6 +94,8 @@ class RunConfig:
         multiplied_from: how many demonstrations those trained on were re-posed from
             (`demos.multiply`), where a plan says so; None where they were not.
         dagger_rounds: rounds of DAgger that the demonstrations hold, where a plan says so.
+        recorded_in: the env of the demonstrations, where the evaluation's world is another or
+            shifted (`evaluated_in`); None where it is the same.
         updates: updates of the weights and `batch_size`, for LeRobot's policies.
         batch_size: frames of an update, for LeRobot's policies.
         seed: training seed.
@@ -115,7 +115,6 @@ class RunConfig:
 
     env: TaskConfig = field(default_factory=TaskConfig)
     encoder: str | None = None
-    recorded_in: TaskConfig | None = field(default=None, kw_only=True, metadata=LATER)
     views: tuple[str, ...] = ()
     policy: str = "bc"
     pool: str = "global"
@@ -130,6 +129,7 @@ class RunConfig:
     variants: Variants | None = field(default=None, metadata=LATER)
     multiplied_from: int | None = field(default=None, metadata=LATER)
     dagger_rounds: int = field(default=0, metadata=LATER)
+    recorded_in: TaskConfig | None = field(default=None, metadata=LATER)
     updates: int | None = None
     batch_size: int | None = None
     seed: int = 0
