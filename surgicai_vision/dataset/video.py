@@ -12,17 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.video import REPEATABLE
 
 if TYPE_CHECKING:
     import av
 
 CODECS = MappingProxyType(
     {
-        "h264": ("libx264", {"g": "2", "crf": "30"}),
+        "h264": ("libx264", {"g": "2", "crf": "30", **REPEATABLE}),
         "av1": ("libsvtav1", {"g": "2", "crf": "30", "preset": "12"}),
     }
 )
-"""Codec → (encoder, options): LeRobot's defaults (lerobot 0.6.1, configs/video.py)."""
+"""Codec → (encoder, options): LeRobot's defaults (lerobot 0.6.1, configs/video.py), but that
+the same frames give the same bytes."""
 
 PIXELS = "yuv420p"
 

@@ -1,5 +1,9 @@
 """Videos: what is written is what was given, the same bytes every time, whole or not at all."""
 
+import os
+import subprocess
+import sys
+
 import av
 import numpy as np
 import pytest
@@ -42,6 +46,37 @@ def test_the_same_frames_give_the_same_bytes(tmp_path):
     for name in "ab":
         write_video(tmp_path / f"{name}.mp4", moving(12), 25)
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+
+
+WRITE = """
+import sys
+from pathlib import Path
+import numpy as np
+from surgicai_vision.core.video import write_video
+from surgicai_vision.dataset.video import VideoWriter
+frames = np.load("frames.npy")
+write_video(Path(sys.argv[1], "one.mp4"), frames, 25)
+writer = VideoWriter(Path(sys.argv[1], "dataset.mp4"), "h264", 25, frames.shape[1])
+for frame in frames:
+    writer.add(frame)
+writer.close()
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's MALLOC_PERTURB_")
+def test_what_memory_held_before_does_not_show_in_a_video(tmp_path):
+    """`MALLOC_PERTURB_` fills memory that is handed out: code that reads it unwritten shows it."""
+    np.save(tmp_path / "frames.npy", moving(12, 96, 96))
+    for fill in ("85", "170"):
+        (tmp_path / fill).mkdir()
+        subprocess.run(
+            [sys.executable, "-c", WRITE, fill],
+            cwd=tmp_path,
+            env=os.environ | {"MALLOC_PERTURB_": fill},
+            check=True,
+        )
+    for name in ("one.mp4", "dataset.mp4"):
+        assert (tmp_path / "85" / name).read_bytes() == (tmp_path / "170" / name).read_bytes()
 
 
 def test_a_failure_leaves_the_earlier_video(tmp_path):
