@@ -1,9 +1,9 @@
 """Reinforcement and offline learning, by Stable-Baselines3 and d3rlpy (extra `rl`).
 
 It stands above evaluation: what is trained is evaluated by `evaluation.rollout`, and what comes out
-is a checkpoint like any other, of the policy `actor`, `bcq`, `hlp` or `residual`. No verb but
-`train --algo` and `export-demos` imports it, and no module of it imports a library before it is
-used.
+is a checkpoint like any other, of the policy `actor`, `bcq`, `hlp` or `residual`. `algorithms`,
+`settings`, `extra`, `transitions`, `export` and the `*_config` modules import no library of the
+extra; `train` imports the others once it knows the algorithm.
 
 Interface:
 
@@ -28,3 +28,11 @@ Layout of the folder while it trains; the first and the last three stay:
     policy.safetensors     weights and the statistics of the inputs
     checkpoint.json        everything about them, with their hash; written last
 """
+
+import contextlib
+
+with contextlib.suppress(ImportError):
+    # gym, which d3rlpy brings and Stable-Baselines3 imports, prints a notice about itself.
+    from gym_notices import notices
+
+    notices.notices.clear()

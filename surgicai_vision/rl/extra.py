@@ -1,18 +1,11 @@
 """The extra `rl`: refused in one line where it is not installed."""
 
-import contextlib
-import importlib
 import importlib.util
-import io
 
 from surgicai_vision.core.errors import InputError
 
 PACKAGES = ("stable_baselines3", "sb3_contrib", "d3rlpy", "minari")
 """What the extra brings."""
-
-
-GYM = "gym"
-"""What d3rlpy brings and Stable-Baselines3 imports where it is: gym, gymnasium's predecessor."""
 
 
 def check_extra(asked: str, *packages: str) -> None:
@@ -28,6 +21,3 @@ def check_extra(asked: str, *packages: str) -> None:
             f"{asked} needs the extra 'rl' ({', '.join(missing)} is not installed): "
             "pip install 'surgicai-vision[rl]'."
         )
-    if packages and importlib.util.find_spec(GYM) is not None:
-        with contextlib.redirect_stderr(io.StringIO()):  # it prints that nobody maintains it
-            importlib.import_module(GYM)

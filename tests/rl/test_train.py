@@ -1,6 +1,8 @@
 """Training: every algorithm leaves a checkpoint that every verb takes; a kill costs no result."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -271,10 +273,15 @@ def test_a_missing_extra_is_one_clear_line(tmp_path, capsys, monkeypatch):
     assert "--algo sac needs the extra 'rl'" in error and len(error.strip().splitlines()) == 1
 
 
-def test_importing_the_verb_imports_no_library_of_the_extra(tmp_path):
-    import subprocess
-    import sys
+def test_gym_is_imported_without_its_notice(tmp_path):
+    code = "import surgicai_vision.rl.high_level, sys; assert 'gym' in sys.modules"
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, cwd=tmp_path, capture_output=True
+    )
+    assert b"gym" not in done.stderr.lower()
 
+
+def test_importing_the_verb_imports_no_library_of_the_extra(tmp_path):
     code = (
         "import sys, surgicai_vision.commands.train, surgicai_vision.rl.settings\n"
         "assert not {'stable_baselines3', 'd3rlpy', 'torch'} & set(sys.modules)"
