@@ -10,8 +10,11 @@ over the demonstrations of the batch, λ1 + λ2 = 1 (SurgicAI). Here the sum is 
 with `normalise_q` J is divided by the mean size of Q (Fujimoto and Gu 2021), so that λ2 weighs the
 same whatever the scale of the reward. With `clip_q` the targets stay within [-1 / (1 - γ), 0], the
 returns that the reward allows (Andrychowicz et al. 2017 clip theirs).
+
+`AnchoredTD3` is what it shares with other actors that are held to what was there before them.
 """
 
+from abc import abstractmethod
 from typing import Any, final
 
 import numpy as np
@@ -46,33 +49,36 @@ def cloning_loss(
     return (passes * squares).mean(), passes.mean()
 
 
-@final
-class DemonstrationTD3(TD3):
-    """TD3 whose actor also clones the demonstrations of its batches; see the module's docstring.
+class AnchoredTD3(TD3):
+    """TD3 whose actor climbs λ1 ∇J - λ2 ∇L, with a loss L that holds it to something known.
 
     Args:
         *arguments: TD3's.
-        bc_weight: λ2.
-        q_filter: clone only where the critic values the demonstrated action above the actor's.
+        bc_weight: λ2; λ1 = 1 - λ2.
         normalise_q: divide J by the mean size of Q.
         clip_q: clip the targets to the returns that a reward in [-1, 0] allows.
-        **options: TD3's; the replay buffer must mix demonstrations (`buffers`).
+        actor_starts: updates of the critics before the actor's first.
+        **options: TD3's.
     """
 
     def __init__(
         self,
         *arguments: Any,
         bc_weight: float = 0.5,
-        q_filter: bool = True,
         normalise_q: bool = True,
         clip_q: bool = True,
+        actor_starts: int = 0,
         **options: Any,
     ):
         self.bc_weight = bc_weight
-        self.q_filter = q_filter
         self.normalise_q = normalise_q
         self.clip_q = clip_q
+        self.actor_starts = actor_starts
         super().__init__(*arguments, **options)
+
+    @abstractmethod
+    def losses(self, batch: Any) -> dict[str, torch.Tensor]:
+        """Return "actor_loss", of a batch of the replay buffer, and the parts that are logged."""
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Take updates as TD3 does, with the actor's loss above."""
@@ -80,8 +86,7 @@ class DemonstrationTD3(TD3):
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         logged: dict[str, list[float]] = {"critic_loss": []}
         buffer = self.replay_buffer
-        assert buffer is not None and isinstance(buffer, Demonstrations)
-        demonstrated = buffer.rows(batch_size)
+        assert buffer is not None
         for _ in range(gradient_steps):
             self._n_updates += 1
             batch = buffer.sample(batch_size)
@@ -94,17 +99,61 @@ class DemonstrationTD3(TD3):
             self.critic.optimizer.step()
             if self._n_updates % self.policy_delay:
                 continue
-            parts = self.actor_losses(batch.observations, batch.actions, demonstrated)
-            self.actor.optimizer.zero_grad()
-            parts["actor_loss"].backward()
-            self.actor.optimizer.step()
-            for name, part in parts.items():
-                logged.setdefault(name, []).append(part.item())
+            if self._n_updates > self.actor_starts:
+                parts = self.losses(batch)
+                self.actor.optimizer.zero_grad()
+                parts["actor_loss"].backward()
+                self.actor.optimizer.step()
+                for name, part in parts.items():
+                    logged.setdefault(name, []).append(part.item())
             polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
             polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, parts_of in logged.items():
             self.logger.record(f"train/{name}", float(np.mean(parts_of)))
+
+    def anchored(self, values: torch.Tensor, anchor: torch.Tensor) -> torch.Tensor:
+        """Return the actor's loss.
+
+        Args:
+            values: Q of the actor's actions, (B, 1).
+            anchor: L, a scalar.
+        """
+        scale = 1.0 / values.abs().mean().detach() if self.normalise_q else 1.0
+        return -(1.0 - self.bc_weight) * scale * values.mean() + self.bc_weight * anchor
+
+    @torch.no_grad()
+    def _targets(self, batch: Any) -> torch.Tensor:
+        """Return the critics' targets (B, 1): TD3's, clipped to what returns can be."""
+        noise = torch.empty_like(batch.actions).normal_(0, self.target_policy_noise)
+        noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+        actions = (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
+        values = torch.cat(self.critic_target(batch.next_observations, actions), dim=1)
+        smallest = values.min(dim=1, keepdim=True).values
+        targets: torch.Tensor = batch.rewards + (1 - batch.dones) * self.gamma * smallest
+        return targets.clamp(-1.0 / (1.0 - self.gamma), 0.0) if self.clip_q else targets
+
+
+@final
+class DemonstrationTD3(AnchoredTD3):
+    """TD3 whose actor also clones the demonstrations of its batches; see the module's docstring.
+
+    Args:
+        *arguments: TD3's.
+        q_filter: clone only where the critic values the demonstrated action above the actor's.
+        **options: `AnchoredTD3`'s; the replay buffer must mix demonstrations (`buffers`).
+    """
+
+    def __init__(self, *arguments: Any, q_filter: bool = True, **options: Any):
+        self.q_filter = q_filter
+        super().__init__(*arguments, **options)
+
+    def losses(self, batch: Any) -> dict[str, torch.Tensor]:
+        """Return the parts of the actor's loss; the batch's last rows are demonstrations."""
+        buffer = self.replay_buffer
+        assert buffer is not None and isinstance(buffer, Demonstrations)
+        rows = buffer.rows(len(batch.actions))
+        return self.actor_losses(batch.observations, batch.actions, rows)
 
     def actor_losses(
         self, observations: Any, actions: torch.Tensor, demonstrated: int
@@ -129,17 +178,5 @@ class DemonstrationTD3(TD3):
             known,
             self.q_filter,
         )
-        scale = 1.0 / values.abs().mean().detach() if self.normalise_q else 1.0
-        loss = -(1.0 - self.bc_weight) * scale * values.mean() + self.bc_weight * cloning
+        loss = self.anchored(values, cloning)
         return {"actor_loss": loss, "cloning_loss": cloning, "q_filter": passed}
-
-    @torch.no_grad()
-    def _targets(self, batch: Any) -> torch.Tensor:
-        """Return the critics' targets (B, 1): TD3's, clipped to what returns can be."""
-        noise = torch.empty_like(batch.actions).normal_(0, self.target_policy_noise)
-        noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
-        actions = (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
-        values = torch.cat(self.critic_target(batch.next_observations, actions), dim=1)
-        smallest = values.min(dim=1, keepdim=True).values
-        targets: torch.Tensor = batch.rewards + (1 - batch.dones) * self.gamma * smallest
-        return targets.clamp(-1.0 / (1.0 - self.gamma), 0.0) if self.clip_q else targets

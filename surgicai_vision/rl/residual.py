@@ -2,8 +2,10 @@
 
 `CorrectionEnv` is the policy's own task: an action corrects what the frozen policy does, within the
 bound, and what is observed is what that policy sees and would do (`policies.residual`). TD3 with
-LayerNorm in its critics learns the correction; before its first update the frozen policy acts alone
-but for the noise.
+LayerNorm in its critics learns the correction μ; before its first update the frozen policy acts
+alone but for the noise. Its actor is held to the frozen policy: it climbs
+
+    λ1 ∇J - λ2 ∇ mean ‖μ‖²
 
     train_residual(ResidualRequest("outputs/train/grasp-…"), out)
 
@@ -22,7 +24,6 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from torch import nn
@@ -40,7 +41,8 @@ from surgicai_vision.evaluation.rollout import run_share
 from surgicai_vision.evaluation.slot import env_of
 from surgicai_vision.rl.extractor import StandardExtractor
 from surgicai_vision.rl.learner import Arrays, State, linear, random_state, set_random_state
-from surgicai_vision.rl.residual_config import ALGO, ResidualRequest
+from surgicai_vision.rl.nair import AnchoredTD3
+from surgicai_vision.rl.residual_config import ALGO, CORRECTION, ResidualRequest
 from surgicai_vision.rl.rlpd import LayerNormTD3Policy
 from surgicai_vision.rl.settings import read_by
 from surgicai_vision.rl.stages import Stages
@@ -121,11 +123,19 @@ class CorrectionEnv(gymnasium.Env[Vector, Vector]):
 
 
 @final
-class WarmTD3(TD3):
-    """TD3 whose first steps are those of its policy with noise, not random actions.
+class CorrectionTD3(AnchoredTD3):
+    """TD3 whose actor is held to no correction; see the module's docstring.
 
-    The policy of a correction begins at none: those steps are the frozen policy's.
+    Its first steps are those of its policy with noise, not random actions: the policy of a
+    correction begins at none, so they are the frozen policy's.
     """
+
+    def losses(self, batch: Any) -> dict[str, torch.Tensor]:
+        """Return the actor's loss and the mean square of the correction, in shares of the bound."""
+        chosen = self.actor(batch.observations)
+        values = self.critic.q1_forward(batch.observations, chosen)
+        squares = chosen.square().sum(dim=1).mean()
+        return {"actor_loss": self.anchored(values, squares), "correction": squares}
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -213,7 +223,7 @@ class _Training:
             "bound": request.bound,
             "correction": list(settings.hidden),
             "algo": ALGO,
-            "settings": read_by(ALGO, settings),
+            "settings": read_by(CORRECTION, settings),
         }
         self.recipe = from_mapping(ResidualRecipe, values, "residual policy")
         torch.manual_seed(request.seed)
@@ -236,11 +246,11 @@ class _Training:
                 ended = terminated or truncated
         return np.stack(rows)
 
-    def _model(self) -> WarmTD3:
+    def _model(self) -> CorrectionTD3:
         """Return the model, whose actor is the untrained correction."""
         settings = self.request.settings
         hidden = list(settings.hidden)
-        model = WarmTD3(
+        model = CorrectionTD3(
             LayerNormTD3Policy,
             self.env,
             learning_rate=settings.learning_rate,
@@ -254,6 +264,10 @@ class _Training:
             policy_delay=settings.policy_delay,
             target_policy_noise=settings.target_noise,
             target_noise_clip=settings.target_noise_clip,
+            actor_starts=settings.actor_starts,
+            bc_weight=settings.bc_weight,
+            normalise_q=settings.normalise_q,
+            clip_q=settings.clip_q,
             action_noise=NormalActionNoise(
                 np.zeros(ACTIONS), settings.exploration_noise * np.ones(ACTIONS)
             ),

@@ -1,31 +1,59 @@
 """What a residual policy is trained by, as data; light to import. See `rl.residual`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import final
 
 from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError, check_at_least
-from surgicai_vision.rl.algorithms import SUCCESS
-from surgicai_vision.rl.settings import Settings, settings_of
+from surgicai_vision.rl.algorithms import SB3, Algorithm
+from surgicai_vision.rl.settings import Settings, changed_settings
 
 ALGO = "td3"
 """The algorithm of the correction."""
-DEFAULTS: Mapping[str, JSON] = {
-    "hidden": [256, 256],
-    "learning_rate": 3e-4,
-    "train_every": 1,
-    "learning_starts": 3000,
-    "exploration_noise": 0.3,
-}
-"""Settings of TD3 that differ from `Settings`; the noise is a share of the bound."""
+CORRECTION = Algorithm(
+    SB3,
+    "TD3",
+    "Silver et al., Residual policy learning, arXiv:1812.06298",
+    (
+        "hidden",
+        "learning_rate",
+        "gamma",
+        "batch_size",
+        "tau",
+        "train_every",
+        "updates",
+        "learning_starts",
+        "critics",
+        "exploration_noise",
+        "actor_starts",
+        "policy_delay",
+        "target_noise",
+        "target_noise_clip",
+        "bc_weight",
+        "normalise_q",
+        "clip_q",
+    ),
+    {
+        "hidden": [256, 256],
+        "learning_rate": 3e-4,
+        "train_every": 1,
+        "learning_starts": 3000,
+        "exploration_noise": 0.3,
+        "actor_starts": 3000,
+        "bc_weight": 0.1,
+    },
+)
+"""TD3 as a correction is learned by. The noise is a share of the bound. Critics that have seen
+little send the actor anywhere within it, so they learn alone at first, and the actor is held to the
+frozen policy by `bc_weight` (docs/results/rl.md)."""
 BOUND = 0.3
 """Largest correction of each element of an action, by default."""
 
 
 def residual_settings(changes: Mapping[str, JSON]) -> Settings:
     """Return the settings of a correction with changes; see `rl.settings.settings_of`."""
-    return settings_of(ALGO, {**DEFAULTS, **changes})
+    return changed_settings(CORRECTION, "a correction", changes)
 
 
 @final
@@ -59,6 +87,7 @@ class ResidualRequest:
             raise InputError(f"bound is {self.bound}; it must be above 0 and at most 1.")
         check_at_least(1, env_steps=self.env_steps, save_every=self.save_every)
         check_at_least(0, validation=self.validation, seed=self.seed)
-        for name in ("envs", "stop_at", *SUCCESS):
-            if getattr(self.settings, name) != getattr(Settings, name):
+        for name in (setting.name for setting in fields(Settings)):
+            is_read = name in CORRECTION.settings
+            if not is_read and getattr(self.settings, name) != getattr(Settings, name):
                 raise InputError(f"A residual policy reads no {name}; leave it out.")

@@ -37,6 +37,7 @@ class Settings:
             demonstrations one episode.
         critics: number of critics, of which the smallest counts.
         exploration_noise: standard deviation of the noise on actions (code .05).
+        actor_starts: updates of the critics before the actor's first; a correction's.
         policy_delay: updates of the critics for one of the actor (code 2).
         target_noise: standard deviation of the noise on the target's action (code .2).
         target_noise_clip: where it is clipped (code .5).
@@ -46,7 +47,7 @@ class Settings:
             asks for holes or for the needle being out, which "go there" would else replace.
         demo_share: share of a batch that is drawn from the demonstrations (code .3).
         bc_weight: λ2, weight of the cloning loss; λ1 = 1 - λ2 is that of the critic's (paper .2,
-            .5, .8; .5 by default).
+            .5, .8; .5 by default). Of a correction's actor the frozen policy is what is cloned.
         q_filter: clone only where the critic values the demonstrated action above the actor's.
         normalise_q: divide the critic's value in the actor's loss by its mean size, so that λ2
             weighs the same at every scale of reward (Fujimoto and Gu, A minimalist approach to
@@ -76,6 +77,7 @@ class Settings:
     learning_starts: int = 0
     critics: int = 2
     exploration_noise: float = 0.1
+    actor_starts: int = 0
     policy_delay: int = 2
     target_noise: float = 0.2
     target_noise_clip: float = 0.5
@@ -220,13 +222,18 @@ def settings_of(algo: str, changes: Mapping[str, JSON]) -> Settings:
         InputError: a value that is not allowed.
     """
     algorithm = ALGORITHMS[check_name("algo", algo, ALGORITHMS)]
+    return changed_settings(algorithm, algo, changes)
+
+
+def changed_settings(algorithm: Algorithm, name: str, changes: Mapping[str, JSON]) -> Settings:
+    """Return the settings of an algorithm of that name with changes; see `settings_of`."""
     for key in changes:
         if key not in algorithm.settings:
-            raise UnknownName(f"setting of '{algo}'", key, algorithm.settings)
-    return from_mapping(Settings, {**algorithm.defaults, **changes}, f"settings of '{algo}'")
+            raise UnknownName(f"setting of '{name}'", key, algorithm.settings)
+    return from_mapping(Settings, {**algorithm.defaults, **changes}, f"settings of '{name}'")
 
 
-def read_by(algo: str, settings: Settings) -> dict[str, JSON]:
+def read_by(algorithm: Algorithm, settings: Settings) -> dict[str, JSON]:
     """Return the settings that an algorithm reads, as data."""
     values = asdict(settings)
-    return {key: values[key] for key in ALGORITHMS[algo].settings}
+    return {key: values[key] for key in algorithm.settings}

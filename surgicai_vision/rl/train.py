@@ -357,7 +357,7 @@ def actor_recipe(request: Request, squash: str) -> ActorRecipe:
         observation=request.observation,
         squash=squash,
         algo=request.algo,
-        settings=read_by(request.algo, request.settings),
+        settings=read_by(request.algorithm, request.settings),
     )
 
 

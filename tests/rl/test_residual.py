@@ -1,6 +1,7 @@
 """A residual policy: the frozen policy where nothing is learned, and what is learned beside it."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.rollout import run_share
 from surgicai_vision.rl import residual
+from surgicai_vision.rl.learner import linear
 from surgicai_vision.rl.residual import CorrectionEnv, train_residual
 from surgicai_vision.rl.residual_config import ResidualRequest, residual_settings
 from surgicai_vision.training.policies import load_policy
@@ -21,7 +23,8 @@ STILL = np.zeros(7, np.float32)
 
 
 def request_of(base, **changes):
-    settings = residual_settings({"hidden": [8], "batch_size": 8, "learning_starts": 4})
+    small = {"hidden": [8], "batch_size": 8, "learning_starts": 4, "actor_starts": 2}
+    settings = residual_settings({**small, **changes.pop("settings", {})})
     return ResidualRequest(
         base, 0.2, settings, env_steps=24, validation=0, save_every=12, **changes
     )
@@ -103,6 +106,26 @@ def test_what_is_trained_is_a_checkpoint_that_is_evaluated_as_any(base, tmp_path
     assert not episode.row.error
     with pytest.raises(OutputExists):
         train_residual(request_of(base, seed=1), tmp_path / "residual")
+
+
+def test_the_actor_waits_for_its_critics(base, tmp_path):
+    train_residual(request_of(base, settings={"actor_starts": 24}), tmp_path / "waits")
+    assert not load_policy(tmp_path / "waits").correction[-1].weight.any()
+
+
+def test_the_actor_is_held_to_the_frozen_policy_as_its_loss_says(base):
+    training = residual._Training(request_of(base, settings={"bc_weight": 0.25}), open_policy(base))
+    model = training.model
+    torch.nn.init.normal_(linear(model.actor.mu)[-1].weight)
+    seen = torch.randn(16, training.policy.sight)
+    moved = model.actor(seen)
+    values = model.critic.q1_forward(seen, moved)
+    parts = model.losses(SimpleNamespace(observations=seen))
+    held = (moved**2).sum() / 16
+    assert parts["correction"].item() == pytest.approx(held.item(), rel=1e-5) and held > 0.01
+    wanted = -0.75 * values.mean() / values.abs().mean() + 0.25 * held
+    assert parts["actor_loss"].item() == pytest.approx(wanted.item(), rel=1e-5)
+    training.close()
 
 
 def test_a_kill_changes_no_result_and_the_best_is_kept(base, tmp_path, monkeypatch):
