@@ -173,6 +173,10 @@ class CurvePoint:
     episodes: int
 
 
+Axis = Callable[[CurvePoint], float]
+"""Where an evaluation stands on a chart's x axis."""
+
+
 def read_curve(result: Result) -> list[CurvePoint]:
     """Return the evaluations on the way to a result's policy; empty where none was kept."""
     places = [result.folder.parent / POLICY]
@@ -190,17 +194,17 @@ def read_curve(result: Result) -> list[CurvePoint]:
     return []
 
 
-def steps_to(mark: float, curve: Sequence[CurvePoint]) -> int | None:
-    """Return the control steps at the first evaluation with a success of `mark`, or None."""
+def first_at(mark: float, curve: Sequence[CurvePoint]) -> CurvePoint | None:
+    """Return the first evaluation with a success of `mark`, or None."""
     for point in curve:
         if point.successes >= mark * point.episodes:
-            return point.env_steps
+            return point
     return None
 
 
 def _curves(rows: Sequence[Row], tasks: Sequence[str]) -> list[Chart]:
     """Return a chart against control steps and one against minutes for each task."""
-    axes: tuple[tuple[str, Callable[[CurvePoint], float]], ...] = (
+    axes: tuple[tuple[str, Axis], ...] = (
         ("control steps, thousands", lambda point: point.env_steps / 1000),
         ("CPU minutes of learning", lambda point: round(point.minutes, 2)),
     )
@@ -219,13 +223,11 @@ def _curves(rows: Sequence[Row], tasks: Sequence[str]) -> list[Chart]:
             ]
             lines = [line for line in lines if len({point.x for point in line.points}) > 1]
             if lines:
-                found.append(_chart(f"{task}: {x_name}", lines, x_name, by_label))
+                found.append(_chart(f"{task}: {x_name}", lines, x_name, x, by_label))
     return found
 
 
-def _points(
-    curves: Sequence[Sequence[CurvePoint]], x: Callable[[CurvePoint], float]
-) -> tuple[Point, ...]:
+def _points(curves: Sequence[Sequence[CurvePoint]], x: Axis) -> tuple[Point, ...]:
     """Return the evaluations of all seeds, the n-th of each counted together."""
     found = []
     for index in range(max(map(len, curves))):
@@ -243,21 +245,22 @@ def _chart(
     title: str,
     lines: Sequence[Series],
     x_name: str,
+    x: Axis,
     by_label: Mapping[str, Sequence[Sequence[CurvePoint]]],
 ) -> Chart:
-    """Draw learning curves; beside them the control steps to `MARK` of each seed."""
+    """Draw learning curves; beside them where each seed first reaches `MARK`."""
     drawn = lines[:MOST]
     rows = []
     for line in lines:
-        steps = [steps_to(MARK, curve) for curve in by_label[line.name]]
-        reached = ", ".join("never" if step is None else f"{step:,}" for step in steps)
+        firsts = [first_at(MARK, curve) for curve in by_label[line.name]]
+        reached = ", ".join("never" if first is None else f"{x(first):g}" for first in firsts)
         rows.append((line.name, line.points[-1].text, reached))
     more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
     return Chart(
         title,
         charts.curves(drawn, x_name, label=f"{title}: success [%] on validation starts"),
         charts.key([line.name for line in drawn]),
-        ("algorithm", "last evaluation", f"control steps to {text.percent(MARK)}"),
+        ("algorithm", "last evaluation", f"first at {text.percent(MARK)}"),
         tuple(rows),
         more,
     )

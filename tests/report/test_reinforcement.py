@@ -21,7 +21,7 @@ from surgicai_vision.report.aggregates import (
 )
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.reader import collect
-from surgicai_vision.report.reinforcement import learned, read_curve, steps_to, table
+from surgicai_vision.report.reinforcement import first_at, learned, read_curve, table
 from surgicai_vision.training.run_config import RunConfig
 
 RATES = {"td3": 0.1, "td3-her-bc": 0.9, "bc": 0.6}
@@ -128,8 +128,8 @@ def test_learning_curves_are_read_beside_the_policy(folder):
     (result, *_) = next(i for i in groups if i.condition.trained_by == "td3-her-bc").results
     curve = read_curve(result)
     assert [(point.env_steps, point.successes) for point in curve] == [(1000, 10), (2000, 20)]
-    assert steps_to(0.95, curve) == 2000 and steps_to(0.4, curve) == 1000
-    assert steps_to(0.95, curve[:1]) is None
+    assert first_at(0.95, curve) == curve[1] and first_at(0.4, curve) == curve[0]
+    assert first_at(0.95, curve[:1]) is None
     found = learned(groups)
     assert [chart.title for chart in found.curves] == [
         f"{task}: {axis}"
@@ -137,7 +137,9 @@ def test_learning_curves_are_read_beside_the_policy(folder):
         for axis in ("control steps, thousands", "CPU minutes of learning")
     ]
     rows = {row[0]: row for row in found.curves[0].rows}
-    assert rows["td3-her-bc, 100 demonstrations"][2] == "2,000, 2,000, 2,000"
+    assert rows["td3-her-bc, 100 demonstrations"][2] == "2, 2, 2", "in thousands"
+    minutes = {row[0]: row[2] for row in found.curves[1].rows}
+    assert minutes["td3-her-bc, 100 demonstrations"] == "1, 1.01, 1.02"
     assert rows["td3"][2] == "never, never, never"
 
 
