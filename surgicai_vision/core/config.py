@@ -19,6 +19,7 @@ import yaml
 from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError, UnknownName, check_name, check_positive
 from surgicai_vision.core.tasks import SUBTASK_STEPS, check_task, task_steps
+from surgicai_vision.core.yaml_text import load_yaml
 
 if TYPE_CHECKING:
     import numpy as np
@@ -423,7 +424,7 @@ def read_changes(texts: Iterable[str]) -> dict[str, JSON]:
                 "such as clock=false."
             )
         try:
-            changes[key] = yaml.safe_load(value)
+            changes[key] = cast(JSON, load_yaml(value))
         except (yaml.YAMLError, ValueError, RecursionError):  # a date that does not exist, …
             raise InputError(f"change '{text}': {value!r} is no YAML value.") from None
     return changes

@@ -20,6 +20,7 @@ from filelock import FileLock
 
 from surgicai_vision import __version__
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists
+from surgicai_vision.core.yaml_text import load_yaml
 
 CACHE_VARIABLE = "SURGICAI_VISION_CACHE"
 CACHE_HERE = Path("outputs") / "cache"
@@ -67,7 +68,7 @@ def read_yaml(path: Path, *, may_be_empty: bool = False) -> dict[str, object]:
         BadFile: the file is missing or damaged, or holds something else.
     """
     try:
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
+        table = load_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -28,6 +28,9 @@ CLONING = ("demo_share", "bc_weight", "q_filter", "normalise_q", "clip_q")
 OFFLINE = (*COMMON, "tau", "critics", "samples")
 CLONED: Mapping[str, JSON] = {"tau": 0.01, "learning_rate": 3e-4}
 """Defaults with a cloning loss: at 1e-3 what was learned is lost again (docs/results/rl.md)."""
+PAPERS_RATE = 3e-4
+"""Learning rate of AWAC, IQL and Cal-QL in their papers and in d3rlpy, whose Cal-QL has 1e-4 for
+the actor."""
 
 
 @final
@@ -66,9 +69,11 @@ class Algorithm:
         return "bc_weight" in self.settings
 
 
-def _offline(kind: str, paper: str, policy: str = "actor") -> Algorithm:
-    """Return an algorithm of d3rlpy."""
-    return Algorithm(D3RLPY, kind, paper, OFFLINE, needs_demos=True, is_online=False, policy=policy)
+def _offline(kind: str, paper: str, policy: str = "actor", **defaults: JSON) -> Algorithm:
+    """Return an algorithm of d3rlpy, with settings that differ from those of `Settings`."""
+    return Algorithm(
+        D3RLPY, kind, paper, OFFLINE, defaults, needs_demos=True, is_online=False, policy=policy
+    )
 
 
 HER = "Andrychowicz et al., Hindsight experience replay, NeurIPS 2017, arXiv:1707.01495"
@@ -147,6 +152,7 @@ ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType(
             "AWAC",
             "Nair et al., AWAC: accelerating online reinforcement learning with offline datasets, "
             "arXiv:2006.09359",
+            learning_rate=PAPERS_RATE,
         ),
         "bcq": _offline(
             "BCQ",
@@ -158,11 +164,13 @@ ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType(
             "IQL",
             "Kostrikov et al., Offline reinforcement learning with implicit Q-learning, ICLR 2022, "
             "arXiv:2110.06169",
+            learning_rate=PAPERS_RATE,
         ),
         "cal-ql": _offline(
             "CalQL",
             "Nakamoto et al., Cal-QL: calibrated offline RL pre-training for efficient online "
             "fine-tuning, NeurIPS 2023, arXiv:2303.05479",
+            learning_rate=PAPERS_RATE,
         ),
     }
 )

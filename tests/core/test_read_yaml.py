@@ -60,3 +60,22 @@ def test_a_change_that_no_value_stands_for_is_refused():
     for value in ("[", "2026-02-31", "[" * 5000):
         with pytest.raises(InputError, match="no YAML value"):
             read_changes((f"a={value}",))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("3e-4", 3e-4),
+        ("-1E5", -1e5),
+        ("2.5e3", 2500.0),
+        (".5e1", 5.0),
+        ("3e", "3e"),
+        ("e4", "e4"),
+        ("'3e-4'", "3e-4"),
+        ("12", 12),
+    ],
+)
+def test_numbers_with_an_exponent_need_no_dot(tmp_path, text, value):
+    (tmp_path / "given.yaml").write_text(f"a: {text}\n")
+    for found in (read_yaml(tmp_path / "given.yaml")["a"], read_changes((f"a={text}",))["a"]):
+        assert found == value and type(found) is type(value)
