@@ -17,6 +17,7 @@ from surgicai_vision.rl import residual
 from surgicai_vision.rl.learner import linear
 from surgicai_vision.rl.residual import CorrectionEnv, train_residual
 from surgicai_vision.rl.residual_config import ResidualRequest, residual_settings
+from surgicai_vision.rl.settings import Settings
 from surgicai_vision.training.policies import load_policy
 
 STILL = np.zeros(7, np.float32)
@@ -164,5 +165,7 @@ def test_only_a_cloned_policy_of_one_subtask_is_corrected(base, tmp_path):
         ResidualRequest(base, settings=residual_settings({"success_steps": 3}))
     with pytest.raises(InputError, match="stop_at"):
         ResidualRequest(base, settings=residual_settings({"stop_at": 0.9}))
+    with pytest.raises(InputError, match="reads no stop_at"):
+        ResidualRequest(base, settings=Settings(stop_at=0.9))
     with pytest.raises(InputError, match="bound"):
         ResidualRequest(base, bound=0.0)
