@@ -255,4 +255,17 @@ def summary_line(result: dict[str, Any]) -> str:
         late = result["end_delay_s"]["mean"]
         line += f"; {result['false_ends']['mean']:.2f} false ends a procedure"
         line += "" if late is None else f", the others {late:.2f} s after the measured success"
-    return line
+    return line + _bite(result)
+
+
+def _bite(result: dict[str, Any]) -> str:
+    """Return medians of the stitch that was made, for the end of a line; "" without one."""
+    entry, leaving, force = (
+        result[column]["median"] for column in ("entry_mm", "exit_mm", "tissue_force_n")
+    )
+    if entry is None or leaving is None:
+        return ""
+    return (
+        f"; medians: entry {entry:.2f} mm and exit {leaving:.2f} mm from the marks, "
+        f"largest force on the tissue {force:.1f} N"
+    )

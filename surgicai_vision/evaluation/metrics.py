@@ -41,7 +41,7 @@ MEASURED = (
     "false_ends",
     "end_delay_s",
 )
-"""Columns a summary averages over all episodes where they were measured."""
+"""Columns a summary gives mean, deviation and median of, over all episodes that have them."""
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,8 @@ def failure_kind(error: str, diverged: bool, touched: bool, wrong_hole: bool, he
 def summary(rows: Sequence[EpisodeMetrics]) -> dict[str, Any]:
     """Return the counts of one policy on one task.
 
-    Trajectory length and steps are those of successful episodes; what was measured is averaged over
-    all episodes that have it ("n" of them).
+    Trajectory length and steps are those of successful episodes; what was measured is summed up,
+    as mean, deviation and median, over all episodes that have it ("n" of them).
     """
     first, successes = rows[0], [row for row in rows if row.success]
     failures = [row.failure for row in rows if not row.success]
@@ -227,7 +227,8 @@ def _finite(rows: Sequence[EpisodeMetrics], column: str) -> list[float]:
 
 
 def _spread(values: list[float]) -> dict[str, float | None]:
-    return {**mean_and_std(values), "n": len(values)}
+    median = statistics.median(values) if values else None
+    return {**mean_and_std(values), "median": median, "n": len(values)}
 
 
 def as_table(rows: Sequence[EpisodeMetrics]) -> list[dict[str, Any]]:

@@ -4,12 +4,15 @@ Errors are failures; the summary has its keys.
 """
 
 import json
+import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from surgicai_vision import envs
+from surgicai_vision.commands.evaluate import summary_line
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError, PhysicsError
@@ -29,6 +32,7 @@ from surgicai_vision.evaluation.statistics import clopper_pearson
 from surgicai_vision.training.run_config import RunConfig
 
 SHORT = TaskConfig("grasp", max_steps=12)
+NEVER_MEASURED = {"mean": None, "std": None, "median": None, "n": 0}
 
 
 class FakeEnv:
@@ -224,11 +228,12 @@ def test_rows_and_summary_hold_what_was_measured(fake_envs, tmp_path):
     # Nothing of the episode before is left in one that could not start.
     assert np.isnan([rows[97].entry_mm, rows[3].exit_mm]).all() and rows[97].slip_mm == 0.0
     result = storage.write_evaluation(tmp_path, episodes, RunConfig(policy="zero"), {})
-    assert result["entry_mm"] == {"mean": pytest.approx(0.5), "std": pytest.approx(0.0), "n": 2}
-    assert result["exit_mm"] == {"mean": None, "std": None, "n": 0}
+    half, zero = pytest.approx(0.5), pytest.approx(0.0)
+    assert result["entry_mm"] == {"mean": half, "std": zero, "median": half, "n": 2}
+    assert result["exit_mm"] == NEVER_MEASURED
     assert result["tissue_force_n"]["n"] == 3
     assert result["paper_successes"] == 1
-    assert result["tears"] == result["thread_mm"] == {"mean": None, "std": None, "n": 0}
+    assert result["tears"] == result["thread_mm"] == NEVER_MEASURED
     assert json.loads((tmp_path / storage.MARKER).read_text())["summary"] == result
     assert repr(storage.read_rows(tmp_path)) == repr(as_table(rows_of(episodes)))
 
@@ -256,6 +261,27 @@ def test_each_subtask_counts_with_all_before_it():
         ("pullout", 1),
     ]
     assert (subtasks[0]["low"], subtasks[0]["high"]) == clopper_pearson(3, 4)
+
+
+def test_what_was_measured_has_a_median_over_the_episodes_that_have_it():
+    rows = [replace(row_with_stages(seed, 5), entry_mm=mm) for seed, mm in enumerate(ENTRIES)]
+    entry = summary(rows)["entry_mm"]
+    assert (entry["mean"], entry["median"], entry["n"]) == (pytest.approx(1.4), 0.7, 3)
+    assert summary(rows)["exit_mm"] == NEVER_MEASURED
+
+
+def test_the_line_about_an_evaluation_ends_with_the_medians_of_its_stitches():
+    rows = [
+        replace(row_with_stages(seed, 5), entry_mm=mm, exit_mm=0.25, tissue_force_n=1.9)
+        for seed, mm in enumerate(ENTRIES)
+    ]
+    assert summary_line(summary(rows)).endswith(
+        "medians: entry 0.70 mm and exit 0.25 mm from the marks, largest force on the tissue 1.9 N"
+    )
+    assert "medians" not in summary_line(summary([row_with_stages(0, 5)]))
+
+
+ENTRIES = (0.5, 0.7, 3.0, math.nan)
 
 
 def row_with_stages(seed, stages):
