@@ -46,6 +46,7 @@ class ChunkRecipe(Recipe):
         execute: how many of them are executed before the next plan.
         history: observations that are seen, the present one last, `frame_stride` control steps
             apart.
+        samples: chunks that a policy which samples draws for a plan; their mean is executed.
         ensemble: average overlapping chunks by the weights exp(-ensemble · i), i = 0 for the
             oldest; None executes the newest alone.
         ema: largest decay of the moving average of the weights; 0 keeps the last weights.
@@ -59,6 +60,7 @@ class ChunkRecipe(Recipe):
     chunk: int = 25
     execute: int = 10
     history: int = 1
+    samples: int = 1
     ensemble: float | None = None
     ema: float = 0.0
     clip_gradient: float = 0.0
@@ -69,7 +71,7 @@ class ChunkRecipe(Recipe):
         super().__post_init__()
         if not 1 <= self.execute <= self.chunk:
             raise InputError(f"execute is {self.execute}; allowed: 1 to chunk, {self.chunk}.")
-        check_at_least(1, history=self.history)
+        check_at_least(1, history=self.history, samples=self.samples)
         if not 0 <= self.ema < 1:
             raise InputError(f"ema is {self.ema}; allowed: 0 to below 1.")
         if not (self.clip_gradient >= 0 and self.minutes >= 0):
@@ -89,7 +91,7 @@ class ChunkPolicy(Policy, abc.ABC):
         normalisation: how actions are normalised, one of `NORMALISATIONS`.
 
     Attributes:
-        chunk, execute, ensemble: as in the recipe.
+        chunk, execute, samples, ensemble: as in the recipe.
         spacing: control steps from one observation of the history to the next.
         heads: what takes in the features.
     """
@@ -107,6 +109,7 @@ class ChunkPolicy(Policy, abc.ABC):
         self.clip = recipe.clip_gradient
         self.chunk = recipe.chunk
         self.execute = recipe.execute
+        self.samples = recipe.samples
         self.ensemble = recipe.ensemble
         self.spacing = recipe.frame_stride
         self.heads = FeatureHeads(recipe, self.inputs)
@@ -202,7 +205,11 @@ class ChunkPolicy(Policy, abc.ABC):
 
     def _chunks(self, observed: torch.Tensor) -> torch.Tensor:
         """Return chunks (B, chunk, 7) in [-1, 1] for normalised inputs (B, [history,] dim)."""
-        planned = self.plan_normalised(*self._seen(observed.to(self.input_mean.dtype)))
+        visual, vector = self._seen(observed.to(self.input_mean.dtype))
+        drawn = self.plan_normalised(
+            visual.repeat_interleave(self.samples, 0), vector.repeat_interleave(self.samples, 0)
+        )
+        planned: torch.Tensor = drawn.unflatten(0, (-1, self.samples)).mean(1)
         actions = planned[:, : self.chunk] * self.action_scale + self.action_centre
         return actions.clamp(-1.0, 1.0)
 

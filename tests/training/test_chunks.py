@@ -63,6 +63,24 @@ LINEAR = Plugin(
 )
 
 
+@final
+class Draws(ChunkPolicy):
+    """A chunk of which nothing is seen: every row is drawn."""
+
+    def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+        assert len(visual) == len(vector)
+        return torch.rand(len(vector), self.chunk, ACTIONS)
+
+    def chunk_loss(
+        self,
+        visual: torch.Tensor,
+        vector: torch.Tensor,
+        actions: torch.Tensor,
+        is_pad: torch.Tensor,
+    ) -> torch.Tensor:
+        raise NotImplementedError
+
+
 @pytest.fixture
 def registered(monkeypatch: pytest.MonkeyPatch):
     POLICIES.register("linear", LINEAR)
@@ -284,6 +302,18 @@ def test_images_are_looked_at_while_they_can_be_shown(
     ahead = range(0, 20 + spacing * history, execute)
     seen = {max(0, tick - back * spacing) for tick in ahead for back in range(history)}
     assert looked_at == sorted(step for step in seen if step < 20)
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_a_plan_is_the_mean_of_the_samples_of_its_own_history(samples: int) -> None:
+    policy = Draws(replace(QUICK, samples=samples), ((DIM,),), "min_max")
+    torch.manual_seed(7)
+    drawn = torch.rand(2 * samples, QUICK.chunk, ACTIONS).numpy()
+    features = np.zeros((2, QUICK.history, DIM), np.float32)
+    vectors = np.zeros((2, QUICK.history, policy.inputs.width), np.float32)
+    planned = policy.plan(features, vectors, seed=7)
+    means = drawn.reshape(2, samples, QUICK.chunk, ACTIONS).mean(1)
+    np.testing.assert_allclose(planned, means, rtol=1e-6)
 
 
 def test_an_ensemble_is_the_weighted_mean_of_the_plans() -> None:
