@@ -184,7 +184,7 @@ def measured_ends(visits: "Sequence[Visit]") -> list[dict[str, Any]]:
                 "subtask": subtask,
                 "ends": len(ends),
                 "false_ends": sum(visit.is_false_end for visit in ends),
-                "median_delay_s": statistics.median(delays) if delays else None,
+                "median_delay_s": _median(delays),
             }
         )
     return rows
@@ -227,8 +227,11 @@ def _finite(rows: Sequence[EpisodeMetrics], column: str) -> list[float]:
 
 
 def _spread(values: list[float]) -> dict[str, float | None]:
-    median = statistics.median(values) if values else None
-    return {**mean_and_std(values), "median": median, "n": len(values)}
+    return {**mean_and_std(values), "median": _median(values), "n": len(values)}
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return statistics.median(values) if values else None
 
 
 def as_table(rows: Sequence[EpisodeMetrics]) -> list[dict[str, Any]]:

@@ -33,7 +33,6 @@ from surgicai_vision.training.train import epochs_within, train
 QUICK = ChunkRecipe(epochs=8, batch_size=32, learning_rate=1e-2, chunk=4, execute=2, history=2)
 
 
-@final
 class Linear(ChunkPolicy):
     """A chunk that is linear in what is seen, with a draw of its own on top."""
 
@@ -64,21 +63,12 @@ LINEAR = Plugin(
 
 
 @final
-class Draws(ChunkPolicy):
+class Draws(Linear):
     """A chunk of which nothing is seen: every row is drawn."""
 
     def plan_normalised(self, visual: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
         assert len(visual) == len(vector)
         return torch.rand(len(vector), self.chunk, ACTIONS)
-
-    def chunk_loss(
-        self,
-        visual: torch.Tensor,
-        vector: torch.Tensor,
-        actions: torch.Tensor,
-        is_pad: torch.Tensor,
-    ) -> torch.Tensor:
-        raise NotImplementedError
 
 
 @pytest.fixture
@@ -306,7 +296,7 @@ def test_images_are_looked_at_while_they_can_be_shown(
 
 @pytest.mark.parametrize("samples", [1, 3])
 def test_a_plan_is_the_mean_of_the_samples_of_its_own_history(samples: int) -> None:
-    policy = Draws(replace(QUICK, samples=samples), ((DIM,),), "min_max")
+    policy = Draws(replace(QUICK, samples=samples), ((DIM,),))
     torch.manual_seed(7)
     drawn = torch.rand(2 * samples, QUICK.chunk, ACTIONS).numpy()
     features = np.zeros((2, QUICK.history, DIM), np.float32)
