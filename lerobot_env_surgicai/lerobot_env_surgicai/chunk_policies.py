@@ -100,6 +100,8 @@ class Act(LeRobotChunks):
         """Return `ACTPolicy`."""
         if recipe.history != 1:
             raise InputError(f"history is {recipe.history}; ACT sees the present moment alone: 1.")
+        if recipe.samples != 1:
+            raise InputError(f"samples is {recipe.samples}; ACT draws nothing, its plan is one: 1.")
         config = _config(
             ACTConfig,
             recipe,

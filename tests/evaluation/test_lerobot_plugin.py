@@ -723,6 +723,8 @@ def test_settings_of_a_chunk_policy_are_lerobots() -> None:
         policies.policy_plugin("act").make(chunk_recipe("act", settings={"chunk_size": 3}), ())
     with pytest.raises(InputError, match="history"):
         policies.policy_plugin("act").make(chunk_recipe("act", history=2), ())
+    with pytest.raises(InputError, match="samples"):
+        policies.policy_plugin("act").make(chunk_recipe("act", samples=2), ())
     with pytest.raises(InputError, match="VQ-BeT"):
         policies.policy_plugin("vqbet").make(chunk_recipe("vqbet", history=2), ())
 
