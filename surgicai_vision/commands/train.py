@@ -80,7 +80,8 @@ class Options:
         view: Views that the policy sees.
         pool: What is taken from the encoder.
         policy: The kind of policy.
-        change: Replace values of the recipe, such as clock=false,map_head=softmax.
+        change: Replace values of the recipe, such as clock=false,map_head=softmax, or one entry of
+            a table in it, such as settings.use_vae=false.
         epochs: Passes over the frames.
         minutes: In their place: as many as fit into so many minutes of one core, for policies that
             plan chunks.

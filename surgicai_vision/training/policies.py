@@ -82,12 +82,12 @@ def load_recipe(
     Args:
         policy: one of `policy_names()`.
         recipe: a name of `recipe_names()`, or the path of a YAML file.
-        changes: keys to replace.
+        changes: keys to replace; `settings.use_vae` is one entry of the table `settings`.
 
     Raises:
         UnknownName: a policy, recipe or key that does not exist.
         BadFile: a recipe file that cannot be read.
-        InputError: a value that is not allowed.
+        InputError: a value that is not allowed, or an entry of what is no table.
     """
     plugin = policy_plugin(policy)
     path = Path(recipe)
@@ -98,7 +98,22 @@ def load_recipe(
     given = changes or {}
     if "epochs" in given:  # whoever says the epochs wants them, and no budget
         values = {key: value for key, value in values.items() if key != BUDGET}
-    return from_mapping(plugin.recipe, {**values, **given}, f"recipe {recipe}")
+    return from_mapping(plugin.recipe, _changed(values, given), f"recipe {recipe}")
+
+
+def _changed(values: Mapping[str, object], changes: Mapping[str, JSON]) -> dict[str, object]:
+    """Return a recipe's values with changes, of whole keys and of single entries of a table."""
+    changed = dict(values)
+    for key, value in changes.items():
+        table, dot, entry = key.partition(".")
+        if not dot:
+            changed[key] = value
+            continue
+        entries = changed.get(table, {})
+        if not isinstance(entries, Mapping) or not entry:
+            raise InputError(f"change '{key}': {table} is no table that has such an entry.")
+        changed[table] = {**entries, entry: value}
+    return changed
 
 
 def recipe_of(run: RunConfig) -> "Recipe":

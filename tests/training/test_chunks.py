@@ -16,7 +16,7 @@ from policies.base import ACTIONS, Plugin
 from policies.chunks import ChunkPolicy, ChunkRecipe
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, UnknownName
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.lazy import LazyMapping
 from surgicai_vision.dataset import open_dataset, render_demos
@@ -27,7 +27,7 @@ from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.chunk_agent import ChunkAgent
 from surgicai_vision.training.averages import MovingAverage
 from surgicai_vision.training.chunks import earlier_rows, timeline_of, with_chunks
-from surgicai_vision.training.policies import POLICIES, load_policy
+from surgicai_vision.training.policies import POLICIES, load_policy, load_recipe
 from surgicai_vision.training.train import epochs_within, train
 
 QUICK = ChunkRecipe(epochs=8, batch_size=32, learning_rate=1e-2, chunk=4, execute=2, history=2)
@@ -321,6 +321,19 @@ def test_an_ensemble_is_the_weighted_mean_of_the_plans() -> None:
 def test_a_recipe_refuses_what_cannot_be(change: dict[str, object]) -> None:
     with pytest.raises(InputError):
         replace(QUICK, **change)
+
+
+def test_a_change_may_be_one_entry_of_a_table(tmp_path: Path, registered: None) -> None:
+    path = tmp_path / "recipe.yaml"
+    path.write_text("settings: {width: 8, depth: 2}", encoding="utf-8")
+    recipe = load_recipe("linear", path, {"settings.depth": 3, "settings.kind": "new", "chunk": 12})
+    assert isinstance(recipe, ChunkRecipe)
+    assert recipe.settings == {"width": 8, "depth": 3, "kind": "new"} and recipe.chunk == 12
+    for key in ("chunk.depth", "settings."):
+        with pytest.raises(InputError, match=f"'{key}'"):
+            load_recipe("linear", path, {"chunk": 12, key: 3})
+    with pytest.raises(UnknownName, match="settings"):
+        load_recipe("linear", path, {"setings.depth": 3})
 
 
 def test_no_tensor_is_left_where_the_policy_was() -> None:
