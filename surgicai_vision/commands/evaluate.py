@@ -59,6 +59,8 @@ class Options:
         seed: Seed of the first start; each episode takes the next.
         workers: Number of processes.
         dataset: Dataset whose mean demonstration replay plays.
+        change: For a policy that plans chunks, how they are acted, in the place of its recipe's:
+            execute, samples, ensemble.
         expert_swap: For a hierarchical policy, the subtask that the expert does, or all: each in
             turn.
         upset: Let one thing go wrong in every episode, drawn from its start: the needle is pushed,
@@ -80,6 +82,9 @@ class Options:
     dataset: DatasetFolder = None
     weights: WeightFiles = ()
     accept_licence: AcceptLicence = False
+    change: Annotated[
+        tuple[str, ...], Parameter(metavar="KEY=VALUE[,KEY=VALUE]"), default_text("none")
+    ] = ()
     expert_swap: Annotated[
         str | None, Parameter(choices=(*names.SUBTASKS, ALL), metavar="SUBTASK")
     ] = None
@@ -104,7 +109,12 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     from surgicai_vision.evaluation.storage import MARKER
 
     if options.expert_swap == ALL:
-        for option, given in (("--video", options.video), ("--upset", options.upset)):
+        refused = {
+            "--video": options.video,
+            "--upset": options.upset,
+            "--change": options.change,
+        }
+        for option, given in refused.items():
             if given:
                 raise InputError(
                     f"{option} does not go with --expert-swap {ALL}; give one subtask."
@@ -117,6 +127,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         options.dataset,
         WeightsSource.parse(options.weights, options.accept_licence),
         options.expert_swap,
+        options.change,
     )
     if options.upset:
         check_upset_task(spec.config.task)
@@ -170,6 +181,7 @@ def open_given(
     dataset: Path | None,
     weights: WeightsSource,
     expert_swap: str | None = None,
+    changes: tuple[str, ...] = (),
 ) -> "PolicySpec":
     """Return what the options of this verb, or of `robustness`, evaluate."""
     from surgicai_vision.evaluation.policy_spec import open_policy
@@ -186,6 +198,7 @@ def open_given(
         dataset=demonstrated,
         expert_swap=expert_swap,
         weights=weights,
+        changes=changes,
     )
 
 

@@ -17,7 +17,14 @@ from typing import TYPE_CHECKING
 from policies.chunks import ChunkPolicy
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import view_names
-from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
+from surgicai_vision.core.config import (
+    JSON,
+    TaskConfig,
+    digest,
+    from_mapping,
+    read_changes,
+    to_mapping,
+)
 from surgicai_vision.core.errors import InputError, UnknownName, check_name
 from surgicai_vision.core.plugins import resolve
 from surgicai_vision.core.tasks import task_text
@@ -41,7 +48,7 @@ from surgicai_vision.evaluation.hierarchical_config import (
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.training import policies, released
-from surgicai_vision.training.checkpoint import read_checkpoint
+from surgicai_vision.training.checkpoint import CARD, read_checkpoint
 from surgicai_vision.training.progress_input import progress_policy_folder
 from surgicai_vision.training.run_config import OWN, RunConfig, evaluated_in
 
@@ -96,6 +103,7 @@ def open_policy(
     dataset: "Dataset | None" = None,
     expert_swap: str | None = None,
     weights: WeightsSource = ANYWHERE,
+    changes: tuple[str, ...] = (),
 ) -> PolicySpec:
     """Return what `given` names; checkpoints are read and their weights looked up at once.
 
@@ -108,6 +116,8 @@ def open_policy(
         dataset: whose mean demonstration "replay" plays.
         expert_swap: the subtask of a hierarchical policy that the expert does in its place.
         weights: where pretrained weights come from.
+        changes: `KEY=VALUE` of `ACTED_BY`, by which a checkpoint of ours that plans chunks acts in
+            the place of its recipe's.
 
     Raises:
         UnknownName: a name that stands for nothing.
@@ -120,6 +130,11 @@ def open_policy(
     if expert_swap is not None and path.suffix not in SUFFIXES:
         raise InputError(
             f"--expert-swap {expert_swap} is for the YAML file of a hierarchical policy; "
+            f"leave it out for {text}."
+        )
+    if changes and not (path / CARD).is_file():
+        raise InputError(
+            f"--change {','.join(changes)} is for the checkpoint of a policy that plans chunks; "
             f"leave it out for {text}."
         )
     if text == REPLAY:
@@ -137,7 +152,7 @@ def open_policy(
         known = (*BASELINES, REPLAY, *map(released.PREFIX.__add__, released.released_names()))
         raise UnknownName("policy or checkpoint folder", text, known)
     else:
-        spec = _from_folder(path, task, weights)
+        spec = _from_folder(path, task, weights, changes)
     if released.is_released(text):
         spec = replace(spec, about={**spec.about, "folder": text})
     if task not in (None, spec.config.task):
@@ -232,11 +247,13 @@ def make_from_factory(target: str) -> Agent:
     return agent
 
 
-def _from_folder(folder: Path, task: str | None, weights: WeightsSource) -> PolicySpec:
+def _from_folder(
+    folder: Path, task: str | None, weights: WeightsSource, changes: tuple[str, ...]
+) -> PolicySpec:
     """Return the policy of a checkpoint folder, LeRobot's or ours."""
     lerobot = lerobot_agent.find(folder)
     if lerobot is None:
-        return _from_checkpoint(folder, weights)
+        return _from_checkpoint(folder, weights, changes)
     known = lerobot_agent.read(lerobot, task)
     run = RunConfig(known.config, known.encoder, known.inputs.cameras, policy=known.policy)
     text = task_text(known.config.task)
@@ -250,12 +267,13 @@ def _from_folder(folder: Path, task: str | None, weights: WeightsSource) -> Poli
     return PolicySpec(run, make, about)
 
 
-def _from_checkpoint(folder: Path, weights: WeightsSource) -> PolicySpec:
+def _from_checkpoint(folder: Path, weights: WeightsSource, changes: tuple[str, ...]) -> PolicySpec:
     """Return the policy of a checkpoint folder of ours.
 
     Raises:
         BadFile: no checkpoint folder, or one without the policy whose progress it is fed.
-        InputError: a high-level policy.
+        UnknownName: a change of what does not decide how it acts.
+        InputError: a high-level policy, or a change that is not allowed.
         MissingWeights: the encoder's weights are not at hand.
     """
     checkpoint = read_checkpoint(folder)
@@ -277,29 +295,49 @@ def _from_checkpoint(folder: Path, weights: WeightsSource) -> PolicySpec:
         },
         "folder": str(folder),
     }
-    return PolicySpec(checkpoint.run, functools.partial(acting_agent, folder, weights), about)
+    acted_by = read_changes(changes)
+    if acted_by:
+        policies.restore(checkpoint, acted_by)  # refuses what is not allowed
+    make = functools.partial(acting_agent, folder, weights, acted_by)
+    return PolicySpec(replace(checkpoint.run, acted_by=changes), make, about)
 
 
-def acting_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> Agent:
+def acting_agent(
+    folder: Path,
+    weights: WeightsSource = ANYWHERE,
+    changes: Mapping[str, JSON] = policies.UNCHANGED,
+) -> Agent:
     """Make the agent of a checkpoint folder that acts, one action or a chunk of them at a time.
+
+    Args:
+        folder: the checkpoint.
+        weights: where pretrained weights come from.
+        changes: settings by which it acts in the place of its own (`policies.restore`).
 
     Raises:
         InputError: the encoder at hand is not the one the policy was trained on.
         BadFile: the policy whose progress it is fed is not in its folder.
     """
-    agent = policy_agent(folder, weights)
+    agent = policy_agent(folder, weights, changes)
     policy = agent.policy
     return ChunkAgent(policy, agent) if isinstance(policy, ChunkPolicy) else agent
 
 
-def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent:
+def policy_agent(
+    folder: Path,
+    weights: WeightsSource = ANYWHERE,
+    changes: Mapping[str, JSON] = policies.UNCHANGED,
+) -> PolicyAgent:
     """Make the agent of a checkpoint folder that answers one observation at a time.
+
+    Args:
+        folder, weights, changes: as in `acting_agent`.
 
     Raises:
         InputError: the encoder at hand is not the one the policy was trained on.
         BadFile: the policy whose progress it is fed is not in its folder.
     """
-    policy = policies.load_policy(folder)
+    policy = policies.load_policy(folder, changes)
     checkpoint = policy.checkpoint
     encoder = policies.load_encoder_of(checkpoint, weights)
     progress = progress_policy_folder(checkpoint)

@@ -26,6 +26,7 @@ class Condition:
         pool: what is taken from the encoder.
         recipe: its recipe's name.
         changes: what is changed in the recipe.
+        acted_by: what of the recipe is changed in the evaluation alone.
         demonstrations: demonstrations trained on, validation included; None where not known.
         looks: the looks in which each demonstration was rendered, or "".
         multiplied_from: how many demonstrations those were re-posed from; None where they were not.
@@ -52,6 +53,7 @@ class Condition:
     pool: str = "global"
     recipe: str = "paper"
     changes: tuple[str, ...] = ()
+    acted_by: tuple[str, ...] = ()
     demonstrations: int | None = None
     looks: str = ""
     multiplied_from: int | None = None
@@ -75,6 +77,7 @@ class Condition:
             hierarchical,
             *(part for part, common in usual if part != common),
             " + ".join(self.changes),
+            f"acting by {' + '.join(self.acted_by)}" if self.acted_by else "",
             self.looks,
             f"multiplied from {self.multiplied_from}" if self.multiplied_from else "",
             f"rounds of DAgger: {self.dagger_rounds}" if self.dagger_rounds else "",
@@ -148,6 +151,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         pool=run.pool,
         recipe=Path(run.recipe).stem,
         changes=run.changes,
+        acted_by=run.acted_by,
         demonstrations=run.demonstrations,
         looks=run.variants.text if run.variants else "",
         multiplied_from=run.multiplied_from,

@@ -27,6 +27,7 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "pool": "pool",
         "recipe": "recipe",
         "changes": "change",
+        "acted_by": "change in acting",
         "demonstrations": "demonstrations",
         "looks": "looks",
         "multiplied_from": "multiplied demonstrations",

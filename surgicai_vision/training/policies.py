@@ -8,6 +8,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from surgicai_vision.core.config import JSON, from_mapping
@@ -22,7 +23,7 @@ from surgicai_vision.training.checkpoint import (
     read_checkpoint,
     read_tensors,
 )
-from surgicai_vision.training.run_config import BUDGET, RunConfig
+from surgicai_vision.training.run_config import ACTED_BY, BUDGET, RunConfig
 
 if TYPE_CHECKING:
     from encoders.base import Encoder
@@ -43,6 +44,8 @@ POLICIES: Final = Registry["Plugin"](
     },
 )
 """Policy name → its `policies.base.Plugin`."""
+UNCHANGED: Final[Mapping[str, JSON]] = MappingProxyType({})
+"""No change: a policy acts by its own recipe."""
 
 
 def register_policy(name: str, plugin: "Plugin", distribution: str = "") -> None:
@@ -140,8 +143,12 @@ def check_progress_from(recipe: "Recipe", progress_from: Path | None) -> None:
         )
 
 
-def load_policy(folder: Path | str) -> "Policy":
+def load_policy(folder: Path | str, changes: Mapping[str, JSON] = UNCHANGED) -> "Policy":
     """Load a trained policy from a checkpoint folder or by its name `released:NAME`, verified.
+
+    Args:
+        folder: the checkpoint.
+        changes: as in `restore`.
 
     Returns:
         The policy; `policy.checkpoint` says everything about it.
@@ -150,14 +157,32 @@ def load_policy(folder: Path | str) -> "Policy":
         BadFile: a folder that is no whole checkpoint, or one that was changed.
         InputError: a released policy that does not exist, or one of another scene.
     """
-    return restore(read_checkpoint(released.resolve(folder)))
+    return restore(read_checkpoint(released.resolve(folder)), changes)
 
 
-def restore(checkpoint: Checkpoint) -> "Policy":
-    """Build the trained policy of a checkpoint; see `load_policy`."""
+def restore(checkpoint: Checkpoint, changes: Mapping[str, JSON] = UNCHANGED) -> "Policy":
+    """Build the trained policy of a checkpoint; see `load_policy`.
+
+    Args:
+        checkpoint: whose policy.
+        changes: settings of its recipe by which it acts in the place of its own, of `ACTED_BY`; for
+            policies that plan chunks.
+
+    Raises:
+        UnknownName: a setting that decides what is learned, or none.
+        InputError: a value that is not allowed, or a policy that plans no chunks.
+    """
     plugin = policy_plugin(checkpoint.policy)
+    for name in changes:
+        check_name("setting by which a policy acts", name, ACTED_BY)
+        if name not in plugin.recipe.__dataclass_fields__:
+            raise InputError(
+                f"'{checkpoint.policy}' answers with one action and has no {name} to change; "
+                "policies that plan chunks have."
+            )
+    recipe = {**checkpoint.recipe, **changes}
     try:
-        policy = plugin.make(from_mapping(plugin.recipe, checkpoint.recipe), checkpoint.visual)
+        policy = plugin.make(from_mapping(plugin.recipe, recipe), checkpoint.visual)
         policy.load_state_dict(read_tensors(checkpoint))
     except RuntimeError as error:
         raise BadFile(

@@ -30,6 +30,8 @@ TERMINATIONS = ("privileged", "learned")
 """How a subtask ends under a hierarchical policy."""
 BUDGET = "minutes"
 """Setting of a recipe that bounds its training (`policies.chunks.ChunkRecipe`)."""
+ACTED_BY = ("execute", "samples", "ensemble")
+"""Settings of such a recipe by which chunks are acted; what is learned does not depend on them."""
 
 BANKS: Mapping[str, int] = MappingProxyType(
     {"test": names.TEST_SEED, "validation": names.VALIDATION_SEED}
@@ -106,6 +108,8 @@ class RunConfig:
         parts: digest of the file that names the policies of a hierarchical policy; empty where
             they are trained by this run.
         expert_swap: the subtask of a hierarchical policy that the expert does.
+        acted_by: settings by which its chunks are acted in an evaluation, "key=value" each, in the
+            place of its recipe's (`ACTED_BY`).
         starts: start states of the evaluation; None before it.
         shift: what is shifted in an evaluation of robustness.
         upset: one thing goes wrong in every episode of the evaluation (`envs.upset`).
@@ -138,6 +142,7 @@ class RunConfig:
     termination: str | None = None
     parts: str = ""
     expert_swap: str | None = None
+    acted_by: tuple[str, ...] = field(default=(), metadata=LATER)
     starts: Starts | None = None
     shift: Shift | None = None
     upset: bool = False
@@ -225,6 +230,7 @@ class RunConfig:
             parts += [self.variants.name] if self.variants else []
             parts += [f"from-{self.multiplied_from}"] if self.multiplied_from else []
             parts += [f"dagger-{self.dagger_rounds}"] if self.dagger_rounds else []
+            parts += ["+".join(("acting", *self.acted_by))] if self.acted_by else []
         if self.expert_swap:
             parts.append(f"expert-{self.expert_swap}")
         return "-".join(parts).replace(":", "-")
@@ -276,6 +282,7 @@ def of_training(run: RunConfig) -> RunConfig:
         run,
         env=run.recorded_in or run.env,
         recorded_in=None,
+        acted_by=(),
         starts=None,
         shift=None,
         expert_swap=None,

@@ -12,7 +12,8 @@ import torch
 from fake_dataset import DIM, FakeDataset, fake_procedures, features_of
 from torch import nn
 
-from policies.base import ACTIONS, Plugin
+from policies.base import ACTIONS, Plugin, Recipe
+from policies.bc import BC
 from policies.chunks import ChunkPolicy, ChunkRecipe
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
@@ -25,9 +26,13 @@ from surgicai_vision.dataset.subset import of_subtask, with_frame_stride
 from surgicai_vision.demos.record import record
 from surgicai_vision.evaluation.agents import PolicyAgent
 from surgicai_vision.evaluation.chunk_agent import ChunkAgent
+from surgicai_vision.evaluation.policy_spec import open_policy
+from surgicai_vision.report.experiment_key import condition_of
+from surgicai_vision.report.pairs import factor
 from surgicai_vision.training.averages import MovingAverage
 from surgicai_vision.training.chunks import earlier_rows, timeline_of, with_chunks
 from surgicai_vision.training.policies import POLICIES, load_policy, load_recipe
+from surgicai_vision.training.run_config import of_training
 from surgicai_vision.training.train import epochs_within, train
 
 QUICK = ChunkRecipe(epochs=8, batch_size=32, learning_rate=1e-2, chunk=4, execute=2, history=2)
@@ -164,6 +169,49 @@ def test_a_chunk_policy_trains_and_reads_back(tmp_path: Path, registered: None) 
     held = actions[kept][actions[kept][..., ACTIONS] == 0][:, :ACTIONS]
     np.testing.assert_allclose(policy.action_centre, (held.min(0) + held.max(0)) / 2, atol=1e-6)
     np.testing.assert_allclose(policy.action_scale, np.ptp(held, axis=0) / 2, atol=1e-6)
+
+
+def test_how_chunks_are_acted_is_changed_without_a_training(
+    tmp_path: Path, registered: None
+) -> None:
+    whole, dataset = chunked()
+    entry = features_of(whole).part(np.arange(whole.length), dataset.fingerprint)
+    folder = tmp_path / "a"
+    train(dataset, [entry], LINEAR, replace(QUICK, epochs=1), out=folder)
+    trained = load_policy(folder)
+    policy = load_policy(folder, {"execute": 1, "samples": 3, "ensemble": 0.5})
+    assert isinstance(policy, ChunkPolicy) and isinstance(trained, ChunkPolicy)
+    assert (policy.execute, policy.samples, policy.ensemble) == (1, 3, 0.5)
+    assert (trained.execute, trained.samples, trained.ensemble) == (2, 1, None)
+    assert all(
+        torch.equal(policy.state_dict()[key], at) for key, at in trained.state_dict().items()
+    )
+    for change, error, said in (
+        ({"execute": 9}, InputError, "1 to chunk, 4"),
+        ({"chunk": 2}, UnknownName, "ensemble, execute, samples"),
+        ({"excute": 1}, UnknownName, "Did you mean 'execute'"),
+    ):
+        with pytest.raises(error, match=said):
+            load_policy(folder, change)
+
+
+def test_an_evaluation_says_how_chunks_were_acted(tmp_path: Path, registered: None) -> None:
+    whole, dataset = chunked()
+    train(dataset, [], LINEAR, replace(QUICK, epochs=1), out=tmp_path / "a")
+    plain = open_policy(tmp_path / "a")
+    other = open_policy(tmp_path / "a", changes=("execute=1", "samples=3"))
+    assert other.name == f"{plain.name}-acting+execute=1+samples=3"
+    assert of_training(other.run) == plain.run
+    seen = condition_of(other.run)
+    assert "acting by execute=1 + samples=3" in seen.variant
+    assert factor(condition_of(plain.run), seen) == "change in acting"
+    with pytest.raises(InputError, match="execute is 0"):
+        open_policy(tmp_path / "a", changes=("execute=0",))
+    with pytest.raises(InputError, match="leave it out for expert"):
+        open_policy("expert", task="grasp", changes=("execute=1",))
+    train(whole, [], BC, Recipe(epochs=1), out=tmp_path / "b")
+    with pytest.raises(InputError, match="'bc' answers with one action"):
+        open_policy(tmp_path / "b", changes=("execute=1",))
 
 
 def test_a_broken_off_training_ends_the_same(tmp_path: Path, registered: None) -> None:
