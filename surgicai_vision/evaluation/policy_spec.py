@@ -48,11 +48,12 @@ from surgicai_vision.evaluation.hierarchical_config import (
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.training import policies, released
-from surgicai_vision.training.checkpoint import CARD, read_checkpoint
+from surgicai_vision.training.checkpoint import read_checkpoint
 from surgicai_vision.training.progress_input import progress_policy_folder
 from surgicai_vision.training.run_config import OWN, RunConfig, evaluated_in
 
 if TYPE_CHECKING:
+    from policies.base import Policy
     from surgicai_vision.dataset.protocol import Dataset
 
 REPLAY = ReplayAgent.name
@@ -132,11 +133,6 @@ def open_policy(
             f"--expert-swap {expert_swap} is for the YAML file of a hierarchical policy; "
             f"leave it out for {text}."
         )
-    if changes and not (path / CARD).is_file():
-        raise InputError(
-            f"--change {','.join(changes)} is for the checkpoint of a policy that plans chunks; "
-            f"leave it out for {text}."
-        )
     if text == REPLAY:
         if dataset is None:
             raise InputError("replay plays the mean demonstration of a dataset; give a dataset.")
@@ -153,6 +149,11 @@ def open_policy(
         raise UnknownName("policy or checkpoint folder", text, known)
     else:
         spec = _from_folder(path, task, weights, changes)
+    if changes and not spec.run.acted_by:
+        raise InputError(
+            f"--change {','.join(changes)} is for the checkpoint of a policy that plans chunks; "
+            f"leave it out for {text}."
+        )
     if released.is_released(text):
         spec = replace(spec, about={**spec.about, "folder": text})
     if task not in (None, spec.config.task):
@@ -318,26 +319,23 @@ def acting_agent(
         InputError: the encoder at hand is not the one the policy was trained on.
         BadFile: the policy whose progress it is fed is not in its folder.
     """
-    agent = policy_agent(folder, weights, changes)
-    policy = agent.policy
+    policy = policies.load_policy(folder, changes)
+    agent = _agent_of(policy, weights)
     return ChunkAgent(policy, agent) if isinstance(policy, ChunkPolicy) else agent
 
 
-def policy_agent(
-    folder: Path,
-    weights: WeightsSource = ANYWHERE,
-    changes: Mapping[str, JSON] = policies.UNCHANGED,
-) -> PolicyAgent:
+def policy_agent(folder: Path, weights: WeightsSource = ANYWHERE) -> PolicyAgent:
     """Make the agent of a checkpoint folder that answers one observation at a time.
-
-    Args:
-        folder, weights, changes: as in `acting_agent`.
 
     Raises:
         InputError: the encoder at hand is not the one the policy was trained on.
         BadFile: the policy whose progress it is fed is not in its folder.
     """
-    policy = policies.load_policy(folder, changes)
+    return _agent_of(policies.load_policy(folder), weights)
+
+
+def _agent_of(policy: "Policy", weights: WeightsSource) -> PolicyAgent:
+    """Make the agent of a trained policy, with the encoder it was trained on."""
     checkpoint = policy.checkpoint
     encoder = policies.load_encoder_of(checkpoint, weights)
     progress = progress_policy_folder(checkpoint)

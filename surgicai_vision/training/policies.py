@@ -45,7 +45,7 @@ POLICIES: Final = Registry["Plugin"](
 )
 """Policy name → its `policies.base.Plugin`."""
 UNCHANGED: Final[Mapping[str, JSON]] = MappingProxyType({})
-"""No change: a policy acts by its own recipe."""
+"""No change: a recipe as it stands, a policy that acts by its own."""
 
 
 def register_policy(name: str, plugin: "Plugin", distribution: str = "") -> None:
@@ -78,7 +78,7 @@ def default_recipe(policy: str) -> str:
 
 
 def load_recipe(
-    policy: str = "bc", recipe: str | Path = "paper", changes: Mapping[str, JSON] | None = None
+    policy: str = "bc", recipe: str | Path = "paper", changes: Mapping[str, JSON] = UNCHANGED
 ) -> "Recipe":
     """Read a recipe and apply changes.
 
@@ -98,10 +98,9 @@ def load_recipe(
         check_name("recipe", str(recipe), recipe_names())
         path = (configs_folder() / "recipes") / f"{recipe}.yaml"
     values: Mapping[str, object] = read_yaml(path, may_be_empty=True)
-    given = changes or {}
-    if "epochs" in given:  # whoever says the epochs wants them, and no budget
+    if "epochs" in changes:  # whoever says the epochs wants them, and no budget
         values = {key: value for key, value in values.items() if key != BUDGET}
-    return from_mapping(plugin.recipe, _changed(values, given), f"recipe {recipe}")
+    return from_mapping(plugin.recipe, _changed(values, changes), f"recipe {recipe}")
 
 
 def _changed(values: Mapping[str, object], changes: Mapping[str, JSON]) -> dict[str, object]:
