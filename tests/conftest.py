@@ -41,6 +41,18 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
     monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
+@pytest.fixture(autouse=True)
+def own_schedule() -> Iterator[None]:
+    """Undo what LeRobot's recording does to a process that is root's.
+
+    Its SVT-AV1 makes the thread a real-time one, and every later test of this process would keep a
+    core from the tests beside it.
+    """
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    yield
+    os.sched_setscheduler(0, policy, parameters)
+
+
 @pytest.fixture
 def tiny_encoder() -> Iterator[None]:
     """Offer the encoder "tiny" for as long as a test runs."""

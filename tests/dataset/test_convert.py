@@ -1,6 +1,7 @@
 """A dataset from a dataset, without rendering: fewer views, videos."""
 
 import json
+import os
 import shutil
 
 import numpy as np
@@ -19,7 +20,7 @@ from surgicai_vision.dataset import (
     render_demos,
     video_jobs,
 )
-from surgicai_vision.dataset.video import CODECS
+from surgicai_vision.dataset.video import CODECS, VideoWriter
 
 CONFIG = TaskConfig(max_steps=12)
 SIZE = 64
@@ -118,6 +119,20 @@ def test_videos_are_encoded_in_blocks_and_do_not_depend_on_the_workers(
         "two views, three episodes in two blocks"
     )
     assert check_dataset(tmp_path / "together").problems == ()
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_an_encoder_leaves_this_thread_its_scheduling(tmp_path, codec):
+    """As root, SVT-AV1 would make it a real-time thread of the highest priority."""
+
+    def schedule() -> tuple[int, int]:
+        return os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+
+    before = schedule()
+    with VideoWriter(tmp_path / "a.mp4", codec, 25, SIZE) as writer:
+        writer.add(np.zeros((SIZE, SIZE, 3), np.uint8))
+        assert schedule() == before
+    assert schedule() == before
 
 
 def test_views_of_a_video_dataset(tmp_path, demos):
