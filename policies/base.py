@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import CLOCK_SIZE
+from surgicai_vision.core.config import CLOCK_PERIOD, CLOCK_SIZE
 from surgicai_vision.core.errors import InputError, check_at_least, check_name, check_positive
 
 if TYPE_CHECKING:
@@ -68,7 +68,8 @@ class Recipe:
         setpoint: feed how far the set point lies from the measured pose as well (needs
             proprioception): an action moves the set point, and the tool lags behind it.
         clock: feed the time since the subtask began as well (needs proprioception), for
-            demonstrators that act by it.
+            demonstrators that act by it; its hand must be seen in more than one place
+            (`frame_stride`).
         progress_input: feed how far the subtask is, as a high-level policy with `progress` says it,
             in the place of the clock (`train --progress-from`; needs proprioception).
         map_head: what takes in a feature map: "softmax" (where each of 32 patterns lies) or
@@ -122,6 +123,12 @@ class Recipe:
             raise InputError("setpoint goes with proprioception; switch it on, and privileged off.")
         if self.clock and (self.privileged or not self.proprioception):
             raise InputError("clock goes with proprioception; switch it on, and privileged off.")
+        if self.clock and self.frame_stride % CLOCK_PERIOD == 0:
+            raise InputError(
+                f"frame_stride is {self.frame_stride}: the clock's hand goes round in "
+                f"{CLOCK_PERIOD} steps and would stand still in all frames trained on; take "
+                "another stride, or clock=false."
+            )
         if self.progress_input and (self.clock or self.privileged or not self.proprioception):
             raise InputError(
                 "progress_input goes with proprioception, in the place of the clock; switch "
