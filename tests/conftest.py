@@ -17,6 +17,8 @@ from pathlib import Path
 
 import pytest
 
+from surgicai_vision.core import processes
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -48,9 +50,8 @@ def own_schedule() -> Iterator[None]:
     Its SVT-AV1 makes the thread a real-time one, and every later test of this process would keep a
     core from the tests beside it.
     """
-    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    yield
-    os.sched_setscheduler(0, policy, parameters)
+    with processes.kept_schedule():
+        yield
 
 
 @pytest.fixture

@@ -44,6 +44,21 @@ fight over it (measured: two single-threaded processes scale linearly)."""
 OFFLINE: Mapping[str, str] = MappingProxyType({"HF_HUB_OFFLINE": "1"})
 """Environment of a child that must find all it needs on this machine."""
 
+
+@contextmanager
+def kept_schedule() -> Iterator[None]:
+    """Leave this thread's scheduling as it is found.
+
+    SVT-AV1 makes the thread that opens it a real-time one (SCHED_FIFO, priority 99) where it runs
+    as root: all that the process does from then on would stop everything else on its core.
+    """
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameters)
+
+
 T = TypeVar("T")
 
 WATCH_S = 0.5

@@ -3,9 +3,7 @@
 A policy reads at random: every second frame is a key frame.
 """
 
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING
@@ -14,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.processes import kept_schedule
 from surgicai_vision.core.video import REPEATABLE
 
 if TYPE_CHECKING:
@@ -49,7 +48,7 @@ class VideoWriter:
         stream.width = size
         stream.height = size
         stream.pix_fmt = PIXELS
-        with _kept_schedule():
+        with kept_schedule():  # SVT-AV1 changes it where it runs as root
             stream.codec_context.open()
         self._stream = stream
         self.written = 0
@@ -77,20 +76,6 @@ class VideoWriter:
         self, kind: type[BaseException] | None, error: object, trace: TracebackType | None
     ) -> None:
         self.close() if kind is None else self._container.close()
-
-
-@contextmanager
-def _kept_schedule() -> Iterator[None]:
-    """Leave this thread's scheduling as it is found.
-
-    SVT-AV1 makes the thread that opens it a real-time one (SCHED_FIFO, priority 99) where it runs
-    as root: all that the process does from then on would stop everything else on its core.
-    """
-    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    try:
-        yield
-    finally:
-        os.sched_setscheduler(0, policy, parameters)
 
 
 def read_frames(
