@@ -25,7 +25,7 @@ from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.run import evaluate_once
 from surgicai_vision.evaluation.storage import FORMAT, RUN_FILE, Row, read_versioned
-from surgicai_vision.experiments.first_stitch import POSTER, STRIP, VIDEO, find_sewer, sew
+from surgicai_vision.experiments.first_stitch import POSTER, STRIP, VIDEO, Sewer, find_sewer, sew
 from surgicai_vision.experiments.prepare import prepare_dataset
 from surgicai_vision.experiments.quickstart_config import Quickstart
 from surgicai_vision.experiments.run import train_run
@@ -68,27 +68,55 @@ def run_quickstart(
     check_opengl()
     sewer = find_sewer(plan.procedure) if plan.procedure else None
     state = _open_state(plan, out)
-    sewn: Row | None = None
-    if sewer is not None:
-        say(f"Act 1. A whole procedure by {sewer.who}.")
-        if sewer.why:
-            say(f"  In the place of {plan.procedure}, which cannot: {sewer.why}")
-        with timed(context.stage, state["seconds"]) as measured:
-            sewn = sew(sewer, out / PROCEDURE, say, measured)
-        state["video"] = _video(sewn)
-        _store_state(out, state)
-        say("")
-        say(
-            f"Act 2. A policy of {plan.task}, from demonstrations to counted successes, and what "
-            "it is to be compared with."
-        )
-    config = TaskConfig(plan.task)
+    sewn = None if sewer is None else _first_act(plan, sewer, out, state, context, say)
+    results = _second_act(plan, out, state, context, say)
+    state["provenance"] = provenance()
+    state.update(_finding(plan, results))
+    _store_state(out, state)
+    with context.stage("report", "parts") as progress:
+        page = write_report(out, progress=progress)
+    return {
+        "report": str(page),
+        "procedure": sewn,
+        "results": results,
+        "seconds": sum(state["seconds"].values()),
+    }
+
+
+def _first_act(
+    plan: Quickstart,
+    sewer: Sewer,
+    out: Path,
+    state: Row,
+    context: RunContext,
+    say: Callable[[str], None],
+) -> Row:
+    """Sew a procedure on film, and say what comes next; return what it came to."""
+    say(f"Act 1. A whole procedure by {sewer.who}.")
+    if sewer.why:
+        say(f"  In the place of {plan.procedure}, which cannot: {sewer.why}")
+    with timed(context.stage, state["seconds"]) as measured:
+        sewn = sew(sewer, out / PROCEDURE, say, measured)
+    state["video"] = _video(sewn)
+    _store_state(out, state)
+    say("")
+    say(
+        f"Act 2. A policy of {plan.task}, from demonstrations to counted successes, and what "
+        "it is to be compared with."
+    )
+    return sewn
+
+
+def _second_act(
+    plan: Quickstart, out: Path, state: Row, context: RunContext, say: Callable[[str], None]
+) -> list[Row]:
+    """Train the policies and count their successes; return the summaries, the expert's last."""
     seeds = Starts(names.TEST_SEED, plan.episodes).seeds
     evaluations = out / "evaluations"
     results: list[Row] = []
     with timed(context.stage, state["seconds"]) as measured:
         folder = prepare_dataset(
-            config,
+            TaskConfig(plan.task),
             out,
             replace(context, stage=measured),
             demonstrations=plan.demonstrations,
@@ -99,6 +127,11 @@ def run_quickstart(
             disturbance=Disturbance(plan.noise),
         )
         dataset = open_dataset(folder)
+        state["data"] = (
+            f"{plan.demonstrations} demonstrations of the scripted expert, {dataset.length} "
+            f"frames; {' and '.join(plan.view)} at {plan.size} × {plan.size}; "
+            f"behaviour cloning, training seed {plan.seed}"
+        )
         for run in plan.runs:
             policy = out / "policies" / run.name
             if not (policy / CARD).exists():
@@ -112,22 +145,7 @@ def run_quickstart(
         results.append(
             evaluate_once(evaluations / "expert", spec, seeds, measured, context.workers)
         )
-    state["provenance"] = provenance()
-    state["data"] = (
-        f"{plan.demonstrations} demonstrations of the scripted expert, {dataset.length} frames; "
-        f"{' and '.join(plan.view)} at {plan.size} × {plan.size}; "
-        f"behaviour cloning, training seed {plan.seed}"
-    )
-    state.update(_finding(plan, results))
-    _store_state(out, state)
-    with context.stage("report", "parts") as progress:
-        page = write_report(out, progress=progress)
-    return {
-        "report": str(page),
-        "procedure": sewn,
-        "results": results,
-        "seconds": sum(state["seconds"].values()),
-    }
+    return results
 
 
 def _finding(plan: Quickstart, results: Sequence[Row]) -> dict[str, str]:

@@ -5,14 +5,15 @@ the one that is there, so running again continues.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from encoders.base import Encoder
-from policies.base import Recipe
+from policies.base import Plugin, Policy, Recipe
 from policies.chunks import ChunkRecipe
 from surgicai_vision.core.files import read_json
 from surgicai_vision.core.progress import Stage
@@ -80,31 +81,16 @@ def train_run(
     if progress_policy is not None:
         check_progress_policy(progress_policy.checkpoint, dataset)
     start_policy = policies.load_policy(start) if start else None
-    features = _encode(run, dataset, stage, weights, encodes_on)
+    learned = _Learned(dataset, _encode(run, dataset, stage, weights, encodes_on))
     if progress_policy is not None:
-        encoder = policies.load_encoder_of(progress_policy.checkpoint, weights)
-        views = progress_policy.checkpoint.views
-        seen = _encode_views(encoder, views, dataset, stage, "features of the progress")
-        fed = with_progress(dataset, progress_policy, seen)
-        dataset = fed
-        features = [entry.part(fed.rows, fed.fingerprint) for entry in features]
-    subsets: list[Callable[[Dataset], DatasetSubset]] = []
-    if plugin.offsets is not None:
-        offsets = plugin.offsets(recipe)
-        subsets.append(lambda present: with_chunks(present, timeline_of(present, demos), offsets))
-    if run.demonstrations not in (None, len(np.unique(dataset.demonstration_index))):
-        subsets.append(functools.partial(first_episodes, count=run.demonstrations))
-    if subtask is not None:
-        subsets.append(functools.partial(of_subtask, subtask=subtask))
-    for select in subsets:
-        subset = select(dataset)
-        dataset = subset
-        features = [entry.part(subset.rows, subset.fingerprint) for entry in features]
-    recipe = _within_budget(recipe, dataset, features, run, out, trains_on)
+        learned = learned.select(_fed(dataset, progress_policy, stage, weights))
+    for select in _selections(run, plugin, recipe, dataset, subtask, demos):
+        learned = learned.select(select(learned.dataset))
+    recipe = _within_budget(recipe, learned, run, out, trains_on)
     with stage(f"policy: {run.name}", "epochs") as progress:
         train(
-            dataset,
-            features,
+            learned.dataset,
+            learned.features,
             plugin,
             recipe,
             seed=run.seed,
@@ -119,13 +105,51 @@ def train_run(
         )
 
 
-def _within_budget(
+class _Learned(NamedTuple):
+    """The frames a policy learns from and their features, one entry a view."""
+
+    dataset: Dataset
+    features: Sequence[Features]
+
+    def select(self, subset: DatasetSubset) -> "_Learned":
+        """Return the same of a subset of the dataset."""
+        parts = [entry.part(subset.rows, subset.fingerprint) for entry in self.features]
+        return _Learned(subset, parts)
+
+
+def _fed(
+    dataset: Dataset, progress_policy: Policy, stage: Stage, weights: WeightsSource
+) -> DatasetSubset:
+    """Return the dataset with the progress that a policy predicts for its frames."""
+    encoder = policies.load_encoder_of(progress_policy.checkpoint, weights)
+    views = progress_policy.checkpoint.views
+    seen = _encode_views(encoder, views, dataset, stage, "features of the progress")
+    return with_progress(dataset, progress_policy, seen)
+
+
+def _selections(
+    run: RunConfig,
+    plugin: Plugin,
     recipe: Recipe,
     dataset: Dataset,
-    features: Sequence[Features],
-    run: RunConfig,
-    out: Path,
-    device: str,
+    subtask: str | None,
+    demos: Path | None,
+) -> Iterator[Callable[[Dataset], DatasetSubset]]:
+    """Yield what selects a run's frames of `dataset`, each from what the one before left.
+
+    Chunks of actions come first, for they reach into frames that are left out later.
+    """
+    if plugin.offsets is not None:
+        offsets = plugin.offsets(recipe)
+        yield lambda present: with_chunks(present, timeline_of(present, demos), offsets)
+    if run.demonstrations not in (None, len(np.unique(dataset.demonstration_index))):
+        yield functools.partial(first_episodes, count=run.demonstrations)
+    if subtask is not None:
+        yield functools.partial(of_subtask, subtask=subtask)
+
+
+def _within_budget(
+    recipe: Recipe, learned: _Learned, run: RunConfig, out: Path, device: str
 ) -> Recipe:
     """Return the recipe with the epochs that fit into its minutes, where it has a budget.
 
@@ -137,12 +161,8 @@ def _within_budget(
         begun = read_json(out / REQUEST).get("recipe", {}).get("epochs", recipe.epochs)
         return replace(recipe, epochs=int(begun))
     plugin = policies.policy_plugin(run.policy)
-    return replace(
-        recipe,
-        epochs=epochs_within(
-            recipe.minutes, dataset, features, plugin, recipe, seed=run.seed, device=device
-        ),
-    )
+    epochs = epochs_within(recipe.minutes, *learned, plugin, recipe, seed=run.seed, device=device)
+    return replace(recipe, epochs=epochs)
 
 
 def encode_run(
