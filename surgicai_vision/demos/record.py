@@ -162,17 +162,12 @@ def record(
             f"episodes is {episodes}, seed {seed}, post_success_steps {post_success_steps}; "
             "they must be at least 1, 0 and 0."
         )
-    _check_demos(demonstrator, demos)
-    if source and demonstrator not in CHOOSING_DEMONSTRATORS:
-        choosing = ", ".join(sorted(CHOOSING_DEMONSTRATORS))
-        raise InputError(
-            f"source is '{source}', and demonstrator '{demonstrator}' chooses no demonstration; "
-            f"leave it out or take demonstrator {choosing}."
-        )
+    _check_demos(demonstrator, demos, source)
     check_late(demonstrator, disturbance)
     if disturbance.upset_fraction:
         check_upset_task(config.task)
-    # What decides the result: a finished folder of the same request is left as it is.
+    # What decides the result: a finished folder of the same request is left as it is. What is not
+    # asked for is left out, so that a folder stays the same request's when an option is added.
     request = {
         "task": to_mapping(config),
         "demonstrator": demonstrator,
@@ -180,14 +175,13 @@ def record(
         "episodes": episodes,
         **_disturbance_fields(disturbance),
     }
-    if post_success_steps:
-        request["post_success_steps"] = post_success_steps
-    if demos:
-        request["demos"] = [sha256_file(path) for path in demos]
-    if source:
-        request["source"] = source
-    if learner:
-        request["learner"] = learner.digest
+    options = {
+        "post_success_steps": post_success_steps,
+        "demos": [sha256_file(path) for path in demos],
+        "source": source,
+        "learner": learner.digest if learner else "",
+    }
+    request |= {name: value for name, value in options.items() if value}
     check_output(out, may_resume=MARKER)
     if finished(out, request):
         return list_demos(out)
@@ -212,8 +206,8 @@ def _sources(kept: Sequence[Path]) -> dict[str, list[str]]:
     return {"sources": [row["source"] for row in results]} if "source" in results[0] else {}
 
 
-def _check_demos(demonstrator: str, demos: Sequence[Path]) -> None:
-    """Refuse a learning demonstrator without demonstrations, and another one with some."""
+def _check_demos(demonstrator: str, demos: Sequence[Path], source: str) -> None:
+    """Refuse a learning demonstrator without demonstrations, others with some, a source in vain."""
     if demonstrator in LEARNING_DEMONSTRATORS and not demos:
         raise InputError(
             f"Demonstrator '{demonstrator}' learns from demonstrations; "
@@ -224,6 +218,12 @@ def _check_demos(demonstrator: str, demos: Sequence[Path]) -> None:
         raise InputError(
             f"Demonstrator '{demonstrator}' learns from no demonstrations; "
             f"leave them (--from) out or take demonstrator {learning}."
+        )
+    if source and demonstrator not in CHOOSING_DEMONSTRATORS:
+        choosing = ", ".join(sorted(CHOOSING_DEMONSTRATORS))
+        raise InputError(
+            f"source is '{source}', and demonstrator '{demonstrator}' chooses no demonstration; "
+            f"leave it out or take demonstrator {choosing}."
         )
 
 

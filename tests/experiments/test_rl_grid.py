@@ -23,6 +23,7 @@ SHIPPED = {
     "rl-online": 8 * 2 * 3,
     "rl-demonstrations": 4 * 5 * 3,
     "rl-offline": 5 * 5 * 3,
+    "rl-offline-still": 3 * 5 * 3,
     "rl-ten-demonstrations": 5 * 2 * 3,
     "rl-hierarchy": 5 * 3 + 3,
 }
