@@ -70,12 +70,15 @@ class Condition:
 
     @property
     def variant(self) -> str:
-        """Everything but inputs and demonstrations that is not as usual: not bc, global, paper."""
+        """Everything but inputs and demonstrations that is not as usual: not bc, global, paper.
+
+        A recipe that is named as the policy's kind is not said a second time.
+        """
         usual = ((self.trained_by, "bc"), (self.pool, "global"), (self.recipe, "paper"))
         hierarchical = f"hierarchical, {self.hierarchical} end" if self.hierarchical else ""
         parts = [
             hierarchical,
-            *(part for part, common in usual if part != common),
+            *dict.fromkeys(part for part, common in usual if part != common),
             " + ".join(self.changes),
             f"acting by {' + '.join(self.acted_by)}" if self.acted_by else "",
             self.looks,

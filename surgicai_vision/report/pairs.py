@@ -3,8 +3,10 @@
 Compared are trained conditions of a task that differ in one thing (`FACTORS`); recipes as wholes,
 with the encoder, views and demonstrations of each; multiplied demonstrations against the few they
 were made of; demonstrations and looks with the epochs that were trained on each; conditions of a
-plan, with how subtasks end in each; and each with images against proprioception alone. Episodes are
-paired by training seed and start. The test speaks of the policies that were trained, not of all
+plan, with how subtasks end in each; and each with images against proprioception alone. Policies of
+different kinds have recipes of their own, so on the same images and demonstrations they are
+compared as wholes, but never two that were given different minutes of training. Episodes are paired
+by training seed and start. The test speaks of the policies that were trained, not of all
 that the same recipe might give.
 """
 
@@ -90,9 +92,12 @@ def factor(first: Condition, second: Condition) -> str:
         name for name in FACTORS if not (blind and name == "pool")
     ]  # no encoder, nothing taken from it
     differ = [name for name in fields if getattr(first, name) != getattr(second, name)]
-    if "recipe" in differ and bool(first.views) == bool(second.views):
+    same_kind = "trained_by" not in differ
+    if "recipe" in differ and same_kind and bool(first.views) == bool(second.views):
         whole = ("encoder", "views", "pool", "recipe", "changes", "demonstrations")
         differ = [name for name in differ if name == "recipe" or name not in whole]
+    if {"trained_by", "recipe"} <= set(differ) and _same_budget(first, second):
+        differ = [name for name in differ if name not in ("recipe", "changes")]
     if "multiplied_from" in differ and _originals(first) == _originals(second):
         differ = [name for name in differ if name != "demonstrations"]
     if "dagger_rounds" in differ:  # a round brings demonstrations of its own
@@ -113,6 +118,11 @@ def _without_amounts(condition: Condition) -> list[str]:
     """
     amounts = ("epochs=", "frame_stride=")
     return [change for change in condition.changes if not change.startswith(amounts)]
+
+
+def _same_budget(first: Condition, second: Condition) -> bool:
+    """Return False where both have a budget of minutes, each another."""
+    return None in (first.minutes, second.minutes) or first.minutes == second.minutes
 
 
 def _originals(condition: Condition) -> int | None:

@@ -365,7 +365,6 @@ def test_conditions_that_differ_in_two_things_are_no_pair():
     assert factor(one, Condition("grasp", "state")) == ""
     assert factor(one, Condition("grasp", "proprioception")) == "images"
     assert factor(one, replace(one, trained_by="act")) == "policy"
-    assert factor(one, replace(one, trained_by="act", recipe="released")) == ""
     early = {"encoder": "imagenet-lite-early", "views": ("front_psm2",), "pool": "spatial"}
     best = Condition("grasp", **early, recipe="best", demonstrations=350)
     assert factor(one, best) == "recipe", "a recipe is compared as a whole"
@@ -373,6 +372,20 @@ def test_conditions_that_differ_in_two_things_are_no_pair():
     assert factor(Condition("grasp", "proprioception"), best) == ""
     blind = Condition("grasp", "proprioception", recipe="best", demonstrations=350)
     assert factor(blind, best) == "images", "without an encoder nothing is taken from it"
+
+
+def test_policies_of_different_kinds_are_compared_with_the_recipe_of_each():
+    images = {"encoder": "imagenet-lite-early", "views": ("front_psm2",), "pool": "spatial"}
+    best = Condition("grasp", **images, recipe="best", demonstrations=350)
+    act = replace(best, trained_by="act", recipe="act", changes=("minutes=30", "clock=true"))
+    vqbet = replace(best, trained_by="vqbet", recipe="vqbet", changes=("minutes=30",))
+    assert factor(best, act) == "policy"
+    assert factor(act, vqbet) == "policy"
+    assert factor(act, replace(vqbet, changes=("minutes=10",))) == "", "less time to train"
+    assert factor(act, replace(vqbet, views=("back_psm2",))) == "", "other images"
+    assert factor(act, replace(vqbet, demonstrations=100)) == "", "other demonstrations"
+    assert factor(act, replace(act, changes=("minutes=30",))) == "change"
+    assert act.policy == "imagenet-lite-early · act · spatial · minutes=30 + clock=true"
 
 
 def test_curves_procedure_and_probes_are_drawn_with_their_numbers(text, groups):
