@@ -69,15 +69,16 @@ class Condition:
     place: str = ""
 
     @property
-    def variant(self) -> str:
-        """Everything but inputs and demonstrations that is not as usual: not bc, global, paper.
+    def parts(self) -> tuple[str, ...]:
+        """The encoder, then everything that is not as usual: not bc, global, paper.
 
-        A recipe that is named as the policy's kind is not said a second time.
+        Inputs and demonstrations are left out. A recipe that is named as the policy's kind is not
+        said a second time.
         """
         usual = ((self.trained_by, "bc"), (self.pool, "global"), (self.recipe, "paper"))
-        hierarchical = f"hierarchical, {self.hierarchical} end" if self.hierarchical else ""
-        parts = [
-            hierarchical,
+        parts = (
+            self.encoder,
+            f"hierarchical, {self.hierarchical} end" if self.hierarchical else "",
             *dict.fromkeys(part for part, common in usual if part != common),
             " + ".join(self.changes),
             f"acting by {' + '.join(self.acted_by)}" if self.acted_by else "",
@@ -88,13 +89,18 @@ class Condition:
             f"in {self.world}" if self.world and not self.name else "",
             self.name,
             self.place,
-        ]
-        return " · ".join(part for part in parts if part)
+        )
+        return tuple(part for part in parts if part)
+
+    @property
+    def variant(self) -> str:
+        """Everything that is not as usual, but for encoder, inputs and demonstrations."""
+        return " · ".join(self.parts[1:])
 
     @property
     def policy(self) -> str:
         """The policy without its views."""
-        return self.encoder + (f" · {self.variant}" if self.variant else "")
+        return " · ".join(self.parts)
 
     @property
     def learned_in(self) -> str:

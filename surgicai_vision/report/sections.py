@@ -1,6 +1,6 @@
 """Sections: the rows of the page's tables and maps, as the template prints them."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from markupsafe import Markup
 
@@ -82,7 +82,8 @@ def ceilings(groups: Sequence[Group]) -> str:
 def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict[str, object]]:
     """Return one heat map a view set: task × policy.
 
-    Of several numbers of demonstrations the largest counts.
+    Of several numbers of demonstrations the largest counts. What all policies of a map have in
+    common stands over it, what tells them apart over their columns.
     """
     plain = [
         item for item in groups if item.condition.plain and item.condition.task != names.SUTURE
@@ -91,17 +92,30 @@ def heat_maps(groups: Sequence[Group], index: dict[Condition, int]) -> list[dict
     several = False
     for views in dict.fromkeys(item.condition.views for item in plain):
         mine = [item for item in plain if item.condition.views == views]
-        columns = list(dict.fromkeys(item.condition.policy for item in mine))
+        columns = list(dict.fromkeys(item.condition.parts for item in mine))
+        shared = set(columns[0]).intersection(*columns) if len(columns) > 1 else set()
         tasks = [task for task in task_names() if of_task(mine, task)]
         rows = []
         for task in tasks:
-            known = {item.condition.policy: item for item in of_task(mine, task)}
+            known = {item.condition.parts: item for item in of_task(mine, task)}
             rows.append(
                 {"task": task, "cells": [_heat(known.get(column), index) for column in columns]}
             )
         several = several or len(rows) > 1
-        maps.append({"view": " + ".join(views) or "no images", "columns": columns, "rows": rows})
+        seen = " + ".join(views) or "no images"
+        maps.append(
+            {
+                "title": " · ".join([seen, *(part for part in columns[0] if part in shared)]),
+                "columns": [_apart(parts, shared) for parts in columns],
+                "rows": rows,
+            }
+        )
     return maps if several else []
+
+
+def _apart(parts: Sequence[str], shared: Collection[str]) -> str:
+    """Name a policy by what it does not share with the others, or else by all of it."""
+    return " · ".join(part for part in parts if part not in shared) or " · ".join(parts)
 
 
 def _heat(item: Group | None, index: dict[Condition, int]) -> dict[str, object]:

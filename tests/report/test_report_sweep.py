@@ -51,6 +51,7 @@ from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import best_trained, group, of_task
 from surgicai_vision.report.pairs import compare, factor
 from surgicai_vision.report.reader import collect
+from surgicai_vision.report.sections import heat_maps
 from surgicai_vision.training.run_config import RunConfig, Shift
 
 LIMIT = 8_000_000
@@ -386,6 +387,23 @@ def test_policies_of_different_kinds_are_compared_with_the_recipe_of_each():
     assert factor(act, replace(vqbet, demonstrations=100)) == "", "other demonstrations"
     assert factor(act, replace(act, changes=("minutes=30",))) == "change"
     assert act.policy == "imagenet-lite-early · act · spatial · minutes=30 + clock=true"
+
+
+def test_a_map_says_once_what_all_its_policies_share(groups):
+    images = {"views": ("front_psm2",), "pool": "spatial"}
+    kinds = {"best": "bc", "act": "act"}
+    conditions = [
+        Condition(task, "imagenet-lite-early", **images, recipe=recipe, trained_by=kind)
+        for task in ("grasp", "place")
+        for recipe, kind in kinds.items()
+    ]
+    mine = [replace(groups[0], condition=condition) for condition in conditions]
+    (drawn,) = heat_maps(mine, {condition: at for at, condition in enumerate(conditions)})
+    assert drawn["title"] == "front_psm2 · imagenet-lite-early · spatial"
+    assert drawn["columns"] == ["best", "act"]
+    (alone,) = heat_maps(mine[::2], {condition: at for at, condition in enumerate(conditions)})
+    assert alone["title"] == "front_psm2"
+    assert alone["columns"] == ["imagenet-lite-early · spatial · best"]
 
 
 def test_curves_procedure_and_probes_are_drawn_with_their_numbers(text, groups):
