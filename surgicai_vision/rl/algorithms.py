@@ -46,6 +46,7 @@ class Algorithm:
         defaults: settings that differ from those of `Settings`.
         needs_demos: it learns from demonstrations.
         is_online: it takes steps in the env.
+        has_layer_norm: its critics have LayerNorm (`rlpd`).
         policy: the registered policy that its actor becomes.
     """
 
@@ -56,6 +57,7 @@ class Algorithm:
     defaults: Mapping[str, JSON] = field(default_factory=dict)
     needs_demos: bool = False
     is_online: bool = True
+    has_layer_norm: bool = False
     policy: str = "actor"
 
     @property
@@ -146,6 +148,7 @@ ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType(
             (*OFF_POLICY, "demo_share"),
             {"demo_share": 0.5, "hidden": [256, 256]},
             needs_demos=True,
+            has_layer_norm=True,
         ),
         "bc": _offline("BC", "Pomerleau, ALVINN, NeurIPS 1988"),
         "awac": _offline(

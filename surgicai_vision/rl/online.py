@@ -87,27 +87,17 @@ class OnlineLearner(Learner):
 
     def _model(self) -> BaseAlgorithm:
         """Return the untrained model of the request."""
-        request = self.request
-        settings = request.settings
-        algorithm = request.algorithm
+        settings = self.request.settings
+        algorithm = self.request.algorithm
         kind = KINDS[algorithm.kind]
-        has_goal = algorithm.has_hindsight
         options: dict[str, Any] = {
             "learning_rate": settings.learning_rate,
             "gamma": settings.gamma,
             "batch_size": settings.batch_size,
-            "seed": request.seed,
+            "seed": self.request.seed,
             "device": "cpu",
         }
-        network: dict[str, Any] = {
-            "activation_fn": nn.ReLU,
-            "features_extractor_class": RelativeExtractor if has_goal else StandardExtractor,
-            "features_extractor_kwargs": {
-                "mean": self.mean.tolist(),
-                "std": self.std.tolist(),
-                **({"task": request.env.task, "memo": FeatureMemo()} if has_goal else {}),
-            },
-        }
+        network = self._network()
         hidden = list(settings.hidden)
         if kind is PPO:
             network["net_arch"] = {"pi": hidden, "vf": hidden}
@@ -115,34 +105,61 @@ class OnlineLearner(Learner):
             return PPO("MlpPolicy", self.env, policy_kwargs=network, **options)
         network["net_arch"] = {"pi": hidden, "qf": hidden}
         network["n_critics"] = settings.critics
-        options |= {
+        options |= self._replay() | self._exploration()
+        if algorithm.is_cloning:
+            kind = DemonstrationTD3
+            for name in ("bc_weight", "q_filter", "normalise_q", "clip_q"):
+                options[name] = getattr(settings, name)
+        policy: Any = "MultiInputPolicy" if algorithm.has_hindsight else "MlpPolicy"
+        if algorithm.has_layer_norm:
+            policy = LayerNormPolicy
+        return kind(policy, self.env, policy_kwargs=network, **options)
+
+    def _network(self) -> dict[str, Any]:
+        """Return how the networks see an observation."""
+        inputs: dict[str, Any] = {"mean": self.mean.tolist(), "std": self.std.tolist()}
+        has_goal = self.request.algorithm.has_hindsight
+        if has_goal:
+            inputs |= {"task": self.request.env.task, "memo": FeatureMemo()}
+        return {
+            "activation_fn": nn.ReLU,
+            "features_extractor_class": RelativeExtractor if has_goal else StandardExtractor,
+            "features_extractor_kwargs": inputs,
+        }
+
+    def _replay(self) -> dict[str, Any]:
+        """Return what is replayed, and how often it is learned from."""
+        request = self.request
+        settings = request.settings
+        options: dict[str, Any] = {
             "tau": settings.tau,
             "buffer_size": request.env_steps + settings.envs,
             "train_freq": settings.train_every,
             "gradient_steps": settings.updates * settings.envs,
             "learning_starts": self._learning_starts(),
-            "replay_buffer_class": HindsightBuffer if has_goal else MixedBuffer,
+            "replay_buffer_class": MixedBuffer,
         }
-        if has_goal:
+        if request.algorithm.has_hindsight:
+            options["replay_buffer_class"] = HindsightBuffer
             options["replay_buffer_kwargs"] = {
                 "keeps_demand": request.keeps_demand,
                 "n_sampled_goal": settings.goals,
             }
-        if "exploration_noise" in algorithm.settings:
+        return options
+
+    def _exploration(self) -> dict[str, Any]:
+        """Return the noise of actions, and that of the targets of twin critics."""
+        settings = self.request.settings
+        read = self.request.algorithm.settings
+        options: dict[str, Any] = {}
+        if "exploration_noise" in read:
             spread = settings.exploration_noise * np.ones(7)
             options["action_noise"] = NormalActionNoise(np.zeros(7), spread)
-        if "policy_delay" in algorithm.settings:
+        if "policy_delay" in read:
             options["policy_delay"] = settings.policy_delay
             options["target_policy_noise"] = settings.target_noise
             options["target_noise_clip"] = settings.target_noise_clip
-        if algorithm.is_cloning:
-            kind = DemonstrationTD3
-            for name in ("bc_weight", "q_filter", "normalise_q", "clip_q"):
-                options[name] = getattr(settings, name)
-        policy: Any = "MultiInputPolicy" if has_goal else "MlpPolicy"
-        if request.algo == "rlpd":
-            policy = LayerNormPolicy
-        return kind(policy, self.env, policy_kwargs=network, **options)
+        return options
 
     def _learning_starts(self) -> int:
         """Return the steps of random actions: hindsight needs an episode that has ended."""
