@@ -2,7 +2,7 @@
 
 Light to import, for the command line. What a library lacks is a small class beside this file:
 `nair.DemonstrationTD3` (behaviour cloning with a Q-filter), `buffers.HindsightBuffer` (relabelled
-success ends an episode), `rlpd.LayerNormPolicy`.
+success ends an episode), `rlpd.LayerNormPolicy`, `awac.PlainAWAC` (no entropy in its target).
 """
 
 from collections.abc import Mapping

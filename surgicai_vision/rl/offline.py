@@ -17,6 +17,7 @@ from torch import nn
 
 from policies.actor import FLEXIBILITY, Actor, BatchConstrained
 from policies.base import Policy
+from surgicai_vision.rl.awac import PlainAWAC
 from surgicai_vision.rl.learner import (
     Learner,
     State,
@@ -48,11 +49,12 @@ def _bc(settings: Settings) -> Any:
         batch_size=settings.batch_size,
         gamma=settings.gamma,
         encoder_factory=VectorEncoderFactory(list(settings.hidden)),
-    )
+    ).create()
 
 
 def _awac(settings: Settings) -> Any:
-    return AWACConfig(n_critics=settings.critics, **_actor_critic(settings))
+    config = AWACConfig(n_critics=settings.critics, **_actor_critic(settings))
+    return PlainAWAC(config, device=False, enable_ddp=False)
 
 
 def _bcq(settings: Settings) -> Any:
@@ -64,26 +66,26 @@ def _bcq(settings: Settings) -> Any:
         n_action_samples=settings.samples,
         action_flexibility=FLEXIBILITY,
         **_actor_critic(settings),
-    )
+    ).create()
 
 
 def _iql(settings: Settings) -> Any:
     encoder = VectorEncoderFactory(list(settings.hidden))
     return IQLConfig(
         n_critics=settings.critics, value_encoder_factory=encoder, **_actor_critic(settings)
-    )
+    ).create()
 
 
 def _cal_ql(settings: Settings) -> Any:
     return CalQLConfig(
         n_critics=settings.critics, n_action_samples=settings.samples, **_actor_critic(settings)
-    )
+    ).create()
 
 
-CONFIGS: Mapping[str, Callable[[Settings], Any]] = MappingProxyType(
+UNTRAINED: Mapping[str, Callable[[Settings], Any]] = MappingProxyType(
     {"BC": _bc, "AWAC": _awac, "BCQ": _bcq, "IQL": _iql, "CalQL": _cal_ql}
 )
-"""`Algorithm.kind` → its configuration."""
+"""`Algorithm.kind` → the library's algorithm with settings, on the CPU."""
 
 
 @final
@@ -117,7 +119,7 @@ class OfflineLearner(Learner):
             rewards=transitions.reward,
             terminals=transitions.terminated.astype(np.float32),
         )
-        self._algo = CONFIGS[request.algorithm.kind](request.settings).create(device=False)
+        self._algo = UNTRAINED[request.algorithm.kind](request.settings)
         self._algo.create_impl((rows.shape[1],), transitions.action.shape[1])
 
     @property

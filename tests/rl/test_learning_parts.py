@@ -5,6 +5,9 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from d3rlpy.algos import AWAC, AWACConfig
+from d3rlpy.dataset import MDPDataset
+from d3rlpy.torch_utility import TorchMiniBatch
 from stable_baselines3 import SAC, TD3
 
 from surgicai_vision import envs
@@ -13,6 +16,7 @@ from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.demos.store import list_demos
 from surgicai_vision.rl import extractor as extractors
 from surgicai_vision.rl import train as training
+from surgicai_vision.rl.awac import PlainAWAC
 from surgicai_vision.rl.buffers import DEMAND, HindsightBuffer, MixedBuffer, demonstrations_of
 from surgicai_vision.rl.export import fill
 from surgicai_vision.rl.extractor import FeatureMemo, RelativeExtractor
@@ -255,3 +259,25 @@ def test_the_critics_of_rlpd_have_layer_norm_and_its_actor_has_none():
     seen = torch.zeros((1, 24))
     values = [model.critic.q1_forward(seen, torch.full((1, 7), s)).item() for s in (1e3, 1e6)]
     assert values[0] == pytest.approx(values[1], rel=1e-2)
+
+
+def test_the_target_of_awac_holds_no_entropy():
+    rng = np.random.default_rng(0)
+    rows = {
+        "observations": rng.normal(size=(20, 24)).astype(np.float32),
+        "actions": rng.uniform(-1, 1, (20, 7)).astype(np.float32),
+        "rewards": -np.ones(20, np.float32),
+        "terminals": (np.arange(20) == 19).astype(np.float32),
+    }
+    batch = TorchMiniBatch.from_batch(
+        MDPDataset(**rows).sample_transition_batch(8), 0.99, False, "cpu"
+    )
+    targets = {}
+    for kind in (AWAC, PlainAWAC):
+        algo = kind(AWACConfig(), device=False, enable_ddp=False)
+        algo.create_impl((24,), 7)
+        for parameter in algo.impl.modules.targ_q_funcs.parameters():
+            parameter.data.zero_()
+        targets[kind] = algo.impl.compute_target(batch)
+    assert torch.equal(targets[PlainAWAC], torch.zeros(8, 1)), "critics that value nothing"
+    assert (targets[AWAC].abs() > 1e-3).all(), "the library is mended; leave `PlainAWAC` out"
