@@ -1,5 +1,6 @@
 """The key of an experiment: what was evaluated, but for the training seed."""
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -190,14 +191,15 @@ def _worlds(run: RunConfig) -> dict[str, str]:
     }
 
 
-type Order = tuple[int, bool, bool, str, int, list[int], str, int, str, float, str, bool]
+type Text = tuple[tuple[str, float], ...]
+type Order = tuple[int, bool, bool, Text, int, list[int], Text, int, str, float, str, bool]
 
 
 def order(condition: Condition) -> Order:
     """Return the place of a condition in tables.
 
     By task; in it trained policies first, by encoder, views and what else they are, then the
-    references.
+    references. Numbers in names are ordered by what they are worth: 3 minutes before 10.
     """
     known = view_names()
     views = [known.index(view) if view in known else len(known) for view in condition.views]
@@ -207,13 +209,19 @@ def order(condition: Condition) -> Order:
         task,
         not condition.trained,
         not views,
-        condition.encoder,
+        _by_number(condition.encoder),
         len(views),
         views,
-        condition.variant,
+        _by_number(condition.variant),
         condition.demonstrations or 0,
         condition.axis,
         condition.strength,
         condition.expert_swap,
         condition.upset,
     )
+
+
+def _by_number(text: str) -> Text:
+    """Return a text's pieces, each as what stands before a number, and the number."""
+    pieces = re.findall(r"(\D*)(\d+(?:\.\d+)?|$)", text)
+    return tuple((before, float(number or 0)) for before, number in pieces)

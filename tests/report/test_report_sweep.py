@@ -46,7 +46,7 @@ from surgicai_vision.report import (
     paper_comparison,
     tables,
 )
-from surgicai_vision.report.experiment_key import Condition
+from surgicai_vision.report.experiment_key import Condition, order
 from surgicai_vision.report.failures import failure_sheet
 from surgicai_vision.report.groups import best_trained, group, of_task
 from surgicai_vision.report.pairs import compare, factor
@@ -387,6 +387,18 @@ def test_policies_of_different_kinds_are_compared_with_the_recipe_of_each():
     assert factor(act, replace(vqbet, demonstrations=100)) == "", "other demonstrations"
     assert factor(act, replace(act, changes=("minutes=30",))) == "change"
     assert act.policy == "imagenet-lite-early · act · spatial · minutes=30 + clock=true"
+
+
+def test_numbers_in_what_was_changed_are_ordered_by_their_worth():
+    one = Condition("grasp", "imagenet-lite-early", ("front_psm2",), recipe="act")
+    budgets = [replace(one, changes=(f"minutes={minutes}",)) for minutes in (10, 2.5, 30, 3)]
+    assert [condition.minutes for condition in sorted(budgets, key=order)] == [2.5, 3, 10, 30]
+    early = [replace(one, encoder=f"vit-{size}") for size in (14, 8)]
+    assert [item.encoder for item in sorted([one, *early], key=order)] == [
+        "imagenet-lite-early",
+        "vit-8",
+        "vit-14",
+    ]
 
 
 def test_a_map_says_once_what_all_its_policies_share(groups):
