@@ -24,6 +24,7 @@ from surgicai_vision.commands.options import (
     within,
 )
 from surgicai_vision.core import names
+from surgicai_vision.core.banks import HELD_OUT, VALIDATION, bank_of
 from surgicai_vision.core.config import JSON, TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.features.encoders import WeightsSource
@@ -140,9 +141,14 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     with console.stage(f"evaluating {spec.name} on {spec.config.task}", "steps") as progress:
         result = evaluate_into(out, spec, seeds, options.workers, progress, filming)
     console.say(summary_line(result))
+    say_starts(seeds, console)
     say_world(spec.config, console)
     console.say(f"episodes: {out}")
-    result |= {"randomisation": varied(spec.config), "out": str(out)}
+    result |= {
+        "starts": bank_of(seeds[0]),
+        "randomisation": varied(spec.config),
+        "out": str(out),
+    }
     if filming is None:
         return result
     videos = [str(filming.folder / name) for name in filming.videos()]
@@ -153,6 +159,18 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
 def varied(config: TaskConfig) -> dict[str, object]:
     """Return the axes along which the world varies from episode to episode, with their values."""
     return {axis: vars(config.randomisation)[axis] for axis in config.randomisation.on}
+
+
+def say_starts(seeds: range, console: Console) -> None:
+    """Print what the starts are, where they are not held out: such a count is no result."""
+    bank = bank_of(seeds[0])
+    if bank == HELD_OUT:
+        return
+    use = "choices are made on them" if bank == VALIDATION else "demonstrations begin from them"
+    console.say(
+        f"starts: {seeds[0]}–{seeds[-1]} are {bank} starts ({use}); held-out ones, for results, "
+        f"begin at {names.TEST_SEED}"
+    )
 
 
 def say_world(config: TaskConfig, console: Console) -> None:
@@ -235,9 +253,16 @@ def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:
         console.say(
             f"{who:<18} " + ", ".join(f"{row['subtask']} {row['k']}/{row['n']}" for row in mine)
         )
+    say_starts(seeds, console)
     say_world(plain.config, console)
     console.say(f"expert swaps: {out / CURVES}")
-    return {"policy": plain.name, "task": plain.config.task, "expert_swap": rows, "out": str(out)}
+    return {
+        "policy": plain.name,
+        "task": plain.config.task,
+        "starts": bank_of(seeds[0]),
+        "expert_swap": rows,
+        "out": str(out),
+    }
 
 
 def summary_line(result: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.evaluate import open_given, say_world
+from surgicai_vision.commands.evaluate import open_given, say_starts, say_world
 from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
@@ -25,6 +25,7 @@ from surgicai_vision.commands.options import (
     default_text,
 )
 from surgicai_vision.core import names
+from surgicai_vision.core.banks import bank_of
 from surgicai_vision.evaluation.robustness import AXES, CURVES, MARK, STRENGTHS
 from surgicai_vision.features.encoders import WeightsSource
 
@@ -97,9 +98,16 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     )
     for axis in dict.fromkeys(row["axis"] for row in rows):
         console.say(curve_line([row for row in rows if row["axis"] == axis]))
+    say_starts(seeds, console)
     say_world(spec.config, console)
     console.say(f"curves: {out / CURVES}")
-    return {"policy": spec.name, "task": spec.config.task, "curves": rows, "out": str(out)}
+    return {
+        "policy": spec.name,
+        "task": spec.config.task,
+        "starts": bank_of(seeds[0]),
+        "curves": rows,
+        "out": str(out),
+    }
 
 
 def curve_line(rows: list[dict[str, Any]]) -> str:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surgicai_vision.core import names
+from surgicai_vision.core.banks import check_training_starts
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, check_name
 from surgicai_vision.core.executor import Job, RunContext, building, job, run, work_folder
@@ -139,7 +140,7 @@ def record(
         episodes: how many to keep.
         out: folder to make; the same request continues it or finds it finished.
         demonstrator: a key of `DEMONSTRATORS`.
-        seed: first seed; the following ones are taken in order.
+        seed: first seed; the following ones are taken in order, training starts all of them.
         disturbance: noise, perturbed starts and upsets.
         post_success_steps: control steps recorded after an episode's success.
         demos: files of the demonstrations that a demonstrator in `LEARNING_DEMONSTRATORS` learns
@@ -150,7 +151,8 @@ def record(
         context: workers, engine and display.
 
     Raises:
-        InputError: fewer than one episode, a negative seed or post_success_steps, an unknown
+        InputError: fewer than one episode, a negative seed or post_success_steps, starts that
+            are kept for validation or tests, an unknown
             demonstrator, demonstrations for a demonstrator that learns from none, or none for one
             that does, a source for one that chooses none; upsets in a task that has none.
         OutputExists: `out` holds something else.
@@ -162,6 +164,7 @@ def record(
             f"episodes is {episodes}, seed {seed}, post_success_steps {post_success_steps}; "
             "they must be at least 1, 0 and 0."
         )
+    check_training_starts(seed, episodes)
     _check_demos(demonstrator, demos, source)
     check_late(demonstrator, disturbance)
     if disturbance.upset_fraction:
@@ -282,7 +285,8 @@ def _run_seeds(
         inputs = (*inputs, learner.digest)
     # The next seeds, without those of the demonstrations that are learned from.
     known = {read_demo(path).seed for path in demos}
-    seeds = (seed for seed in itertools.count(request["seed"]) if seed not in known)
+    bank = range(request["seed"], names.VALIDATION_SEED)
+    seeds = (seed for seed in bank if seed not in known)
     while len(kept) < wanted:
         if len(kept) + len(skipped) >= MAX_FAILURES * wanted + 5:
             reasons = "; ".join(f"seed {row['seed']}: {row['reason']}" for row in skipped[:3])
@@ -301,6 +305,11 @@ def _run_seeds(
             )
             for seed in itertools.islice(seeds, wanted - len(kept))
         ]
+        if not jobs:
+            raise SurgicaiError(
+                f"The training starts end at {names.VALIDATION_SEED - 1}, and "
+                f"{len(kept)} of {wanted} demonstrations succeeded; give a smaller --seed."
+            )
         report = functools.partial(_report_all, progress, len(kept), wanted)
         for folder in run_jobs(jobs, progress=report):
             result = read_json(folder / "result.json")

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from surgicai_vision.core import names
+from surgicai_vision.core.banks import BANKS
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.evaluation.robustness.axes import AXES
 from surgicai_vision.experiments.dataset_config import (
@@ -14,7 +15,6 @@ from surgicai_vision.experiments.dataset_config import (
 )
 from surgicai_vision.experiments.plan_parts import HLP, PARTS, Condition, PlannedPolicy
 from surgicai_vision.features import encoders
-from surgicai_vision.training.run_config import BANKS
 
 if TYPE_CHECKING:
     from surgicai_vision.experiments.plan_config import Plan

@@ -52,6 +52,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from surgicai_vision.core import names
+from surgicai_vision.core.banks import BANKS
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import (
     JSON,
@@ -79,7 +80,6 @@ from surgicai_vision.experiments.plan_parts import (
 )
 from surgicai_vision.experiments.sweep.experiment import Evaluated, Training
 from surgicai_vision.training.run_config import (
-    BANKS,
     OWN,
     RunConfig,
     Starts,

@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from surgicai_vision.core.banks import HELD_OUT
 from surgicai_vision.core.cameras import view_names
 from surgicai_vision.core.config import read_changes, world_text
 from surgicai_vision.core.tasks import task_names
@@ -42,6 +43,7 @@ class Condition:
         upset: whether one thing went wrong in every episode.
         name: name of the condition of a plan, or "".
         trained: whether a policy was trained.
+        starts: what the starts are to a policy (`core.banks`).
         place: where it stands, if another evaluation of the same condition and training seed stands
             elsewhere.
     """
@@ -67,6 +69,7 @@ class Condition:
     upset: bool = False
     name: str = ""
     trained: bool = True
+    starts: str = HELD_OUT
     place: str = ""
 
     @property
@@ -89,9 +92,15 @@ class Condition:
             f"demonstrated in {self.recorded_in}" if self.recorded_in else "",
             f"in {self.world}" if self.world and not self.name else "",
             self.name,
+            "" if self.is_held_out else f"{self.starts} starts",
             self.place,
         )
         return tuple(part for part in parts if part)
+
+    @property
+    def is_held_out(self) -> bool:
+        """Whether it was counted on starts that nothing of the policy has met."""
+        return self.starts == HELD_OUT
 
     @property
     def variant(self) -> str:
@@ -173,6 +182,7 @@ def condition_of(run: RunConfig, place: str = "") -> Condition:
         upset=run.upset,
         name=run.condition,
         trained=run.is_trained,
+        starts=run.starts.bank if run.starts else HELD_OUT,
         place=place,
     )
 

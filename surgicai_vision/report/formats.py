@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 
 from surgicai_vision.report import paper, text
-from surgicai_vision.report.groups import Group
+from surgicai_vision.report.groups import Group, starts_of
 from surgicai_vision.report.paper_comparison import beside_paper, our_text, paper_text
 
 HEAD = (
@@ -58,7 +58,7 @@ def markdown(groups: Sequence[Group], title: str) -> str:
             [(task, encoder, *_paired(task, encoder, pairs)) for task, encoder, pairs in rows],
         )
     parts += [
-        f"Success from held-out starts. {CAPTION}",
+        f"Success from {starts_of(groups)}. {CAPTION}",
         "",
         *_markdown(HEAD, [_record(item) for item in groups]),
     ]

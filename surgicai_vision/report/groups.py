@@ -189,10 +189,18 @@ def best_trained(groups: Sequence[Group]) -> Group | None:
 
 
 def as_trained(groups: Sequence[Group]) -> list[Group]:
-    """Return the evaluations without a shift.
+    """Return the evaluations without a shift, on held-out starts.
 
-    Where there are none, those at strength 0, else all.
+    Where there are none without a shift, those at strength 0, else all; where there are none on
+    held-out starts, those on others.
     """
     evaluated = [item for item in groups if item.episodes]
+    evaluated = [item for item in evaluated if item.condition.is_held_out] or evaluated
     plain = [item for item in evaluated if item.condition.plain]
     return plain or [item for item in evaluated if not item.condition.strength] or evaluated
+
+
+def starts_of(groups: Sequence[Group]) -> str:
+    """Say what the starts are: "held-out starts", or "starts" where they are of several banks."""
+    banks = {item.condition.starts for item in groups}
+    return f"{banks.pop()} starts" if len(banks) == 1 else "starts"

@@ -11,7 +11,13 @@ from surgicai_vision.core.tasks import task_names
 from surgicai_vision.report import charts, curves, paper, sections, text
 from surgicai_vision.report.episodes import group_details, letters
 from surgicai_vision.report.filmstrips import Reel
-from surgicai_vision.report.groups import Group, as_trained, best_trained, of_task
+from surgicai_vision.report.groups import (
+    Group,
+    as_trained,
+    best_trained,
+    of_task,
+    starts_of,
+)
 from surgicai_vision.report.high_level import high_level_policies
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.probes import probes
@@ -46,6 +52,7 @@ def numbers(
     best = {task: best_trained(of_task(groups, task)) for task in task_names()}
     return {
         **(_told(collected) or headline(groups)),
+        "starts": starts_of(groups),
         "counts": _counts(collected),
         "paper": sections.paper_rows(groups, index),
         "paper_source": paper.SOURCE,
@@ -105,10 +112,11 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
     shown = best_trained(evaluated) or evaluated[0]
     task = shown.condition.task
     label = shown.label
-    count = f"{shown.successes} of {shown.episodes} held-out starts of {task}"
+    starts = f"{shown.condition.starts} starts of {task}"
+    count = f"{shown.successes} of {shown.episodes} {starts}"
     sentence = f"{label} solves {count}"
     if shown.condition.trained and not shown.successes:
-        sentence = f"No trained policy solves any of {shown.episodes} held-out starts of {task}"
+        sentence = f"No trained policy solves any of {shown.episodes} {starts}"
     first = f"{text.percent(shown.rate)}, 95 % interval {text.interval(shown.interval)}."
     lead = (
         f"That is {first}"
@@ -138,7 +146,8 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
     if not any(item.successes for item in best):
         episodes = sum(item.episodes for item in evaluated if item.condition.trained)
         sentence = (
-            f"No trained policy solves any held-out start of {text.plural(len(best), 'task')}"
+            f"No trained policy solves any of its {starts_of(best)} of"
+            f" {text.plural(len(best), 'task')}"
         )
         return {
             "headline": sentence,
@@ -157,8 +166,8 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
     )
     return {
         "headline": (
-            f"The best trained policy of each of {len(best)} tasks solves {span} of its held-out"
-            " starts"
+            f"The best trained policy of each of {len(best)} tasks solves {span} of its"
+            f" {starts_of(best)}"
         ),
         "lead": f"{'; '.join(parts)}. {warning}",
     }

@@ -1,14 +1,24 @@
 """Origin: with what, where and by which commands the numbers were made."""
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
+from surgicai_vision.core.banks import HELD_OUT, TRAINING, VALIDATION, bank_of
 from surgicai_vision.report import text
 from surgicai_vision.report.groups import Group
 from surgicai_vision.report.reader import Collected, Result
 from surgicai_vision.report.tables import evaluate_command
 
+USES: Mapping[str, str] = MappingProxyType(
+    {
+        HELD_OUT: "the bank for tests: no training uses it",
+        VALIDATION: "the bank for validation: choices are made on it",
+        TRAINING: "the bank for training: demonstrations begin from it",
+    }
+)
+"""What each bank of starts is for."""
 FLOW = ("demos", "dataset", "features", "policy", "evaluation", "report")
 
 
@@ -75,13 +85,13 @@ def _hash(value: object) -> str:
 
 
 def _starts(results: Sequence[Result]) -> str:
-    """Return the range of start seeds, and how many of them."""
-    seeds = sorted({row["seed"] for result in results for row in result.rows})
-    if not seeds:
-        return ""
-    return (
-        f"{seeds[0]}–{seeds[-1]} ({text.plural(len(seeds), 'start')}), the bank for tests: no"
-        " training uses it"
+    """Return the range of start seeds of each bank, how many of them, and what the bank is for."""
+    found: dict[str, list[int]] = {}
+    for seed in sorted({row["seed"] for result in results for row in result.rows}, reverse=True):
+        found.setdefault(bank_of(seed), []).insert(0, seed)
+    return "; ".join(
+        f"{seeds[0]}–{seeds[-1]} ({text.plural(len(seeds), 'start')}), {USES[bank]}"
+        for bank, seeds in found.items()
     )
 
 

@@ -13,6 +13,8 @@ from typing import Any
 
 from filelock import Timeout
 
+from surgicai_vision.core import names
+from surgicai_vision.core.banks import check_training_starts
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import BadFile, OutputExists, SurgicaiError
 from surgicai_vision.core.files import TEMPORARY, check_output, locked
@@ -92,10 +94,12 @@ def open_recordings(
         seed: first seed of a new folder, 0 by default; an existing one is continued.
 
     Raises:
+        InputError: the start is kept for validation or tests.
         OutputExists: the folder holds something else.
         SurgicaiError: another session has it open.
         BadFile: damaged episodes or marker.
     """
+    check_training_starts(seed or names.TRAIN_SEED, 1)
     check_output(folder, may_resume=MARKER)
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
@@ -120,7 +124,7 @@ def _read(folder: Path, config: TaskConfig, scene_hash: str, seed: int | None) -
         "task": to_mapping(config),
         "demonstrator": DEMONSTRATOR,
         "scene": scene_hash,
-        "seed": seed or 0,
+        "seed": seed or names.TRAIN_SEED,
     }
     if not (folder / MARKER).exists() and not any(folder.glob("episode_*")):
         return Recordings(folder, request, [], [])

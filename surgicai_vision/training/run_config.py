@@ -7,12 +7,11 @@ Light to import, for the command line.
 """
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 
 from surgicai_vision.core import names
+from surgicai_vision.core.banks import bank_of
 from surgicai_vision.core.cameras import check_view
 from surgicai_vision.core.config import JSON, LATER, TaskConfig, read_changes
 from surgicai_vision.core.errors import InputError, check_name
@@ -33,11 +32,6 @@ BUDGET = "minutes"
 ACTED_BY = ("execute", "samples", "ensemble")
 """Settings of such a recipe by which chunks are acted; what is learned does not depend on them."""
 
-BANKS: Mapping[str, int] = MappingProxyType(
-    {"test": names.TEST_SEED, "validation": names.VALIDATION_SEED}
-)
-"""Bank of start states → its first seed; choices are made on validation, and reported on test."""
-
 
 @dataclass(frozen=True)
 class Starts:
@@ -55,6 +49,11 @@ class Starts:
     def seeds(self) -> range:
         """The seed of each start."""
         return range(self.first_seed, self.first_seed + self.episodes)
+
+    @property
+    def bank(self) -> str:
+        """What they are to a policy (`bank_of`); across banks, what the least independent is."""
+        return bank_of(self.first_seed)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import pytest
 from fake_env import FakeEnv, FakeExpert
 from shown import showing
 
+from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
 from surgicai_vision.core.executor import RunContext
@@ -298,3 +299,17 @@ def test_record_refuses_senseless_numbers(tmp_path, episodes, seed):
         InputError, match=f"episodes is {episodes}, seed {seed}, post_success_steps 0"
     ):
         record(CONFIG, episodes=episodes, seed=seed, out=tmp_path / "demos")
+
+
+def test_record_keeps_away_from_starts_that_are_counted_on(tmp_path, fake, monkeypatch):
+    out = tmp_path / "demos"
+    for seed in (names.VALIDATION_SEED, names.TEST_SEED + 7):
+        with pytest.raises(InputError, match=f"seed {seed} on.*give a smaller --seed"):
+            record(CONFIG, episodes=1, seed=seed, out=out)
+    assert not list(tmp_path.iterdir())
+    last = names.VALIDATION_SEED - 1
+    (path,) = record(CONFIG, episodes=1, seed=last, out=out, context=RunContext(0))
+    assert read_demo(path).seed == last
+    monkeypatch.setattr(FakeExpert, "action", lambda self: np.zeros(7, np.float32))
+    with pytest.raises(SurgicaiError, match=f"starts end at {last}, and 0 of 1"):
+        record(CONFIG, episodes=1, seed=last, out=tmp_path / "failed", context=RunContext(0))

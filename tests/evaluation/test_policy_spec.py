@@ -67,6 +67,19 @@ def test_evaluate_says_in_which_world_it_counts(tmp_path, monkeypatch, capsys):
         assert any("world: varies" in line for line in lines) == bool(expected)
 
 
+def test_evaluate_says_which_starts_are_no_result(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    checkpoint(Path("made"), "grasp", env=TaskConfig("grasp", max_steps=2))
+    command = ["evaluate", "made", "--episodes", "1", "--workers", "1", "--json", "--seed"]
+    for seed, bank in ((7, "training"), (500_000, "validation"), (900_000, "held-out")):
+        assert main([*command, str(seed)]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert json.loads(lines[-1])["starts"] == bank
+        told = [line for line in lines if line.startswith("starts:")]
+        assert bool(told) == (bank != "held-out")
+        assert all(f"{seed}–{seed} are {bank} starts" in line for line in told)
+
+
 def test_a_factory_elsewhere_makes_the_agent(tmp_path: Path) -> None:
     spec = open_policy(f"{__name__}:Still", env={"max_steps": 2})
     assert spec.run.views == ("back",) and spec.run.is_trained

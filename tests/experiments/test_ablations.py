@@ -9,6 +9,7 @@ import pytest
 
 from surgicai_vision.commands.sweep import read_grid
 from surgicai_vision.core import names
+from surgicai_vision.core.banks import BANKS
 from surgicai_vision.core.config import RandomisationConfig, read_changes
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import RunContext
@@ -17,7 +18,7 @@ from surgicai_vision.experiments.sweep.grid import Ablation, Grid
 from surgicai_vision.experiments.sweep.plan import Jobs, plan, run_key
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import read_checkpoint
-from surgicai_vision.training.run_config import BANKS, RunConfig, with_epochs
+from surgicai_vision.training.run_config import RunConfig, with_epochs
 
 BASE = """
 task: grasp

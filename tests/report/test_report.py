@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+import shutil
 from html.parser import HTMLParser
 
 import numpy as np
@@ -21,7 +22,7 @@ from surgicai_vision.evaluation.storage import (
     read_rows,
     write_evaluation,
 )
-from surgicai_vision.training.run_config import RunConfig
+from surgicai_vision.training.run_config import RunConfig, Starts
 
 LIMIT = 3_000_000
 MACHINE = {
@@ -54,20 +55,22 @@ def episode(policy, seed, success):
     return Episode(row, Film(kept, np.stack([kept, np.full(9, seed)], axis=1).astype(np.float64)))
 
 
-def store(folder, name, successes, views=None):
-    """Store an evaluation of 20 episodes."""
-    episodes = [episode(name, names.TEST_SEED + i, i < successes) for i in range(20)]
+def store(folder, name, successes, views=None, first=names.TEST_SEED):
+    """Store an evaluation of 20 episodes, the first from the start `first`."""
+    episodes = [episode(name, first + i, i < successes) for i in range(20)]
     about = {"command": "surgicai-vision evaluate", "provenance": {}}
     encoder = name.rsplit("-", 1)[0] if views else None
     policy = name if name in report.REFERENCES else "bc"
-    run = RunConfig(TaskConfig("grasp"), encoder, tuple(views or ()), policy=policy)
+    seen = tuple(views or ())
+    run = RunConfig(TaskConfig("grasp"), encoder, seen, policy=policy, starts=Starts(first, 20))
     if run.is_trained:
         checkpoint = {
             "weights_sha256": "0123456789abcdef" * 4,
             "dataset": "fedcba9876543210" * 4,
         }
         about |= {"checkpoint": checkpoint, "folder": "policies/x"}
-    return write_evaluation(folder / "evaluations" / name, episodes, run, about)
+    place = name if first == names.TEST_SEED else f"{name}-{first}"
+    return write_evaluation(folder / "evaluations" / place, episodes, run, about)
 
 
 @pytest.fixture
@@ -190,6 +193,20 @@ def test_without_a_success_or_a_failure_the_page_says_so(tmp_path, painted):
     assert "zero solves 0 of 20 held-out starts" in text
     store(tmp_path, "zero", 20)
     assert "No episode of any policy was a failure." in report.write_report(tmp_path).read_text()
+
+
+def test_what_was_counted_on_other_starts_is_no_result(tmp_path, painted):
+    store(tmp_path, "imagenet-lite-front", 9, ["front"])
+    store(tmp_path, "imagenet-lite-front", 20, ["front"], names.VALIDATION_SEED)
+    text = report.write_report(tmp_path).read_text()
+    assert "imagenet-lite on front solves 9 of 20 held-out starts of grasp" in text
+    assert "imagenet-lite · validation starts" in text and "Success from starts<" in text
+    assert "900000–900019 (20 starts), the bank for tests: no training uses it" in text
+    assert "500000–500019 (20 starts), the bank for validation: choices are made on it" in text
+    shutil.rmtree(tmp_path / "evaluations/imagenet-lite-front")
+    text = report.write_report(tmp_path).read_text()
+    assert "solves 20 of 20 validation starts of grasp" in text
+    assert "Success from validation starts<" in text and "held-out starts" not in text
 
 
 def test_films_are_of_a_trained_policy_where_it_has_one(results, painted):

@@ -11,8 +11,9 @@ from teleoperators import REST, SHORT, VIEWS, FakeMapping, Script, SessionEnv, e
 from told_clock import Clock
 
 from surgicai_vision.commands.main import main
+from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import BadFile, OutputExists, SurgicaiError
+from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
 from surgicai_vision.core.pacer import Pacer
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_marker
 from surgicai_vision.teleoperation.inputs import DISCARD, KEEP, START, STOP, VIEW, Input
@@ -214,6 +215,15 @@ def test_a_folder_is_one_sessions_at_a_time(open_session, tmp_path):
         open_recordings(tmp_path / "demos", SHORT, "f" * 64),
     ):
         pass
+
+
+def test_starts_that_are_counted_on_are_refused(tmp_path):
+    with (
+        pytest.raises(InputError, match=f"seed {names.TEST_SEED} on"),
+        open_recordings(tmp_path / "demos", SHORT, "f" * 64, names.TEST_SEED),
+    ):
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 def test_another_task_scene_or_seed_is_refused(tmp_path):

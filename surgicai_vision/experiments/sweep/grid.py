@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from surgicai_vision.core import names
+from surgicai_vision.core.banks import BANKS
 from surgicai_vision.core.cameras import camera_names, view_names
 from surgicai_vision.core.config import (
     JSON,
@@ -23,7 +24,6 @@ from surgicai_vision.experiments.sweep.experiment import Evaluated, Training, ch
 from surgicai_vision.features import encoders
 from surgicai_vision.training import policies
 from surgicai_vision.training.run_config import (
-    BANKS,
     LEROBOT_POLICIES,
     OWN,
     TERMINATIONS,

@@ -24,6 +24,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from surgicai_vision.core import names
+from surgicai_vision.core.banks import BANKS
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, read_changes, to_mapping
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.demos.disturbance import Disturbance
@@ -32,7 +33,7 @@ from surgicai_vision.experiments.sweep.experiment import Evaluated, Training, ch
 from surgicai_vision.rl.algorithms import ALGORITHMS
 from surgicai_vision.rl.high_level_config import DECISIONS
 from surgicai_vision.rl.settings import OBSERVATIONS, settings_of
-from surgicai_vision.training.run_config import BANKS, RunConfig, Starts
+from surgicai_vision.training.run_config import RunConfig, Starts
 
 RECIPE = "rl"
 """`RunConfig.recipe` of an actor; no file."""

@@ -1,0 +1,46 @@
+"""Banks of starts: what a start is for, by its seed.
+
+Demonstrations begin, and reinforcement learns, from training starts; choices are made on validation
+starts; results are counted on held-out ones. The banks never meet.
+
+bank_of(900_000) == HELD_OUT
+"""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
+
+BANKS: Mapping[str, int] = MappingProxyType(
+    {"test": names.TEST_SEED, "validation": names.VALIDATION_SEED}
+)
+"""Bank of an evaluation's starts, as a grid names it → its first seed."""
+
+HELD_OUT, VALIDATION, TRAINING = "held-out", "validation", "training"
+"""What a start is to a policy."""
+
+
+def bank_of(seed: int) -> str:
+    """Return what a start is to a policy: `HELD_OUT`, `VALIDATION` or `TRAINING`."""
+    if seed >= names.TEST_SEED:
+        return HELD_OUT
+    return VALIDATION if seed >= names.VALIDATION_SEED else TRAINING
+
+
+def check_training_starts(seed: int, episodes: int) -> None:
+    """Refuse to demonstrate from starts that are kept to choose by and to count on.
+
+    Args:
+        seed: of the first start.
+        episodes: starts at least, each with the next seed.
+
+    Raises:
+        InputError: a start is no training start.
+    """
+    if bank_of(seed + episodes - 1) != TRAINING:
+        raise InputError(
+            f"Demonstrations from seed {seed} on, {episodes} of them, reach into the starts that "
+            f"are kept for validation (from {names.VALIDATION_SEED} on) or for tests (from "
+            f"{names.TEST_SEED} on); give a smaller --seed."
+        )
