@@ -191,13 +191,13 @@ def best_trained(groups: Sequence[Group]) -> Group | None:
 def as_trained(groups: Sequence[Group]) -> list[Group]:
     """Return the evaluations without a shift, on held-out starts.
 
-    Where there are none without a shift, those at strength 0, else all; where there are none on
+    Where there are none without a shift, those at strength 0, else all; where none of these is on
     held-out starts, those on others.
     """
     evaluated = [item for item in groups if item.episodes]
-    evaluated = [item for item in evaluated if item.condition.is_held_out] or evaluated
     plain = [item for item in evaluated if item.condition.plain]
-    return plain or [item for item in evaluated if not item.condition.strength] or evaluated
+    shown = plain or [item for item in evaluated if not item.condition.strength] or evaluated
+    return [item for item in shown if item.condition.is_held_out] or shown
 
 
 def starts_of(groups: Sequence[Group]) -> str:

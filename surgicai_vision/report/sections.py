@@ -13,6 +13,7 @@ from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.groups import MEASURES, Group, of_task
 from surgicai_vision.report.pairs import Pair
 from surgicai_vision.report.paper_comparison import beside_paper, our_text, paper_text
+from surgicai_vision.report.reader import Result
 
 PAIRS_SHOWN = 12
 
@@ -306,10 +307,6 @@ def caption(groups: Sequence[Group]) -> str:
     results = [result for item in groups for result in item.results]
     if not results:
         return ""
-    config = results[0].config
-    first, last = (
-        pick(row["seed"] for result in results for row in result.rows) for pick in (min, max)
-    )
     meanings = {
         "missed": "never touched the needle",
         "dropped": "lost it",
@@ -319,18 +316,26 @@ def caption(groups: Sequence[Group]) -> str:
         "error": "no start or no finite action",
     }
     failures = "; ".join(f"{kind.replace('_', ' ')} = {meanings[kind]}" for kind in kinds(groups))
+    configs = [result.config for result in results]
+    limits = text.either(sorted(config.max_steps for config in configs))
+    grasps = text.either(config.scene.grasp for config in configs)
+    tolerances = text.either(config.tolerance for config in configs)
     return (
-        "Successes of n episodes with the exact (Clopper–Pearson) interval; the same starts, seeds"
-        f" {first}–{last}, for every policy. Trajectory length and time steps: mean ± standard"
-        " deviation over successful episodes"
-        + (
-            f", of at most {config.max_steps} steps. "
-            if len({r.config.max_steps for r in results}) == 1
-            else ". "
-        )
+        "Successes of n episodes with the exact (Clopper–Pearson) interval; "
+        f"{_starts(results)}. Trajectory length and time steps: mean ± standard deviation over"
+        f" successful episodes, of at most {limits} steps. "
         + (f"Failures: {failures}. " if failures else "")
-        + f"Grasp by {config.scene.grasp}, {config.tolerance} tolerances."
+        + f"Grasp by {grasps}, {tolerances} tolerances."
     )
+
+
+def _starts(results: Sequence[Result]) -> str:
+    """Say from which starts the policies were counted, and whether from the same."""
+    counted = {tuple(sorted(row["seed"] for row in result.rows)) for result in results}
+    ranges = text.either(f"{seeds[0]}–{seeds[-1]}" for seeds in sorted(counted))
+    if len(counted) == 1:
+        return f"the same starts, seeds {ranges}, for every policy"
+    return f"of each policy the starts of seeds {ranges}"
 
 
 def _short(reason: str, most: int = 160) -> str:

@@ -4,7 +4,7 @@ Percentages are whole, intervals in brackets, absent is a dash.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -20,6 +20,12 @@ def interval(bounds: Sequence[float]) -> str:
     """Return (0.4078, 0.8461) as "41–85 %"."""
     low, high = bounds
     return f"{100 * low:.0f}–{100 * high:.0f} %"
+
+
+def either(values: Iterable[object]) -> str:
+    """Return what differs among `values`, in order, as "200, 300 or 2000"."""
+    words = [str(value) for value in dict.fromkeys(values)]
+    return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def mean(value: dict[str, float | None]) -> str:
