@@ -1,5 +1,6 @@
 """Contact sheet: images of states for reports: coloured, encoded, and in a grid."""
 
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
@@ -32,6 +33,8 @@ PALETTE = np.array(
 
 BEYOND = 1.0
 """Depth [m] from which a pixel is background; the scene is 0.2 m deep."""
+LETTERS = 7.0
+"""Letters of a sheet's title for each inch of its width."""
 
 
 class Draw(Protocol):
@@ -106,13 +109,17 @@ def depth_range(frame: NDArray[np.float32]) -> tuple[float, float]:
 def sheet(
     rows: Sequence[tuple[str, Sequence[Image]]], columns: Sequence[str], title: str
 ) -> "Figure":
-    """Return a matplotlib figure: a grid of images with a name for each row and column."""
+    """Return a matplotlib figure: a grid of images with a name for each row and column.
+
+    A title that is wider than the grid goes on in further lines.
+    """
     from matplotlib.figure import Figure
 
     width = 2.1 * len(columns) + 1.0
-    height = 2.1 * len(rows) + 0.8
+    lines = textwrap.wrap(title, int(LETTERS * width))
+    height = 2.1 * len(rows) + 0.6 + 0.2 * max(len(lines), 1)
     figure = Figure(figsize=(width, height), layout="constrained")
-    figure.suptitle(title, fontsize=13, fontweight="bold")
+    figure.suptitle("\n".join(lines), fontsize=13, fontweight="bold")
     axes = figure.subplots(len(rows), len(columns), squeeze=False)
     for (name, images), line in zip(rows, axes, strict=True):
         for image, axis in zip(images, line, strict=True):
