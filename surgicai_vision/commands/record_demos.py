@@ -52,6 +52,8 @@ class Options:
         noise: Standard deviation of the noise on executed motions, in units of an action's range;
             labels stay the expert's.
         noise_from: Lowest such deviation: each episode draws its own between this and --noise.
+        jaw_noise: Standard deviation of the noise on the jaw's motion while it is not told to
+            close.
         perturb_start_fraction: Share of episodes that start with a push that is not recorded.
         upset_fraction: Share of episodes in which something goes wrong once: the needle is pushed,
             or jaws open (docs/demos.md).
@@ -75,6 +77,7 @@ class Options:
     noise_from: Annotated[
         float | None, FRACTION, Parameter(metavar="SIGMA"), default_text("--noise itself")
     ] = None
+    jaw_noise: Annotated[float, FRACTION, Parameter(metavar="SIGMA")] = 0.0
     perturb_start_fraction: Annotated[float, FRACTION] = 0.0
     upset_fraction: Annotated[float, FRACTION] = 0.0
     late: Annotated[int, NOT_NEGATIVE] = 0
@@ -119,6 +122,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             options.noise_from,
             options.upset_fraction,
             options.late,
+            options.jaw_noise,
         ),
         post_success_steps=options.post_success_steps,
         demos=demos,

@@ -69,7 +69,6 @@ DEMONSTRATORS: Mapping[str, str] = MappingProxyType(
         "expert": "surgicai_vision.demos.expert:Expert",
         "dmp": "surgicai_vision.demos.dmp.controller:DmpController",
         "search": "surgicai_vision.demos.search_expert:SearchExpert",
-        "funnel": "surgicai_vision.demos.funnel_expert:FunnelExpert",
         "recover": "surgicai_vision.demos.recovery_expert:RecoveryExpert",
         "multiply": "surgicai_vision.demos.multiply.multiplier:Multiplier",
     }

@@ -24,12 +24,16 @@ class Disturbance:
 
     Attributes:
         noise: standard deviation of the Gaussian noise on the six motions of an executed action, in
-            units of its range; the jaw has none, since a random walk of it would drop the needle.
+            units of its range; the jaw has its own.
         perturb_start_fraction: share of episodes that start with a motion in a random direction,
             which is not recorded.
         noise_from: lowest deviation; each episode draws its own between this and `noise`. None
             takes `noise` throughout.
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
+        jaw_noise: the same of the jaw's motion, while it is not told to close: a random walk of
+            closed jaws would drop the needle. Without it open jaws are always as far open as the
+            demonstrator has them, and nothing shows a policy whose jaws have closed a little how to
+            open them again (docs/results/unmoved.md).
         late: most control steps by which a demonstrator that goes back notices a loss late; each
             episode draws its own. It shows what a policy looks like that has not noticed yet.
     """
@@ -39,6 +43,7 @@ class Disturbance:
     noise_from: float | None = None
     upset_fraction: float = 0.0
     late: int = 0
+    jaw_noise: float = 0.0
 
     def __post_init__(self) -> None:
         if self.noise_from is not None and not 0.0 <= self.noise_from <= self.noise:
@@ -50,6 +55,8 @@ class Disturbance:
                 f"noise is {self.noise:g} and perturb_start_fraction "
                 f"{self.perturb_start_fraction:g}; each must be within 0 and 1."
             )
+        if not 0.0 <= self.jaw_noise <= 1.0:
+            raise InputError(f"jaw_noise is {self.jaw_noise:g}; it must be within 0 and 1.")
         if not 0.0 <= self.upset_fraction <= 1.0:
             raise InputError(
                 f"upset_fraction is {self.upset_fraction:g}; it must be within 0 and 1."
@@ -79,12 +86,19 @@ class Disturbance:
         """Return by how many control steps a loss is noticed late in an episode."""
         return int(rng.integers(0, self.late, endpoint=True)) if self.late else 0
 
-    @staticmethod
     def disturb(
-        action: NDArray[np.float32], deviation: float, rng: np.random.Generator
+        self, action: NDArray[np.float32], deviation: float, rng: np.random.Generator
     ) -> NDArray[np.float32]:
-        """Return what is executed in the place of `action`, (7,)."""
+        """Return what is executed in the place of `action`, (7,).
+
+        Args:
+            action: the demonstrator's, (7,) in [-1, 1]; at -1 the jaw closes.
+            deviation: what `draw_deviation` gave for the episode.
+            rng: the source of the noise.
+        """
         noisy = action + np.append(rng.normal(0.0, deviation, 6), 0.0)
+        if self.jaw_noise and action[6] > -1.0:
+            noisy[6] += rng.normal(0.0, self.jaw_noise)
         executed: NDArray[np.float32] = np.clip(noisy, -1.0, 1.0).astype(np.float32)
         return executed
 

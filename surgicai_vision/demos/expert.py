@@ -70,20 +70,6 @@ HANDOFF_OFFSET = math.radians(4.0)
 """The expert grasps the needle a little nearer to the tip than the goal, away from the tissue."""
 
 
-class Offset(NamedTuple):
-    """How far the tool is off a grasp.
-
-    Attributes:
-        depth: along the grasp's approach axis [m], negative before the grasp.
-        beside: beside it [m].
-        turned: angle between their poses [rad].
-    """
-
-    depth: float
-    beside: float
-    turned: float
-
-
 class ToolTarget(NamedTuple):
     """Where the active tool should be.
 
@@ -276,45 +262,23 @@ def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: flo
         back: how far before it the tool lines up [m].
         opened: jaw angle on the way [rad].
     """
-    off = offset_from(world, goal)
-    if (target := close_when_there(world, goal, off, opened)) is not None:
-        return target
-    lined_up = off.beside < 2 * ALIGNED and off.turned < 2 * ALIGNED_ANGLE
-    if lined_up and not is_closing(world, opened):
-        return ToolTarget(goal, opened)
-    retreat = min(off.depth, -back) if not lined_up and off.depth > -back else -back
-    return ToolTarget(before(goal, -retreat), opened)
-
-
-def offset_from(world: WorldState, goal: Matrix) -> Offset:
-    """Return how far the tool is off the grasp at T_world_tip `goal`."""
+    # Where the tool is relative to the grasp, along and beside the approach axis.
     axis = goal[:3, 2]
     offset = world.tip[:3, 3] - goal[:3, 3]
     depth = float(offset @ axis)
     beside = float(np.linalg.norm(offset - depth * axis))
-    return Offset(depth, beside, _angle_between(world.tip, goal))
-
-
-def is_closing(world: WorldState, opened: float) -> bool:
-    """Return True once the jaws are told to be closer than `opened` [rad] by two steps."""
-    return world.command_jaw < opened - 2 * world.step.jaw
-
-
-def close_when_there(
-    world: WorldState, goal: Matrix, off: Offset, opened: float
-) -> ToolTarget | None:
-    """Return how to close at the grasp; None where the tool is not there yet."""
-    is_near = off.beside < CLOSING and abs(off.depth) < CLOSING and off.turned < CLOSING_ANGLE
-    if is_closing(world, opened) and is_near:
+    turned = _angle_between(world.tip, goal)
+    lined_up = beside < 2 * ALIGNED and turned < 2 * ALIGNED_ANGLE
+    closing = world.command_jaw < opened - 2 * world.step.jaw
+    # Close, go in, or line up, whichever is due.
+    if closing and beside < CLOSING and abs(depth) < CLOSING and turned < CLOSING_ANGLE:
         return ToolTarget(goal if not world.holds else world.command, 0.0)
-    if off.beside < ALIGNED and abs(off.depth) < ALIGNED and off.turned < ALIGNED_ANGLE:
+    if beside < ALIGNED and abs(depth) < ALIGNED and turned < ALIGNED_ANGLE:
         return ToolTarget(goal, 0.0)
-    return None
-
-
-def before(goal: Matrix, back: float) -> Matrix:
-    """Return the pose `back` [m] before the grasp at T_world_tip `goal`, on its approach axis."""
-    return _shifted(goal, -back * goal[:3, 2])
+    if lined_up and not closing:
+        return ToolTarget(goal, opened)
+    retreat = min(depth, -back) if not lined_up and depth > -back else -back
+    return ToolTarget(_shifted(goal, retreat * axis), opened)
 
 
 def _grasp(world: WorldState) -> ToolTarget:
@@ -325,13 +289,10 @@ def _grasp(world: WorldState) -> ToolTarget:
 
 
 def _handoff(world: WorldState) -> ToolTarget:
-    return approach_and_grasp(world, handoff_goal(world), HANDOFF_BACK, OPEN_HANDOFF)
-
-
-def handoff_goal(world: WorldState) -> Matrix:
-    """Return T_world_tip of the expert's grasp in the handoff."""
-    angle = world.stitch.handoff_angle + HANDOFF_OFFSET
-    return world.needle @ grasp_in_needle(world.arm, angle, radius=world.stitch.radius)
+    goal = world.needle @ grasp_in_needle(
+        world.arm, world.stitch.handoff_angle + HANDOFF_OFFSET, radius=world.stitch.radius
+    )
+    return approach_and_grasp(world, goal, HANDOFF_BACK, OPEN_HANDOFF)
 
 
 # -- carrying the needle ---------------------------------------------------------------------------

@@ -96,6 +96,7 @@ def record_into(
     noise_from: float | None = None,
     upset_fraction: float = 0.0,
     late: int = 0,
+    jaw_noise: float = 0.0,
     post_success_steps: int = 0,
     demos: Sequence[str] = (),
     source: str = "",
@@ -107,7 +108,7 @@ def record_into(
         make_demonstrator(demonstrator, env, demos, source),
         seed,
         demonstrator,
-        Disturbance(noise, perturb_start_fraction, noise_from, upset_fraction, late),
+        Disturbance(noise, perturb_start_fraction, noise_from, upset_fraction, late, jaw_noise),
         post_success_steps,
         behaviour,
     )

@@ -155,6 +155,7 @@ def rollout(
     if not disturbance.perturb_start(env, rng):
         env.reset(seed=seed)  # the perturbation ended it; this start stays as it was
     deviation = disturbance.draw_deviation(rng)
+    is_noisy = bool(disturbance.noise or disturbance.jaw_noise)
     demonstrator.late = disturbance.draw_late(rng)
     observation = env.observe() if behaviour else None
     if behaviour:
@@ -177,7 +178,7 @@ def rollout(
         if behaviour and observation is not None:
             executed = behaviour.action(env, observation)
         if executed is None:
-            executed = disturbance.disturb(label, deviation, rng) if deviation else label
+            executed = disturbance.disturb(label, deviation, rng) if is_noisy else label
         recorder.step(upset.altered(executed), label)
         observation = recorder.observation
         steps_left -= succeeded
@@ -186,7 +187,7 @@ def rollout(
         ended = finished or recorder.truncated or not recorder.is_physical
         ended = ended or bool(demonstrator.gives_up)
 
-    with_executed = bool(disturbance.noise or behaviour or fraction)
+    with_executed = bool(is_noisy or behaviour or fraction)
     demo = recorder.demo(with_executed, demonstrator.source)
     if not recorder.is_physical:
         return Rollout(demo, False, "physics error", upset.kind)

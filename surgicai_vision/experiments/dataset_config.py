@@ -38,6 +38,7 @@ class Demonstrations:
         view: rendered views; none where no image is learned from.
         demonstrator: who demonstrates.
         noise: how much what the demonstrator executes is disturbed.
+        jaw_noise: the same of the jaw, while it is not told to close.
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
         late: most control steps by which a demonstrator that goes back notices a loss late.
         post_success_steps: control steps an episode goes on after its success.
@@ -82,6 +83,7 @@ class Demonstrations:
     of: str = field(default="", metadata=LATER)
     corruption: float = field(default=0.0, metadata=LATER)
     learner: str = field(default="", metadata=LATER)
+    jaw_noise: float = field(default=0.0, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_name("demonstrator", self.demonstrator, DEMONSTRATORS)
@@ -113,7 +115,12 @@ class Demonstrations:
     @property
     def disturbance(self) -> Disturbance:
         """What goes wrong in them."""
-        return Disturbance(self.noise, upset_fraction=self.upset_fraction, late=self.late)
+        return Disturbance(
+            self.noise,
+            upset_fraction=self.upset_fraction,
+            late=self.late,
+            jaw_noise=self.jaw_noise,
+        )
 
     @property
     def manner(self) -> str:
@@ -122,6 +129,7 @@ class Demonstrations:
         who = f"re-posed from '{self.of}'" if self.of else f"by the scripted {self.demonstrator}"
         parts = [who]
         parts += [f"executed with noise {self.noise:g}"] if self.noise else []
+        parts += [f"its open jaws with noise {self.jaw_noise:g}"] if self.jaw_noise else []
         parts += [f"upset in {self.upset_fraction:.0%}"] if self.upset_fraction else []
         parts += [f"noticed up to {self.late} steps late"] if self.late else []
         parts += [f"going on for {after} steps after their success"] if after else []
