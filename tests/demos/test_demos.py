@@ -100,6 +100,29 @@ def test_the_range_of_noise_reaches_the_recording(tmp_path):
         assert one.seed == other.seed and not np.array_equal(one.executed, other.executed)
 
 
+def test_open_jaws_have_noise_of_their_own_and_closing_ones_none(tmp_path):
+    """Of closed jaws a random walk would drop the needle."""
+    config = TaskConfig("handoff")
+    given = {"seed": 3, "out": tmp_path, "context": RunContext(0)}
+    demos = {}
+    for name, disturbance in (("calm", Disturbance(0.3)), ("loud", Disturbance(0.3, jaw_noise=1))):
+        request = {**given, "out": tmp_path / name, "disturbance": disturbance}
+        demos[name] = read_demo(record(config, episodes=1, **request)[0])
+    calm, loud = ((demo.action[:, 6], demo.executed[:, 6]) for demo in demos.values())
+    np.testing.assert_array_equal(*calm)
+    labels, executed = loud
+    closing = labels == -1.0
+    assert closing.any() and not closing.all()
+    np.testing.assert_array_equal(executed[closing], labels[closing])
+    assert 0.5 < (executed - labels)[~closing].std() <= 1.0, "clipped to the range of an action"
+    # The label takes back what the noise of the step before did: that is what it is for.
+    both = ~closing[1:] & ~closing[:-1]
+    did, answered = (executed - labels)[:-1][both], labels[1:][both]
+    assert np.corrcoef(did, answered)[0, 1] < -0.5
+    stored = [read_marker(tmp_path / name)["request"] for name in ("calm", "loud")]
+    assert "jaw_noise" not in stored[0] and stored[1]["jaw_noise"] == 1
+
+
 def test_an_episode_goes_on_after_its_success():
     env = FakeEnv(CONFIG)
     plain = rollout(env, FakeExpert(env), 3).demo
@@ -151,6 +174,8 @@ def test_a_recovery_starts_elsewhere_and_its_push_is_not_recorded():
         {"noise": -0.1},
         {"noise": float("nan")},
         {"perturb_start_fraction": 1.1},
+        {"jaw_noise": 1.1},
+        {"jaw_noise": float("nan")},
         {"noise_from": 0.1},
     ],
 )
