@@ -24,7 +24,7 @@ from surgicai_vision.commands.options import (
     within,
 )
 from surgicai_vision.core import names
-from surgicai_vision.core.banks import HELD_OUT, VALIDATION, bank_of
+from surgicai_vision.core.banks import HELD_OUT, USES, bank_of
 from surgicai_vision.core.config import JSON, TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.features.encoders import WeightsSource
@@ -141,8 +141,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     with console.stage(f"evaluating {spec.name} on {spec.config.task}", "steps") as progress:
         result = evaluate_into(out, spec, seeds, options.workers, progress, filming)
     console.say(summary_line(result))
-    say_starts(seeds, console)
-    say_world(spec.config, console)
+    say_conditions(seeds, spec.config, console)
     console.say(f"episodes: {out}")
     result |= {
         "starts": bank_of(seeds[0]),
@@ -161,20 +160,14 @@ def varied(config: TaskConfig) -> dict[str, object]:
     return {axis: vars(config.randomisation)[axis] for axis in config.randomisation.on}
 
 
-def say_starts(seeds: range, console: Console) -> None:
-    """Print what the starts are, where they are not held out: such a count is no result."""
+def say_conditions(seeds: range, config: TaskConfig, console: Console) -> None:
+    """Print what the starts are, where a count on them is no result, and how the world varies."""
     bank = bank_of(seeds[0])
-    if bank == HELD_OUT:
-        return
-    use = "choices are made on them" if bank == VALIDATION else "demonstrations begin from them"
-    console.say(
-        f"starts: {seeds[0]}–{seeds[-1]} are {bank} starts ({use}); held-out ones, for results, "
-        f"begin at {names.TEST_SEED}"
-    )
-
-
-def say_world(config: TaskConfig, console: Console) -> None:
-    """Print how the world varies, where it does."""
+    if bank != HELD_OUT:
+        console.say(
+            f"starts: {seeds[0]}–{seeds[-1]} are {bank} starts ({USES[bank]}); held-out ones, for "
+            f"results, begin at {names.TEST_SEED}"
+        )
     if config.randomisation.on:
         console.say(
             f"world: varies ({config.randomisation.text}); `env: {{randomisation: {{}}}}` in a "
@@ -253,8 +246,7 @@ def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:
         console.say(
             f"{who:<18} " + ", ".join(f"{row['subtask']} {row['k']}/{row['n']}" for row in mine)
         )
-    say_starts(seeds, console)
-    say_world(plain.config, console)
+    say_conditions(seeds, plain.config, console)
     console.say(f"expert swaps: {out / CURVES}")
     return {
         "policy": plain.name,

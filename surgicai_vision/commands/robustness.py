@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
-from surgicai_vision.commands.evaluate import open_given, say_starts, say_world
+from surgicai_vision.commands.evaluate import open_given, say_conditions
 from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
@@ -98,8 +98,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     )
     for axis in dict.fromkeys(row["axis"] for row in rows):
         console.say(curve_line([row for row in rows if row["axis"] == axis]))
-    say_starts(seeds, console)
-    say_world(spec.config, console)
+    say_conditions(seeds, spec.config, console)
     console.say(f"curves: {out / CURVES}")
     return {
         "policy": spec.name,

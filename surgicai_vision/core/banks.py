@@ -20,6 +20,15 @@ BANKS: Mapping[str, int] = MappingProxyType(
 HELD_OUT, VALIDATION, TRAINING = "held-out", "validation", "training"
 """What a start is to a policy."""
 
+USES: Mapping[str, str] = MappingProxyType(
+    {
+        HELD_OUT: "the bank for tests: no training uses it",
+        VALIDATION: "the bank for validation: choices are made on it",
+        TRAINING: "the bank for training: demonstrations begin from it",
+    }
+)
+"""What each bank is for, in words."""
+
 
 def bank_of(seed: int) -> str:
     """Return what a start is to a policy: `HELD_OUT`, `VALIDATION` or `TRAINING`."""

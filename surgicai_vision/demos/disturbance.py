@@ -30,10 +30,10 @@ class Disturbance:
         noise_from: lowest deviation; each episode draws its own between this and `noise`. None
             takes `noise` throughout.
         upset_fraction: share of episodes in which something goes wrong once (`envs.upset`).
-        jaw_noise: the same of the jaw's motion, while it is not told to close: a random walk of
-            closed jaws would drop the needle. Without it open jaws are always as far open as the
-            demonstrator has them, and nothing shows a policy whose jaws have closed a little how to
-            open them again (docs/results/unmoved.md).
+        jaw_noise: standard deviation of the noise on the jaw's motion, in units of its range, while
+            it is not told to close: a random walk of closed jaws would drop the needle. Without it
+            open jaws are always as far open as the demonstrator has them, and nothing shows a
+            policy whose jaws have closed a little how to open them again (docs/results/unmoved.md).
         late: most control steps by which a demonstrator that goes back notices a loss late; each
             episode draws its own. It shows what a policy looks like that has not noticed yet.
     """

@@ -37,7 +37,6 @@ FACTORS: Mapping[str, str] = MappingProxyType(
         "world": "world",
         "learned_in": "world of the demonstrations",
         "name": "condition",
-        "starts": "starts",
         "place": "place",
     }
 )

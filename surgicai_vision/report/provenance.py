@@ -1,24 +1,15 @@
 """Origin: with what, where and by which commands the numbers were made."""
 
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from surgicai_vision.core.banks import HELD_OUT, TRAINING, VALIDATION, bank_of
+from surgicai_vision.core.banks import USES, bank_of
 from surgicai_vision.report import text
 from surgicai_vision.report.groups import Group
 from surgicai_vision.report.reader import Collected, Result
 from surgicai_vision.report.tables import evaluate_command
 
-USES: Mapping[str, str] = MappingProxyType(
-    {
-        HELD_OUT: "the bank for tests: no training uses it",
-        VALIDATION: "the bank for validation: choices are made on it",
-        TRAINING: "the bank for training: demonstrations begin from it",
-    }
-)
-"""What each bank of starts is for."""
 FLOW = ("demos", "dataset", "features", "policy", "evaluation", "report")
 
 
