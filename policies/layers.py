@@ -86,7 +86,8 @@ class MapConvolutions(nn.Module):
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Return (B, `FEATURES`) for flattened maps (B, C·h·w)."""
-        numbers: torch.Tensor = self.layers(rows.unflatten(1, self.shape))
+        # A view's part of wider rows would be copied by the convolution, and once more backwards.
+        numbers: torch.Tensor = self.layers(rows.unflatten(1, self.shape).contiguous())
         return numbers
 
 

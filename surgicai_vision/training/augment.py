@@ -56,20 +56,22 @@ def with_shift(
         places: largest move [places].
         moments: rows one after the other that are one history; B is a multiple of it.
     """
-    moved = observed.clone()
+    moved = torch.zeros_like(observed)
     at = 0
     for shape in shapes:
         size = math.prod(shape)
         if len(shape) == 3:
             maps = observed[:, at : at + size].unflatten(1, shape)
             target = moved[:, at : at + size].unflatten(1, shape)
-            target.zero_()
             moves = torch.randint(-places, places + 1, (len(maps) // moments, 2))
             for row, (down, right) in enumerate(moves.repeat_interleave(moments, 0).tolist()):
                 to_y, from_y = _overlap(down, shape[1])
                 to_x, from_x = _overlap(right, shape[2])
                 target[row, :, to_y, to_x] = maps[row, :, from_y, from_x]
+        else:
+            moved[:, at : at + size] = observed[:, at : at + size]
         at += size
+    moved[:, at:] = observed[:, at:]
     return moved
 
 
