@@ -314,7 +314,8 @@ def _table(rows: Sequence[Row]) -> list[dict[str, JSON]]:
 
 def _told(run: RunConfig) -> str:
     """Return what a policy is told that no robot knows; "" where that is nothing."""
-    if run.privileged:
+    learned_on_state = run.algo is not None and run.encoder is None
+    if run.privileged or learned_on_state:
         return "sees the state with the goal"
     return "ends told by the simulator" if run.termination == "privileged" else ""
 

@@ -166,3 +166,31 @@ def test_the_commands_make_a_row_and_the_page(
     (rows / "b.json").write_text("{}", encoding="utf-8")
     assert main(["leaderboard", str(rows)]) == 1
     assert main(["leaderboard", str(tmp_path / "nowhere")]) == 2
+
+
+def test_the_rows_of_this_repository_are_taken(tmp_path: Path) -> None:
+    rows = Path(__file__).resolve().parents[2] / "rows"
+    board = write_leaderboard(rows, tmp_path / "board.html")
+    assert not board.refused
+    stored = [read_row(path) for path in rows.glob("*.json")]
+    assert len(board.taken) == len(stored)
+    experts = {row.run.env.task for row in stored if row.run.policy == "expert"}
+    assert experts == set(names.SUBTASKS), "the reference of a task is missing"
+
+
+@pytest.mark.parametrize(
+    "on_state",
+    [
+        lambda run: replace(run, privileged=True),
+        lambda run: replace(run, policy="actor", algo="td3"),
+    ],
+    ids=["cloned", "reinforced"],
+)
+def test_what_sees_the_state_is_marked(
+    row: Row, tmp_path: Path, on_state: Callable[[RunConfig], RunConfig]
+) -> None:
+    for name, run in (("images", row.run), ("state", on_state(row.run))):
+        (tmp_path / name).mkdir()
+        write_row(replace(row, run=run).sealed(), tmp_path / name / "row.json")
+        page = write_leaderboard(tmp_path / name, tmp_path / f"{name}.html").page.read_text()
+        assert ("sees the state with the goal" in page) == (name == "state")
