@@ -314,8 +314,7 @@ def _table(rows: Sequence[Row]) -> list[dict[str, JSON]]:
 
 def _told(run: RunConfig) -> str:
     """Return what a policy is told that no robot knows; "" where that is nothing."""
-    learned_on_state = run.algo is not None and run.encoder is None
-    if run.privileged or learned_on_state:
+    if run.sees_goal:
         return "sees the state with the goal"
     return "ends told by the simulator" if run.termination == "privileged" else ""
 

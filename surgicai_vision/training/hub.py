@@ -146,7 +146,7 @@ def _facts(checkpoint: Checkpoint) -> dict[str, str]:
         learned = f"{run.env_steps} control steps" if run.env_steps else f"{run.updates} updates"
         facts["policy"] = f"`{checkpoint.policy}`, algorithm `{run.algo}`, {learned}"
         facts["data"] = f"{run.demonstrations or 'no'} demonstrations"
-        if run.encoder is None:
+        if run.sees_goal:
             facts["sees"] = f"the state with the goal ({run.inputs}), in simulation alone"
     if encoder is not None:
         facts["encoder"] = (

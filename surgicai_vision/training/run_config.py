@@ -190,6 +190,11 @@ class RunConfig:
         return self.termination is not None
 
     @property
+    def sees_goal(self) -> bool:
+        """Whether the policy sees the state with the goal, which no robot knows."""
+        return self.privileged or (self.algo is not None and self.encoder is None)
+
+    @property
     def inputs(self) -> str:
         """What the policy is fed, in words."""
         if self.encoder:
