@@ -392,6 +392,7 @@ def hierarchical_policy(
     # With experts in every place a policy knows no scene: the task is that of all its policies.
     known: dict[str, RunConfig] = {}
     low: dict[str, MakeAgent] = {}
+    sees_goal = expert_swap is not None
     for subtask, policy in config.low.items():
         if _names_code(policy):
             raise InputError(
@@ -400,6 +401,7 @@ def hierarchical_policy(
             )
         spec = open_policy(policy, task=subtask, weights=weights)
         low[subtask] = spec.make_agent
+        sees_goal |= spec.run.sees_goal
         if spec.run.is_trained:
             known[subtask] = spec.run
     about: dict[str, JSON] = {"hierarchical": to_mapping(config)}
@@ -427,6 +429,7 @@ def hierarchical_policy(
     run = RunConfig(
         replace(env, task=names.SUTURE, max_steps=config.max_steps, advance=config.advance),
         views=tuple(view for view in view_names() if view in seen),
+        privileged=sees_goal,
         termination=config.termination,
         parts=digest(config),
         expert_swap=expert_swap,

@@ -314,9 +314,9 @@ def _table(rows: Sequence[Row]) -> list[dict[str, JSON]]:
 
 def _told(run: RunConfig) -> str:
     """Return what a policy is told that no robot knows; "" where that is nothing."""
-    if run.sees_goal:
-        return "sees the state with the goal"
-    return "ends told by the simulator" if run.termination == "privileged" else ""
+    state = ["sees the state with the goal"] if run.sees_goal else []
+    ends = ["ends told by the simulator"] if run.termination == "privileged" else []
+    return "; ".join(state + ends)
 
 
 def _against(row: Row, best: Row) -> str:

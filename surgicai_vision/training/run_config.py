@@ -21,6 +21,8 @@ OWN = "own"
 """Stands for an encoder: a network of the policy's own, trained with it on the images."""
 REFERENCES = ("expert", "random", "zero", "replay", "recover")
 """Policies that are not trained: what the trained ones stand beside."""
+EXPERTS = ("expert", "recover")
+"""Those of them that read the simulator's state."""
 LEROBOT_POLICIES = ("act", "diffusion")
 """Policies that a grid trains by `lerobot-train`, for a number of updates."""
 ACTORS = ("actor", "bcq")
@@ -81,7 +83,8 @@ class RunConfig:
         views: its views, in the order of the features; empty without images.
         policy: policy's name; one of `REFERENCES` for what is not trained.
         pool: what is taken from the encoder.
-        privileged: see the state with the goal in place of all else, an upper bound.
+        privileged: see the state with the goal in place of all else, an upper bound; of a
+            hierarchical policy, whether a policy that acts in it sees it.
         recipe: the policy's recipe: a name, or the path of a YAML file.
         changes: what is changed in the recipe, "key=value" each.
         demonstrations: demonstrations trained on, those of the validation split included; None
@@ -191,8 +194,12 @@ class RunConfig:
 
     @property
     def sees_goal(self) -> bool:
-        """Whether the policy sees the state with the goal, which no robot knows."""
-        return self.privileged or (self.algo is not None and self.encoder is None)
+        """Whether the policy, or one that acts in it, sees the state with the goal.
+
+        No robot knows that state.
+        """
+        by_state = self.policy in ACTORS and self.encoder is None
+        return self.privileged or by_state or self.policy in EXPERTS
 
     @property
     def inputs(self) -> str:

@@ -190,6 +190,7 @@ def test_experts_in_their_order_sew_and_count_their_stages() -> None:
         HierarchicalConfig("order", **PRIVILEGED, max_steps=1000, grasp_hold=5)
     )
     assert made.config.advance == "success" and made.make_agent().privileged
+    assert made.run.sees_goal
     assert made.config.task == "suture"
     row = evaluate(made.make_agent, made.config, [names.TEST_SEED], workers=1)[0].row
     assert row.success and row.stages == 5, row
@@ -230,6 +231,10 @@ def test_trained_policies_act_together_in_any_batch(tmp_path: Path) -> None:
         assert repr(rows[0]) == repr(rows[1]) and rows[0][0].steps == 12  # NaN is unequal to itself
         assert made.config.advance == {"learned": "told", "privileged": "success"}[termination]
         assert made.make_agent().privileged == (termination == "privileged")
+        assert not made.run.sees_goal
+        assert hierarchical_policy(
+            HierarchicalConfig(hlp, **{**low, "place": "expert"}, termination=termination)
+        ).run.sees_goal
     spec = open_policy(written(tmp_path, hlp, low), env={"reward": "dense"})
     assert (spec.config.advance, spec.config.reward) == ("told", "dense")
     with pytest.raises(InputError, match="follows from the termination"):

@@ -178,13 +178,18 @@ def test_the_rows_of_this_repository_are_taken(tmp_path: Path) -> None:
     assert experts == set(names.SUBTASKS), "the reference of a task is missing"
 
 
+def test_a_high_level_policy_by_ppo_sees_poses_alone() -> None:
+    assert not RunConfig(TaskConfig("suture"), policy="hlp", algo="ppo").sees_goal
+
+
 @pytest.mark.parametrize(
     "on_state",
     [
         lambda run: replace(run, privileged=True),
         lambda run: replace(run, policy="actor", algo="td3"),
+        lambda run: replace(run, policy="expert"),
     ],
-    ids=["cloned", "reinforced"],
+    ids=["cloned", "reinforced", "scripted"],
 )
 def test_what_sees_the_state_is_marked(
     row: Row, tmp_path: Path, on_state: Callable[[RunConfig], RunConfig]
