@@ -228,15 +228,18 @@ def _curves(rows: Sequence[Row], tasks: Sequence[str]) -> list[Chart]:
 
 
 def _points(curves: Sequence[Sequence[CurvePoint]], x: Axis) -> tuple[Point, ...]:
-    """Return the evaluations of all seeds, the n-th of each counted together."""
+    """Return the evaluations of all seeds, the n-th of each counted together.
+
+    A seed that has ended counts with its last one, and stands where the others do.
+    """
     found = []
     for index in range(max(map(len, curves))):
-        here = [curve[index] for curve in curves if index < len(curve)]
+        here = [curve[min(index, len(curve) - 1)] for curve in curves if curve]
         won = sum(point.successes for point in here)
         of = sum(point.episodes for point in here)
         bounds = statistics.clopper_pearson(won, of)
-        where = float(np.mean([x(point) for point in here]))
-        words = f"{won}/{of} ({text.interval(bounds)}) at {where:g}"
+        where = float(np.mean([x(curve[index]) for curve in curves if index < len(curve)]))
+        words = f"{won}/{of} ({text.interval(bounds)}) at {where:.3g}"
         found.append(Point(where, won / of, *bounds, words))
     return tuple(found)
 
@@ -253,14 +256,14 @@ def _chart(
     rows = []
     for line in lines:
         firsts = [first_at(MARK, curve) for curve in by_label[line.name]]
-        reached = ", ".join("never" if first is None else f"{x(first):g}" for first in firsts)
+        reached = ", ".join("never" if first is None else f"{x(first):.3g}" for first in firsts)
         rows.append((line.name, line.points[-1].text, reached))
     more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
     return Chart(
         title,
         charts.curves(drawn, x_name, label=f"{title}: success [%] on validation starts"),
         charts.key([line.name for line in drawn]),
-        ("algorithm", "last evaluation", f"first at {text.percent(MARK)}"),
+        ("algorithm", "last evaluation of each seed", f"first at {text.percent(MARK)}"),
         tuple(rows),
         more,
     )

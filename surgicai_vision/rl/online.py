@@ -77,6 +77,7 @@ class OnlineLearner(Learner):
         self.env = SuturingVecEnv.of(request.env, obs_type, settings.envs, workers)
         self.env.set_attr("success_rule", settings.success_rule)
         self.model = self._model()
+        self.log_to(Logger(None, []))  # without one `learn` makes a folder for it at every call
         if transitions is not None:
             buffer = self._buffer
             assert isinstance(buffer, MixedBuffer | HindsightBuffer)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
 
 from surgicai_vision.core import names
 from surgicai_vision.core.files import write_json
@@ -61,6 +62,7 @@ class Stages:
         Returns:
             The weights of the best point, and that point.
         """
+        model.set_logger(Logger(None, []))  # without one `learn` makes a folder for it at each call
         curve, best = begun
         minutes = curve[-1].minutes if curve else 0.0
         while model.num_timesteps < self.steps:

@@ -21,7 +21,14 @@ from surgicai_vision.report.aggregates import (
 )
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.reader import collect
-from surgicai_vision.report.reinforcement import first_at, learned, read_curve, table
+from surgicai_vision.report.reinforcement import (
+    CurvePoint,
+    _points,
+    first_at,
+    learned,
+    read_curve,
+    table,
+)
 from surgicai_vision.training.run_config import RunConfig
 
 RATES = {"td3": 0.1, "td3-her-bc": 0.9, "bc": 0.6}
@@ -141,6 +148,14 @@ def test_learning_curves_are_read_beside_the_policy(folder):
     minutes = {row[0]: row[2] for row in found.curves[1].rows}
     assert minutes["td3-her-bc, 100 demonstrations"] == "1, 1.01, 1.02"
     assert rows["td3"][2] == "never, never, never"
+
+
+def test_a_seed_that_has_ended_counts_with_its_last_evaluation():
+    short = [CurvePoint(1000, 500, 1.0, 10, 20)]
+    long = [CurvePoint(1000, 500, 2.0, 0, 20), CurvePoint(2000, 1000, 4.0, 5, 20)]
+    points = _points([short, long, []], lambda point: point.minutes)
+    assert [(point.x, point.rate) for point in points] == [(1.5, 10 / 40), (4.0, 15 / 40)]
+    assert points[-1].text.startswith("15/40") and points[-1].text.endswith("at 4")
 
 
 def test_the_page_and_its_tables_have_them(folder, monkeypatch):
