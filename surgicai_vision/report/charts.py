@@ -7,6 +7,7 @@ alone. Colours of text and axes come from the page's style sheet.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from markupsafe import Markup, escape
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#7a5195", "#666666")
@@ -38,6 +39,8 @@ RIGHT = 22
 TOP = 10
 BOTTOM = 40
 """Size and margins of a curve's drawing, in its own units."""
+FEW_MARKS = 8
+"""Numbers that have room below a curve's axis."""
 NAMES = 104
 BAR = 20
 """Width of the names beside bars, and height of a bar with its gap."""
@@ -202,7 +205,8 @@ def curves(
     """Draw success against x, one line a series, intervals as bars at the points.
 
     Args:
-        series: the lines; each has an x of its own for every point.
+        series: the lines; each has an x of its own for every point. One without points keeps the
+            colour of its place from the others.
         x_name: what x is.
         logarithmic: a logarithmic axis; every x above 0.
         label: what a screen reader says.
@@ -212,6 +216,7 @@ def curves(
     from math import log
 
     xs = sorted({point.x for line in series for point in line.points})
+    marks = xs if ticks or logarithmic else _marks(xs)
     scale = log if logarithmic else float
     low, high = scale(xs[0]), scale(xs[-1])
     span = (high - low) or 1.0
@@ -221,14 +226,15 @@ def curves(
             HEIGHT - TOP - BOTTOM
         ) * (1 - rate)
 
-    parts = [_axes(xs, place, x_name, ticks or {})]
+    parts = [_axes(marks, place, x_name, ticks or {})]
     for index, line in enumerate(series):
         shift = (
             3.0 * (index - (len(series) - 1) / 2) / max(1, len(series) - 1)
             if len(series) > 1
             else 0.0
         )
-        parts.append(_line(line, index, shift if joined else 0.0, place, joined))
+        if line.points:
+            parts.append(_line(line, index, shift if joined else 0.0, place, joined))
     body = "".join(parts)
     return Markup(
         f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img"'
@@ -237,15 +243,31 @@ def curves(
 
 
 def key(names: Sequence[str]) -> Markup:
-    """Draw the legend of the series called `names`."""
+    """Draw the legend of the series called `names`; "" for one without points."""
     items = []
     for index, name in enumerate(names):
+        if not name:
+            continue
         colour = COLOURS[index % len(COLOURS)]
         marker = _marker(index, 10, 8, colour)
         line = f'<line x1="0" x2="20" y1="8" y2="8" stroke="{colour}" stroke-width="2"/>'
         sign = f'<svg class="sign" viewBox="0 0 20 16" aria-hidden="true">{line}{marker}</svg>'
         items.append(f"<span>{sign}{escape(name)}</span>")
     return Markup(f'<p class="key">{"".join(items)}</p>')
+
+
+def _marks(xs: Sequence[float]) -> list[float]:
+    """Return where a linear axis is marked: at every x, or at round numbers where these are many.
+
+    Numbers are many, too, where they have more digits than fit below the axis.
+    """
+    if len(xs) == 1 or (len(xs) <= FEW_MARKS and all(len(f"{x:g}") <= 4 for x in xs)):
+        return list(xs)
+    low, high = xs[0], xs[-1]
+    power = 10.0 ** np.floor(np.log10((high - low) / FEW_MARKS))
+    step = next(power * m for m in (1, 2, 5, 10) if (high - low) / (power * m) <= FEW_MARKS)
+    first, last = int(np.ceil(low / step)), int(np.floor(high / step))
+    return [round(step * index, 9) for index in range(first, last + 1)]
 
 
 def _axes(xs: Sequence[float], place: object, x_name: str, ticks: Mapping[float, str]) -> str:

@@ -38,13 +38,20 @@ class Row:
 
     Attributes:
         algo: its name.
-        label: the same with what is changed, and the demonstrations.
+        settings: what is changed, what it sees and its demonstrations, in words.
+        shared: those of them that all rows of the table have.
         groups: task → its evaluations.
     """
 
     algo: str
-    label: str
+    settings: tuple[str, ...]
+    shared: tuple[str, ...]
     groups: Mapping[str, Group]
+
+    @property
+    def label(self) -> str:
+        """The algorithm with what tells it from the other rows."""
+        return ", ".join((self.algo, *(word for word in self.settings if word not in self.shared)))
 
     def scores(self, tasks: Sequence[str]) -> list[list[float]]:
         """Return the success rate of each training seed on each task."""
@@ -74,6 +81,7 @@ class Learned:
         tasks: columns of the table.
         head: its head.
         rows: its rows, as text.
+        shared: settings and demonstrations of every row, in words.
         better: rows of the probability that the best method beats another, as text.
         best: that method.
         curves: success on the way against control steps, and against minutes, task by task.
@@ -82,6 +90,7 @@ class Learned:
     tasks: tuple[str, ...]
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    shared: tuple[str, ...]
     better: tuple[tuple[str, ...], ...]
     best: str
     curves: tuple[Chart, ...]
@@ -98,6 +107,7 @@ def learned(groups: Sequence[Group]) -> Learned | None:
         tasks,
         ("algorithm", *tasks, "interquartile mean"),
         tuple(_cells(row, tasks) for row in rows),
+        rows[0].shared,
         tuple(_better(best, row) for row in rows if row is not best),
         best.label,
         tuple(_curves(rows, tasks)),
@@ -106,27 +116,29 @@ def learned(groups: Sequence[Group]) -> Learned | None:
 
 def table(groups: Sequence[Group]) -> list[Row]:
     """Return the algorithms in the order of SurgicAI's tables, those with results alone."""
-    found: dict[tuple[str, str], dict[str, Group]] = {}
+    found: dict[tuple[str, tuple[str, ...]], dict[str, Group]] = {}
     for item in groups:
         condition = item.condition
         # Cloning from images is called "bc", too; an actor's run names its algorithm.
         is_actor = any(result.run.algo for result in item.results) and condition.plain
         is_actor = is_actor and condition.trained_by in ALGORITHMS
         if item.episodes and is_actor and condition.task in names.SUBTASKS and not condition.place:
-            by_task = found.setdefault((condition.trained_by, _label(item)), {})
+            by_task = found.setdefault((condition.trained_by, _settings(item)), {})
             by_task[condition.task] = item
     order = list(ALGORITHMS)
     keys = sorted(found, key=lambda key: (order.index(key[0]), key[1]))
-    return [Row(algo, label, found[algo, label]) for algo, label in keys]
+    every = [settings for _, settings in keys]
+    shared = tuple(word for word in every[0] if all(word in each for each in every)) if keys else ()
+    return [Row(algo, settings, shared, found[algo, settings]) for algo, settings in keys]
 
 
-def _label(item: Group) -> str:
-    """Return the algorithm with what is changed, what it sees and its demonstrations."""
+def _settings(item: Group) -> tuple[str, ...]:
+    """Return what is changed, what it sees and its demonstrations, in words."""
     condition = item.condition
-    parts = [condition.trained_by, *condition.changes]
-    parts += [condition.encoder] if condition.encoder != "relative" else []
-    parts += [f"{condition.demonstrations} demonstrations"] if condition.demonstrations else []
-    return ", ".join(parts)
+    words = list(condition.changes)
+    words += [condition.encoder] if condition.encoder != "relative" else []
+    words += [f"{condition.demonstrations} demonstrations"] if condition.demonstrations else []
+    return tuple(words)
 
 
 def _cells(row: Row, tasks: Sequence[str]) -> tuple[str, ...]:
@@ -212,17 +224,14 @@ def _curves(rows: Sequence[Row], tasks: Sequence[str]) -> list[Chart]:
     for task in tasks:
         by_label = {
             row.label: [read_curve(result) for result in row.groups[task].results]
-            for row in rows
             if task in row.groups
+            else []
+            for row in rows
         }
         for x_name, x in axes:
-            lines = [
-                Series(label, _points(curves, x))
-                for label, curves in by_label.items()
-                if any(len(curve) > 1 for curve in curves)
-            ]
-            lines = [line for line in lines if len({point.x for point in line.points}) > 1]
-            if lines:
+            # A line without points keeps its colour: an algorithm has one on the whole page.
+            lines = [Series(label, _points(curves, x)) for label, curves in by_label.items()]
+            if any(line.points for line in lines):
                 found.append(_chart(f"{task}: {x_name}", lines, x_name, x, by_label))
     return found
 
@@ -230,10 +239,12 @@ def _curves(rows: Sequence[Row], tasks: Sequence[str]) -> list[Chart]:
 def _points(curves: Sequence[Sequence[CurvePoint]], x: Axis) -> tuple[Point, ...]:
     """Return the evaluations of all seeds, the n-th of each counted together.
 
-    A seed that has ended counts with its last one, and stands where the others do.
+    A seed that has ended counts with its last one, and stands where the others do. What does not
+    move along the axis is no curve and has no points: a single evaluation, or offline learning
+    against control steps.
     """
     found = []
-    for index in range(max(map(len, curves))):
+    for index in range(max(map(len, curves), default=0)):
         here = [curve[min(index, len(curve) - 1)] for curve in curves if curve]
         won = sum(point.successes for point in here)
         of = sum(point.episodes for point in here)
@@ -241,7 +252,7 @@ def _points(curves: Sequence[Sequence[CurvePoint]], x: Axis) -> tuple[Point, ...
         where = float(np.mean([x(curve[index]) for curve in curves if index < len(curve)]))
         words = f"{won}/{of} ({text.interval(bounds)}) at {where:.3g}"
         found.append(Point(where, won / of, *bounds, words))
-    return tuple(found)
+    return tuple(found) if len({point.x for point in found}) > 1 else ()
 
 
 def _chart(
@@ -253,19 +264,19 @@ def _chart(
 ) -> Chart:
     """Draw learning curves; beside them where each seed first reaches `MARK`."""
     drawn = lines[:MOST]
+    more = len([line for line in lines[MOST:] if line.points])
     rows = []
-    for line in lines:
+    for line in (line for line in lines if line.points):
         firsts = [first_at(MARK, curve) for curve in by_label[line.name]]
         reached = ", ".join("never" if first is None else f"{x(first):.3g}" for first in firsts)
         rows.append((line.name, line.points[-1].text, reached))
-    more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
     return Chart(
         title,
         charts.curves(drawn, x_name, label=f"{title}: success [%] on validation starts"),
-        charts.key([line.name for line in drawn]),
+        charts.key([line.name if line.points else "" for line in drawn]),
         ("algorithm", "last evaluation of each seed", f"first at {text.percent(MARK)}"),
         tuple(rows),
-        more,
+        f"{more} more in the table." if more else "",
     )
 
 
@@ -277,6 +288,7 @@ def markdown(found: Learned) -> str:
     parts = [
         f"Success from held-out starts: k/n over all training seeds (exact 95 % interval); paper: "
         f"{paper.LEARNED_SOURCE}. Interquartile mean over runs with its bootstrap interval.",
+        *([f"Every row: {', '.join(found.shared)}."] if found.shared else []),
         "",
         *_rows(found.head, found.rows),
     ]

@@ -19,6 +19,7 @@ from surgicai_vision.report.aggregates import (
     interquartile_mean,
     probability_of_improvement,
 )
+from surgicai_vision.report.charts import COLOURS
 from surgicai_vision.report.groups import group
 from surgicai_vision.report.reader import collect
 from surgicai_vision.report.reinforcement import (
@@ -156,6 +157,23 @@ def test_a_seed_that_has_ended_counts_with_its_last_evaluation():
     points = _points([short, long, []], lambda point: point.minutes)
     assert [(point.x, point.rate) for point in points] == [(1.5, 10 / 40), (4.0, 15 / 40)]
     assert points[-1].text.startswith("15/40") and points[-1].text.endswith("at 4")
+
+
+def test_an_algorithm_has_one_colour_and_what_all_share_is_said_once(folder):
+    groups = [item for item in group(collect(folder)) if item.condition.trained_by != "bc"]
+    lost = ("td3", "grasp")  # the first algorithm has no result on the first task
+    some = [i for i in groups if (i.condition.trained_by, i.condition.task) != lost]
+    found = learned(some)
+    (one, *_), (*_, other) = (
+        [str(c.drawing) for c in found.curves if c.title.startswith(task)]
+        for task in ("grasp", "insert")
+    )
+    assert COLOURS[1] in one and COLOURS[0] not in one
+    assert COLOURS[1] in other and COLOURS[0] in other
+    cloned = [item for item in groups if item.condition.trained_by == "td3-her-bc"]
+    assert learned(cloned).rows[0][0] == "td3-her-bc"
+    assert learned(cloned).shared == ("100 demonstrations",)
+    assert learned(groups).shared == ()
 
 
 def test_the_page_and_its_tables_have_them(folder, monkeypatch):

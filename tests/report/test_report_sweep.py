@@ -14,6 +14,8 @@ from dataclasses import replace
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from sweep_results import (
     COMMAND,
@@ -643,6 +645,23 @@ def test_text_in_a_heat_map_can_be_read():
         assert (light + 0.05) / (dark + 0.05) > 4.5
     values = [luminance(back) for back, _ in steps]
     assert all(a >= b for a, b in itertools.pairwise(values)), "lightness alone carries the value"
+
+
+@given(st.lists(st.floats(0, 1e5, allow_nan=False).map(lambda x: round(x, 3)), min_size=1).map(set))
+def test_an_axis_has_few_marks_with_room_for_each(xs):
+    xs = sorted(xs)
+    marks = charts._marks(xs)
+    assert len(marks) <= charts.FEW_MARKS + 1
+    assert all(xs[0] <= mark <= xs[-1] for mark in marks)
+    if marks != xs:
+        steps = np.diff(marks)
+        assert np.allclose(steps, steps[:1]), "evenly spaced"
+
+
+def test_an_axis_is_marked_at_round_numbers_where_its_points_are_not():
+    assert charts._marks([2.5, 5, 7.5]) == [2.5, 5, 7.5]
+    assert charts._marks([0.563333, 1.22, 3.16333, 5.11]) == [1, 2, 3, 4, 5]
+    assert charts._marks([2.5 * n for n in range(1, 21)]) == [10, 20, 30, 40, 50]
 
 
 def test_page_stands_alone(text):
