@@ -153,9 +153,8 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
             "headline": sentence,
             "lead": f"{episodes:,} episodes; the intervals of each policy stand below.",
         }
-    low = min(item.rate for item in best)
-    high = max(item.rate for item in best)
-    span = text.percent(high) if low == high else f"{text.percent(low)} to {text.percent(high)}"
+    bounds = (min(item.rate for item in best), max(item.rate for item in best))
+    span = " to ".join(dict.fromkeys(map(text.percent, bounds)))
     parts = [
         f"{item.condition.task} {item.successes}/{item.episodes} ({text.interval(item.interval)};"
         f" {item.label})"

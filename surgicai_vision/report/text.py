@@ -12,8 +12,11 @@ ABSENT = "–"
 
 
 def percent(rate: float) -> str:
-    """Return 0.654 as "65 %"."""
-    return f"{100 * rate:.0f} %"
+    """Return 0.654 as "65 %", and 299 of 300 as "99.7 %": only all are "100 %", only none "0 %"."""
+    whole = f"{100 * rate:.0f}"
+    if whole in ("0", "100") and rate not in (0.0, 1.0):
+        return f"{100 * rate:.1f} %"
+    return f"{whole} %"
 
 
 def interval(bounds: Sequence[float]) -> str:
