@@ -35,6 +35,7 @@ from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS, advance_of
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, shifted_config
 from surgicai_vision.evaluation.statistics import clopper_pearson, mcnemar
 from surgicai_vision.evaluation.storage import read_evaluation, read_rows
+from surgicai_vision.report import text
 from surgicai_vision.scene import build_scene
 from surgicai_vision.training.run_config import RunConfig
 
@@ -289,7 +290,7 @@ def _table(rows: Sequence[Row]) -> list[dict[str, JSON]]:
     lines: list[dict[str, JSON]] = []
     for place, row in enumerate(ordered):
         wins = sum(row.successes)
-        low, high = clopper_pearson(wins, len(row.successes))
+        bounds = clopper_pearson(wins, len(row.successes))
         lines.append(
             {
                 "name": row.entry.name,
@@ -297,8 +298,8 @@ def _table(rows: Sequence[Row]) -> list[dict[str, JSON]]:
                 "link": row.entry.link,
                 "policy": row.run.name,
                 "count": f"{wins}/{len(row.successes)}",
-                "rate": f"{wins / len(row.successes):.0%}",
-                "interval": f"{low:.0%} to {high:.0%}",
+                "rate": text.percent(wins / len(row.successes)),
+                "interval": text.interval(bounds),
                 "against_best": _against(row, ordered[0]) if place else "",
                 "demonstrations": row.run.demonstrations,
                 "minutes": row.entry.minutes,
