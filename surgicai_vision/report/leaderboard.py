@@ -76,9 +76,9 @@ class Entry:
             raise InputError(f"link is {self.link}; it must begin with https://.")
         if self.minutes is not None and not self.minutes >= 0:
             raise InputError(f"minutes is {self.minutes}; it must be at least 0.")
-        for text in (self.name, self.by, self.link, self.hardware, self.note):
-            if len(text) > 300:
-                raise InputError(f"'{text[:40]}…' has {len(text)} characters; 300 at most.")
+        for words in (self.name, self.by, self.link, self.hardware, self.note):
+            if len(words) > 300:
+                raise InputError(f"'{words[:40]}…' has {len(words)} characters; 300 at most.")
 
 
 @dataclass(frozen=True)
