@@ -27,6 +27,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.banks import HELD_OUT, USES, bank_of
 from surgicai_vision.core.config import JSON, TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.percentages import interval, percent
 from surgicai_vision.features.encoders import WeightsSource
 
 if TYPE_CHECKING:
@@ -259,10 +260,9 @@ def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:
 
 def summary_line(result: dict[str, Any]) -> str:
     """Return one line about an evaluation."""
-    low, high = result["ci95"]
     line = (
         f"{result['policy']} on {result['task']}: {result['successes']}/{result['episodes']} "
-        f"({100 * result['success_rate']:.0f} %, 95 % interval {100 * low:.0f}–{100 * high:.0f} %)"
+        f"({percent(result['success_rate'])}, 95 % interval {interval(result['ci95'])})"
     )
     if result["paper_successes"] != result["successes"]:
         line += f", {result['paper_successes']} by the paper's tolerances alone"

@@ -18,6 +18,7 @@ from surgicai_vision.commands.options import (
     TASK,
     VIEWS,
 )
+from surgicai_vision.core.percentages import interval
 from surgicai_vision.experiments.quickstart_config import PolicyChoice, Quickstart
 
 app = App(name="quickstart", help_epilogue="example:\n  surgicai-vision quickstart")
@@ -105,13 +106,12 @@ def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:
-    low, high = result["ci95"]
     length = result["trajectory_length_mm"]["mean"]
     steps = result["time_steps"]["mean"]
     return (
         result["policy"],
         f"{result['successes']}/{result['episodes']}",
-        f"{100 * low:.0f}–{100 * high:.0f} %",
+        interval(result["ci95"]),
         "–" if length is None else f"{length:.1f}",
         "–" if steps is None else f"{steps:.0f}",
     )

@@ -22,6 +22,7 @@ from surgicai_vision.commands.options import (
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.percentages import interval
 from surgicai_vision.demos.demonstrator import CHOOSING_DEMONSTRATORS, SOURCES
 
 if TYPE_CHECKING:
@@ -133,10 +134,10 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     # A start that the demonstrator failed from is named in the marker and counts in the share.
     marker = read_marker(out)
     tried = len(paths) + len(marker["skipped"])
-    low, high = clopper_pearson(len(paths), tried)
+    bounds = clopper_pearson(len(paths), tried)
     console.say(f"{len(paths)} demonstrations of {options.task}: {out}")
     console.say(
-        f"{len(paths)}/{tried} starts succeeded (95 % interval {low:.0%} to {high:.0%})"
+        f"{len(paths)}/{tried} starts succeeded (95 % interval {interval(bounds)})"
         + (f"; {out / MARKER} names the others." if tried > len(paths) else ".")
     )
     upsets = marker.get("upsets", {})
@@ -147,7 +148,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         "episodes": len(paths),
         "starts": tried,
         "share": len(paths) / tried,
-        "interval": [low, high],
+        "interval": list(bounds),
         "demos": str(out),
         **({"upsets": upsets} if options.upset_fraction else {}),
     }

@@ -18,6 +18,7 @@ from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists
 from surgicai_vision.core.executor import RunContext
+from surgicai_vision.core.percentages import interval
 from surgicai_vision.core.progress import timed
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.demos.disturbance import Disturbance
@@ -152,7 +153,6 @@ def _finding(plan: Quickstart, results: Sequence[Row]) -> dict[str, str]:
     """Return the page's headline, how many of how many beside what, and the line below it."""
     trained = list(zip(plan.runs, results, strict=False))
     (run, shown), *others = trained
-    low, high = shown["ci95"]
     beside = ", ".join(f"{_words(other)} {result['successes']}" for other, result in others)
     details = "; ".join(
         (
@@ -167,7 +167,7 @@ def _finding(plan: Quickstart, results: Sequence[Row]) -> dict[str, str]:
         "headline": f"{plan.task.capitalize()}, {_words(run)}: {shown['successes']} of "
         f"{shown['episodes']} held-out starts" + (f"; {beside}" if beside else ""),
         "lead": f"Trained on {plan.demonstrations} demonstrations{_seen(run)}; 95 % interval "
-        f"{100 * low:.0f}–{100 * high:.0f} %. Beside it, from the same demonstrations and on the "
+        f"{interval(shown['ci95'])}. Beside it, from the same demonstrations and on the "
         f"same starts: {details}.",
     }
 

@@ -8,21 +8,22 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from surgicai_vision.core.percentages import interval, percent
+
+__all__ = [
+    "ABSENT",
+    "either",
+    "finite",
+    "interval",
+    "mean",
+    "percent",
+    "plural",
+    "probability",
+    "quartiles",
+    "spread",
+]
+
 ABSENT = "–"
-
-
-def percent(rate: float) -> str:
-    """Return 0.654 as "65 %", and 299 of 300 as "99.7 %": only all are "100 %", only none "0 %"."""
-    whole = f"{100 * rate:.0f}"
-    if whole in ("0", "100") and rate not in (0.0, 1.0):
-        return f"{100 * rate:.1f} %"
-    return f"{whole} %"
-
-
-def interval(bounds: Sequence[float]) -> str:
-    """Return (0.4078, 0.8461) as "41–85 %"."""
-    low, high = bounds
-    return f"{100 * low:.0f}–{100 * high:.0f} %"
 
 
 def either(values: Iterable[object]) -> str:

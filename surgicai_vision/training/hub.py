@@ -18,6 +18,7 @@ from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.executor import building
 from surgicai_vision.core.files import check_output
 from surgicai_vision.core.hub import connect, refusals_in_one_line
+from surgicai_vision.core.percentages import interval
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.scene import build_scene
 from surgicai_vision.training.checkpoint import CARD, WEIGHTS, Checkpoint, read_checkpoint
@@ -49,9 +50,8 @@ class Successes:
     @property
     def text(self) -> str:
         """The count with its interval, in words."""
-        low, high = self.interval
         return (
-            f"{self.count}/{self.episodes} (95 % interval {low:.0%} to {high:.0%}), "
+            f"{self.count}/{self.episodes} (95 % interval {interval(self.interval)}), "
             f"start seeds {min(self.seeds)} to {max(self.seeds)}"
         )
 

@@ -66,7 +66,7 @@ def test_movement_primitives_print_the_share_that_succeeds(text, tmp_path, monke
     words = line.replace("--episodes 50", "--episodes 2").split()
     assert main([*words, "--workers", "1", "--out", "dmp"]) == 0
     assert re.search(
-        r"^2/\d+ starts succeeded \(95 % interval \d+% to \d+%\)",
+        r"^2/\d+ starts succeeded \(95 % interval \d+–\d+ %\)",
         capsys.readouterr().out,
         re.MULTILINE,
     )

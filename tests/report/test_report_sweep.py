@@ -54,7 +54,6 @@ from surgicai_vision.report.groups import best_trained, group, of_task
 from surgicai_vision.report.pairs import compare, factor
 from surgicai_vision.report.reader import collect
 from surgicai_vision.report.sections import heat_maps
-from surgicai_vision.report.text import percent
 from surgicai_vision.training.run_config import RunConfig, Shift
 
 LIMIT = 8_000_000
@@ -657,11 +656,6 @@ def test_an_axis_has_few_marks_with_room_for_each(xs):
     if marks != xs:
         steps = np.diff(marks)
         assert np.allclose(steps, steps[:1]), "evenly spaced"
-
-
-def test_only_all_are_a_hundred_percent_and_only_none_nothing():
-    rates = (0, 1 / 300, 0.654, 299 / 300, 1)
-    assert list(map(percent, rates)) == ["0 %", "0.3 %", "65 %", "99.7 %", "100 %"]
 
 
 def test_an_axis_is_marked_at_round_numbers_where_its_points_are_not():
