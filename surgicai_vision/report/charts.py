@@ -4,10 +4,10 @@ Series have Okabe and Ito's colours and a marker of their own, so that no chart 
 alone. Colours of text and axes come from the page's style sheet.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from markupsafe import Markup, escape
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#7a5195", "#666666")
@@ -213,11 +213,9 @@ def curves(
         ticks: x → its word, where it is no number.
         joined: draw a line through the points of a series.
     """
-    from math import log
-
     xs = sorted({point.x for line in series for point in line.points})
     marks = xs if ticks or logarithmic else _marks(xs)
-    scale = log if logarithmic else float
+    scale = math.log if logarithmic else float
     low, high = scale(xs[0]), scale(xs[-1])
     span = (high - low) or 1.0
 
@@ -242,17 +240,17 @@ def curves(
     )
 
 
-def key(names: Sequence[str]) -> Markup:
-    """Draw the legend of the series called `names`; "" for one without points."""
+def key(series: Sequence[Series]) -> Markup:
+    """Draw the legend of the series that have points."""
     items = []
-    for index, name in enumerate(names):
-        if not name:
+    for index, line in enumerate(series):
+        if not line.points:
             continue
         colour = COLOURS[index % len(COLOURS)]
         marker = _marker(index, 10, 8, colour)
-        line = f'<line x1="0" x2="20" y1="8" y2="8" stroke="{colour}" stroke-width="2"/>'
-        sign = f'<svg class="sign" viewBox="0 0 20 16" aria-hidden="true">{line}{marker}</svg>'
-        items.append(f"<span>{sign}{escape(name)}</span>")
+        stroke = f'<line x1="0" x2="20" y1="8" y2="8" stroke="{colour}" stroke-width="2"/>'
+        sign = f'<svg class="sign" viewBox="0 0 20 16" aria-hidden="true">{stroke}{marker}</svg>'
+        items.append(f"<span>{sign}{escape(line.name)}</span>")
     return Markup(f'<p class="key">{"".join(items)}</p>')
 
 
@@ -264,9 +262,9 @@ def _marks(xs: Sequence[float]) -> list[float]:
     if len(xs) == 1 or (len(xs) <= FEW_MARKS and all(len(f"{x:g}") <= 4 for x in xs)):
         return list(xs)
     low, high = xs[0], xs[-1]
-    power = 10.0 ** np.floor(np.log10((high - low) / FEW_MARKS))
+    power = 10.0 ** math.floor(math.log10((high - low) / FEW_MARKS))
     step = next(power * m for m in (1, 2, 5, 10) if (high - low) / (power * m) <= FEW_MARKS)
-    first, last = int(np.ceil(low / step)), int(np.floor(high / step))
+    first, last = math.ceil(low / step), math.floor(high / step)
     return [round(step * index, 9) for index in range(first, last + 1)]
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from markupsafe import Markup
 
-from surgicai_vision.core import names
+from surgicai_vision.core import names, percentages
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import charts, text
@@ -156,7 +156,7 @@ def _point(x: float, item: Group) -> Point:
         x,
         item.rate,
         *item.interval,
-        f"{count}, {text.percent(item.rate)} ({text.interval(item.interval)})",
+        f"{count}, {percentages.percent(item.rate)} ({percentages.interval(item.interval)})",
     )
 
 
@@ -185,7 +185,7 @@ def _chart(
         drawn, x_name, logarithmic=logarithmic, label=f"{title}: success [%] against {x_name}"
     )
     head = ("policy", *(f"{x:g}" for x in xs), *((extra[0],) if extra else ()))
-    return Chart(title, drawing, charts.key([line.name for line in drawn]), head, tuple(rows), more)
+    return Chart(title, drawing, charts.key(drawn), head, tuple(rows), more)
 
 
 def procedure(groups: Sequence[Group]) -> Chart | None:
@@ -199,7 +199,7 @@ def procedure(groups: Sequence[Group]) -> Chart | None:
         counts = [sum(stage > index for stage in stages) for index in range(len(names.SUBTASKS))]
         bounds = [statistics.clopper_pearson(count, item.episodes) for count in counts]
         texts = [
-            f"{count}/{item.episodes} ({text.interval(b)})"
+            f"{count}/{item.episodes} ({percentages.interval(b)})"
             for count, b in zip(counts, bounds, strict=True)
         ]
         points = [
@@ -216,7 +216,7 @@ def procedure(groups: Sequence[Group]) -> Chart | None:
         drawn, "finished, and all before it", label="progress in the procedure", ticks=ticks
     )
     more = f"{len(lines) - MOST} more in the table." if len(lines) > MOST else ""
-    key = charts.key([line.name for line in drawn])
+    key = charts.key(drawn)
     return Chart("", drawing, key, ("policy", *names.SUBTASKS), tuple(rows), more)
 
 

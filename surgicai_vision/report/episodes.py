@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
+from surgicai_vision.core import percentages
 from surgicai_vision.evaluation.statistics import clopper_pearson
 from surgicai_vision.report import text
 from surgicai_vision.report.charts import KIND_COLOURS
@@ -72,7 +73,7 @@ def group_details(
         "title": item.label,
         "task": item.condition.task,
         "count": f"{item.successes}/{item.episodes}" if item.episodes else "",
-        "interval": text.interval(item.interval) if item.episodes else "",
+        "interval": percentages.interval(item.interval) if item.episodes else "",
         "across": item.across_text() if item.across else "",
         "cells": [_cell(result, commands.get(str(result.folder), [])) for result in item.results],
         "measures": _measures(item) if item.episodes else [],
@@ -90,7 +91,7 @@ def _cell(result: Result, commands: Sequence[str]) -> dict[str, object]:
     return {
         "seed": result.seed if result.trained else None,
         "count": f"{k}/{len(rows)}",
-        "interval": text.interval(clopper_pearson(k, len(rows))),
+        "interval": percentages.interval(clopper_pearson(k, len(rows))),
         "starts": _starts([row["seed"] for row in rows]),
         "outcomes": "".join(
             "s" if row["success"] else LETTERS.get(row["failure"], "?") for row in rows

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 
+from surgicai_vision.core import percentages
 from surgicai_vision.report import paper, text
 from surgicai_vision.report.groups import Group, starts_of
 from surgicai_vision.report.paper_comparison import beside_paper, our_text, paper_text
@@ -109,8 +110,8 @@ def _record(item: Group) -> tuple[str, ...]:
     return (
         *start,
         count,
-        text.percent(item.rate),
-        text.interval(item.interval),
+        percentages.percent(item.rate),
+        percentages.interval(item.interval),
         item.across_text(),
         *spread,
     )

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from surgicai_vision.core import percentages
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.evaluation.metrics import KINDS
 from surgicai_vision.report import text
@@ -141,7 +142,7 @@ class Group:
         std = 100 * self.across.std
         counts = [sum(bool(row["success"]) for row in result.rows) for result in self.results]
         by_seed = ", ".join(map(str, counts))
-        bounds = text.interval(self.across.interval)
+        bounds = percentages.interval(self.across.interval)
         return f"{mean:.1f} ± {std:.1f} % ({bounds}); by seed {by_seed}"
 
 

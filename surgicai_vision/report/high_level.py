@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from surgicai_vision.core import names
+from surgicai_vision.core import names, percentages
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.reader import Result
@@ -57,7 +57,7 @@ def _shown(results: list[Result]) -> HighLevel:
     labels = dict.fromkeys(f"{one.condition.policy}, seed {one.seed}" for one in results)
     said = [
         f"{errors.right} of {text.plural(errors.frames, 'frame')} named rightly "
-        f"({text.percent(errors.right / errors.frames)})",
+        f"({percentages.percent(errors.right / errors.frames)})",
         f"calibration error {errors.calibration_error:.3f}",
     ]
     if errors.progress_error is not None:

@@ -26,6 +26,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from surgicai_vision.core import percentages
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import write_bytes, write_json
@@ -35,7 +36,6 @@ from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS, advance_of
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, shifted_config
 from surgicai_vision.evaluation.statistics import clopper_pearson, mcnemar
 from surgicai_vision.evaluation.storage import read_evaluation, read_rows
-from surgicai_vision.report import text
 from surgicai_vision.scene import build_scene
 from surgicai_vision.training.run_config import RunConfig
 
@@ -298,8 +298,8 @@ def _table(rows: Sequence[Row]) -> list[dict[str, JSON]]:
                 "link": row.entry.link,
                 "policy": row.run.name,
                 "count": f"{wins}/{len(row.successes)}",
-                "rate": text.percent(wins / len(row.successes)),
-                "interval": text.interval(bounds),
+                "rate": percentages.percent(wins / len(row.successes)),
+                "interval": percentages.interval(bounds),
                 "against_best": _against(row, ordered[0]) if place else "",
                 "demonstrations": row.run.demonstrations,
                 "minutes": row.entry.minutes,

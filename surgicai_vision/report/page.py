@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
-from surgicai_vision.core import names
+from surgicai_vision.core import names, percentages
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.report import charts, curves, paper, sections, text
 from surgicai_vision.report.episodes import group_details, letters
@@ -82,7 +82,7 @@ def numbers(
         "learned_source": paper.LEARNED_SOURCE,
         "high_level": high_level_policies(collected.results),
         "subtasks": names.SUBTASKS,
-        "paper_procedure": ", ".join(text.percent(rate) for rate in paper.HIERARCHICAL),
+        "paper_procedure": ", ".join(percentages.percent(rate) for rate in paper.HIERARCHICAL),
         "probes": probes(collected.probes, groups),
         "pairs": [sections.pair_row(at, pair) for at, pair in enumerate(pairs)],
         "pairs_shown": sections.PAIRS_SHOWN,
@@ -117,7 +117,9 @@ def headline(groups: Sequence[Group]) -> dict[str, str]:
     sentence = f"{label} solves {count}"
     if shown.condition.trained and not shown.successes:
         sentence = f"No trained policy solves any of {shown.episodes} {starts}"
-    first = f"{text.percent(shown.rate)}, 95 % interval {text.interval(shown.interval)}."
+    first = (
+        f"{percentages.percent(shown.rate)}, 95 % interval {percentages.interval(shown.interval)}."
+    )
     lead = (
         f"That is {first}"
         if shown.successes or not shown.condition.trained
@@ -154,10 +156,10 @@ def _headline_of_many(evaluated: list[Group], tasks: list[str]) -> dict[str, str
             "lead": f"{episodes:,} episodes; the intervals of each policy stand below.",
         }
     bounds = (min(item.rate for item in best), max(item.rate for item in best))
-    span = " to ".join(dict.fromkeys(map(text.percent, bounds)))
+    span = " to ".join(dict.fromkeys(map(percentages.percent, bounds)))
     parts = [
-        f"{item.condition.task} {item.successes}/{item.episodes} ({text.interval(item.interval)};"
-        f" {item.label})"
+        f"{item.condition.task} {item.successes}/{item.episodes}"
+        f" ({percentages.interval(item.interval)}; {item.label})"
         for item in best
     ]
     warning = (

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 
+from surgicai_vision.core import percentages
 from surgicai_vision.core.tasks import task_names
-from surgicai_vision.report import paper, text
+from surgicai_vision.report import paper
 from surgicai_vision.report.experiment_key import Condition
 from surgicai_vision.report.groups import Group
 
@@ -47,7 +48,7 @@ def beside_paper(
 def paper_text(task: str, encoder: str, rate: float | None) -> str:
     """Return the paper's rate as text, or why there is none."""
     if rate is not None:
-        return text.percent(rate)
+        return percentages.percent(rate)
     return "not reported" if paper.has(task, encoder) else "not in the paper"
 
 
@@ -56,7 +57,7 @@ def our_text(item: Group | None) -> str:
     if item is None:
         return "not in this sweep"
     if item.episodes:
-        return f"{item.successes}/{item.episodes} ({text.interval(item.interval)})"
+        return f"{item.successes}/{item.episodes} ({percentages.interval(item.interval)})"
     return item.missing[0].state
 
 

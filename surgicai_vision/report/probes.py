@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from surgicai_vision.core import percentages
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import charts, text
 from surgicai_vision.report.charts import Point, Series
@@ -94,7 +95,7 @@ def _row(probe: Mapping[str, Any], mine: Sequence[Group]) -> ProbeRow:
         angle_sort=angle[0] if angle else "",
         n=probe.get("n", text.ABSENT),
         success=f"{k}/{n}" if n else text.ABSENT,
-        rate=text.percent(k / n) if n else "",
+        rate=percentages.percent(k / n) if n else "",
         point=point,
     )
 
@@ -139,7 +140,7 @@ def _chart(pairs: Sequence[tuple[ProbeRow, Point]]) -> Chart | None:
     drawing = charts.curves(
         lines, name, label=f"success [%] against {name}", ticks=ticks, joined=False
     )
-    return Chart("Success [%] against the probe", drawing, charts.key(encoders), (), ())
+    return Chart("Success [%] against the probe", drawing, charts.key(lines), (), ())
 
 
 def _correlations(pairs: Sequence[tuple[ProbeRow, Point]]) -> str:

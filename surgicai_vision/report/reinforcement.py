@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surgicai_vision.core import files, names
+from surgicai_vision.core import files, names, percentages
 from surgicai_vision.core.errors import BadFile
 from surgicai_vision.evaluation import statistics
 from surgicai_vision.report import aggregates, charts, paper, text
@@ -146,14 +146,14 @@ def _cells(row: Row, tasks: Sequence[str]) -> tuple[str, ...]:
     cells = []
     for task in tasks:
         theirs = paper.LEARNED.get(row.algo, {}).get(task)
-        beside = f"; paper {text.percent(theirs)}" if theirs is not None else ""
+        beside = f"; paper {percentages.percent(theirs)}" if theirs is not None else ""
         item = row.groups.get(task)
         if item is None:
             cells.append(text.ABSENT + beside)
             continue
         seeds = f", {text.plural(len(item.results), 'seed')}"
         count = f"{item.successes}/{item.episodes}{seeds}"
-        cells.append(f"{count} ({text.interval(item.interval)}){beside}")
+        cells.append(f"{count} ({percentages.interval(item.interval)}){beside}")
     mean, bounds, runs, of_tasks = row.aggregate
     middle = f"{mean:.2f} ({bounds[0]:.2f}–{bounds[1]:.2f}); {text.plural(runs, 'run')}"
     return (row.label, *cells, f"{middle}, {text.plural(of_tasks, 'task')}")
@@ -250,7 +250,7 @@ def _points(curves: Sequence[Sequence[CurvePoint]], x: Axis) -> tuple[Point, ...
         of = sum(point.episodes for point in here)
         bounds = statistics.clopper_pearson(won, of)
         where = float(np.mean([x(curve[index]) for curve in curves if index < len(curve)]))
-        words = f"{won}/{of} ({text.interval(bounds)}) at {where:.3g}"
+        words = f"{won}/{of} ({percentages.interval(bounds)}) at {where:.3g}"
         found.append(Point(where, won / of, *bounds, words))
     return tuple(found) if len({point.x for point in found}) > 1 else ()
 
@@ -273,8 +273,8 @@ def _chart(
     return Chart(
         title,
         charts.curves(drawn, x_name, label=f"{title}: success [%] on validation starts"),
-        charts.key([line.name if line.points else "" for line in drawn]),
-        ("algorithm", "last evaluation of each seed", f"first at {text.percent(MARK)}"),
+        charts.key(drawn),
+        ("algorithm", "last evaluation of each seed", f"first at {percentages.percent(MARK)}"),
         tuple(rows),
         f"{more} more in the table." if more else "",
     )

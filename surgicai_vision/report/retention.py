@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from markupsafe import Markup
 
-from surgicai_vision.core import names
+from surgicai_vision.core import names, percentages
 from surgicai_vision.core.config import RandomisationConfig
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation import statistics
@@ -130,7 +130,7 @@ def _last(row: Kept) -> tuple[float, float, float] | None:
 
 
 def _share(value: float | None) -> str:
-    return text.ABSENT if value is None else text.percent(value)
+    return text.ABSENT if value is None else percentages.percent(value)
 
 
 def _words(row: Kept) -> str:
@@ -144,7 +144,11 @@ def _words(row: Kept) -> str:
 def _kept_text(row: Kept) -> str:
     """Return the retention at the largest strength with its interval."""
     last = _last(row)
-    return text.ABSENT if last is None else f"{text.percent(last[0])} ({text.interval(last[1:])})"
+    return (
+        text.ABSENT
+        if last is None
+        else f"{percentages.percent(last[0])} ({percentages.interval(last[1:])})"
+    )
 
 
 def _row(row: Kept) -> tuple[str, ...]:
@@ -190,7 +194,7 @@ def looks(groups: Sequence[Group]) -> list[tuple[str, ...]]:
 def _count(wins: Mapping[Start, bool]) -> str:
     """Return k/n with its interval."""
     won, all_ = sum(wins.values()), len(wins)
-    return f"{won}/{all_} ({text.interval(statistics.clopper_pearson(won, all_))})"
+    return f"{won}/{all_} ({percentages.interval(statistics.clopper_pearson(won, all_))})"
 
 
 def _ratio(held_in: Mapping[Start, bool], held_out: Mapping[Start, bool]) -> str:
@@ -199,4 +203,4 @@ def _ratio(held_in: Mapping[Start, bool], held_out: Mapping[Start, bool]) -> str
     kept = statistics.retention(one, other) if one else None
     if kept is None or kept.ratio is None or kept.low is None or kept.high is None:
         return text.ABSENT
-    return f"{text.percent(kept.ratio)} ({text.interval((kept.low, kept.high))})"
+    return f"{percentages.percent(kept.ratio)} ({percentages.interval((kept.low, kept.high))})"

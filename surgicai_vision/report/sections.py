@@ -4,7 +4,7 @@ from collections.abc import Collection, Sequence
 
 from markupsafe import Markup
 
-from surgicai_vision.core import names
+from surgicai_vision.core import names, percentages
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.evaluation.metrics import KINDS
 from surgicai_vision.evaluation.statistics import clopper_pearson
@@ -40,7 +40,9 @@ def paper_rows(groups: Sequence[Group], index: dict[Condition, int]) -> list[dic
                     "paper": paper_text(task, encoder, rate),
                     "ours": count,
                     "interval": (
-                        text.interval(item.interval) if item is not None and evaluated else ""
+                        percentages.interval(item.interval)
+                        if item is not None and evaluated
+                        else ""
                     ),
                     "drawing": drawing,
                     "group": index[item.condition] if item is not None else None,
@@ -76,7 +78,7 @@ def ceilings(groups: Sequence[Group]) -> str:
         ]
         if of_task(groups, task):
             ours = f", ours {our_text(mine[-1])}" if mine else ""
-            parts.append(f"{task} {text.percent(rate)}{ours}")
+            parts.append(f"{task} {percentages.percent(rate)}{ours}")
     return "; ".join(parts)
 
 
@@ -178,7 +180,7 @@ def success_row(at: int, item: Group, best: Group | None) -> dict[str, object]:
     low, high = item.interval
     length = item.on_successes("trajectory_length_mm")
     steps = item.on_successes("steps")
-    label = f"{text.percent(item.rate)}, 95 % interval {text.interval((low, high))}"
+    label = f"{percentages.percent(item.rate)}, 95 % interval {percentages.interval((low, high))}"
     failures = ", ".join(
         f"{count} {kind.replace('_', ' ')}" for kind, count in item.failures.items()
     )
@@ -187,11 +189,11 @@ def success_row(at: int, item: Group, best: Group | None) -> dict[str, object]:
         "kind": "best" if item is best and item.successes else row["kind"],
         "successes": item.successes,
         "episodes": item.episodes,
-        "rate": text.percent(item.rate),
-        "interval": text.interval((low, high)),
+        "rate": percentages.percent(item.rate),
+        "interval": percentages.interval((low, high)),
         "drawing": charts.interval(item.rate, low, high, label),
         "across": item.across_text().partition(" (")[0],
-        "bootstrap": text.interval(item.across.interval) if item.across else "",
+        "bootstrap": percentages.interval(item.across.interval) if item.across else "",
         "seeds": len(item.results),
         "length": text.mean(length),
         "steps": text.mean(steps),

@@ -1,27 +1,12 @@
-"""Text: numbers as tables print them.
+"""Text: numbers as tables print them, intervals in brackets, absent is a dash.
 
-Percentages are whole, intervals in brackets, absent is a dash.
+Rates are written by `core.percentages`.
 """
 
 import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-
-from surgicai_vision.core.percentages import interval, percent
-
-__all__ = [
-    "ABSENT",
-    "either",
-    "finite",
-    "interval",
-    "mean",
-    "percent",
-    "plural",
-    "probability",
-    "quartiles",
-    "spread",
-]
 
 ABSENT = "–"
 

@@ -1,5 +1,6 @@
 """Demonstrations that the tests of reinforcement learning share."""
 
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -26,3 +27,12 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         write_marker(folder, task, "expert")
         folders[task] = folder
     return folders
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return an empty folder that stands in the place of the machine's temporary one."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder

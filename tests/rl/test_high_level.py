@@ -1,7 +1,6 @@
 """PPO over low-level policies: the env is the hierarchical policy's, the checkpoint its HLP."""
 
 import dataclasses
-import tempfile
 
 import numpy as np
 import pytest
@@ -121,11 +120,9 @@ def test_the_policy_of_the_best_evaluation_is_kept(tmp_path, monkeypatch):
     assert resumed.policy_sha256 == kept.policy_sha256
 
 
-def test_a_kill_changes_no_result(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    (tmp_path / "temporary").mkdir()
+def test_a_kill_changes_no_result(tmp_path, temporary, monkeypatch):
     whole = train_high_level(request_of(), tmp_path / "whole")
-    assert not list((tmp_path / "temporary").iterdir())
+    assert not list(temporary.iterdir())
     original = high_level._save
 
     def die(*arguments):

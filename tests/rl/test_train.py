@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import tempfile
 from dataclasses import replace
 
 import numpy as np
@@ -196,12 +195,10 @@ def test_learning_ends_once_it_is_solved_twice_in_a_row(killed_at, tmp_path, mon
 
 
 @pytest.mark.parametrize("algo", ["td3", "ppo", "bc"])
-def test_nothing_is_left_in_the_temporary_folder(algo, demos, tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    (tmp_path / "temporary").mkdir()
+def test_nothing_is_left_in_the_temporary_folder(algo, demos, tmp_path, temporary):
     request, paths = request_of(algo, demos)
     train(request, paths, tmp_path / "out", tensorboard=False)
-    assert not list((tmp_path / "temporary").iterdir())
+    assert not list(temporary.iterdir())
 
 
 def test_workers_change_no_result(demos, tmp_path):
