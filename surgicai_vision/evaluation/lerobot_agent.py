@@ -45,6 +45,12 @@ from surgicai_vision.evaluation.agent import (
     frame_of,
     simulated,
 )
+from surgicai_vision.features.devices import (
+    cuda_devices,
+    random_states,
+    seeded_random_states,
+    set_random_states,
+)
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training.run_config import OWN
 from surgicai_vision.training.threads import one_thread
@@ -298,24 +304,17 @@ class LeRobotAgent(Agent):
         self._text = text
         self._together = bool(getattr(self._policy, "memoryless", False))
         self._encoder = _encoder(inputs, weights) if inputs.encoder else None
-        device = str(next(self._policy.parameters()).device)
-        self._devices = ("cpu",) if device == "cpu" else ("cpu", device)
+        self._device = next(self._policy.parameters()).device
         self._slots: dict[int, tuple[LeRobotPolicy, dict[str, torch.Tensor]]] = {}
 
     def reset(self, slot: int, robot: Robot, seed: int) -> None:
         """Give the slot a policy that remembers nothing, and the random numbers of its seed."""
-        import torch
-
         policy = self._policy
         if not self._together:
             tensors = itertools.chain(policy.parameters(), policy.buffers())
             policy = copy.deepcopy(policy, {id(tensor): tensor for tensor in tensors})
         policy.reset()
-        states = {
-            device: torch.Generator(device).manual_seed(seed).get_state()
-            for device in self._devices
-        }
-        self._slots[slot] = policy, states
+        self._slots[slot] = policy, seeded_random_states(self._device, seed)
 
     def restart(self, slot: int) -> None:
         """Forget what the slot's policy has planned: its subtask begins anew."""
@@ -327,17 +326,16 @@ class LeRobotAgent(Agent):
         """Return the policy's actions, (n, 7) or (n, 16)."""
         import torch
 
-        cuda = [device for device in self._devices if device != "cpu"]
+        cuda = cuda_devices(self._device)
         with one_thread(), torch.inference_mode(), torch.random.fork_rng(devices=cuda):
             if self._together:
                 return self._act(self._policy, robots, observations)
             actions = []
             for slot, robot, observation in zip(slots, robots, observations, strict=True):
                 policy, states = self._slots[slot]
-                for device, state in states.items():
-                    _set_random(device, state)
+                set_random_states(states)
                 actions.append(self._act(policy, [robot], [observation]))
-                self._slots[slot] = policy, {device: _random(device) for device in states}
+                self._slots[slot] = policy, random_states(self._device)
             return np.concatenate(actions)
 
     def _state(self, robots: Sequence[Robot]) -> NDArray[np.float32]:
@@ -374,23 +372,6 @@ class LeRobotAgent(Agent):
         }
         action = self._after(policy.select_action(self._before(batch)))
         return np.asarray(action.to("cpu", torch.float32).numpy(), np.float32)
-
-
-def _random(device: str) -> "torch.Tensor":
-    """Return the state of a device's random numbers."""
-    import torch
-
-    return torch.get_rng_state() if device == "cpu" else torch.cuda.get_rng_state(device)
-
-
-def _set_random(device: str, state: "torch.Tensor") -> None:
-    """Put a device's random numbers into a state."""
-    import torch
-
-    if device == "cpu":
-        torch.set_rng_state(state)
-    else:
-        torch.cuda.set_rng_state(state, device)
 
 
 def _load(folder: Path, weights: WeightsSource) -> tuple[LeRobotPolicy, Before, After]:

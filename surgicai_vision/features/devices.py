@@ -1,9 +1,23 @@
-"""Devices: what `--device` names, light to import.
+"""Devices: what `--device` names, and the random numbers drawn on them; light to import.
 
 `auto` is a CUDA device where there is one, else the CPU.
+
+A computation on a GPU draws from two random states of torch, the CPU's and the GPU's:
+
+    states = random_states("cuda")      # both
+    …
+    set_random_states(states)           # what is drawn next is what was drawn then
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
 from surgicai_vision.core.errors import InputError, check_name
+
+if TYPE_CHECKING:
+    import torch
 
 AUTO = "auto"
 CPU = "cpu"
@@ -28,3 +42,38 @@ def find_device(name: str) -> str:
     if name == CUDA:
         raise InputError("--device cuda: torch finds no CUDA device; take cpu or auto.")
     return CPU
+
+
+def cuda_devices(device: str | torch.device) -> list[torch.device]:
+    """Return the CUDA devices that a computation on a device draws from: none, or that one."""
+    import torch
+
+    device = torch.device(device)
+    return [device] if device.type == CUDA else []
+
+
+def random_states(device: str | torch.device) -> dict[str, torch.Tensor]:
+    """Return torch's random states that a computation on a device draws from, by device."""
+    import torch
+
+    states = {str(cuda): torch.cuda.get_rng_state(cuda) for cuda in cuda_devices(device)}
+    return {CPU: torch.get_rng_state(), **states}
+
+
+def seeded_random_states(device: str | torch.device, seed: int) -> dict[str, torch.Tensor]:
+    """Return what `random_states` returns right after `torch.manual_seed(seed)`."""
+    import torch
+
+    names = [CPU, *map(str, cuda_devices(device))]
+    return {name: torch.Generator(name).manual_seed(seed).get_state() for name in names}
+
+
+def set_random_states(states: Mapping[str, torch.Tensor]) -> None:
+    """Put torch's random states where `random_states` found them."""
+    import torch
+
+    for name, state in states.items():
+        if name == CPU:
+            torch.set_rng_state(state)
+        else:
+            torch.cuda.set_rng_state(state, name)

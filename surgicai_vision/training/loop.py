@@ -18,6 +18,7 @@ from surgicai_vision.core.config import to_mapping
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.features.cache import Features
+from surgicai_vision.features.devices import cuda_devices, random_states, set_random_states
 from surgicai_vision.training.augment import with_noise, with_shift
 from surgicai_vision.training.averages import MovingAverage
 from surgicai_vision.training.checkpoint import (
@@ -301,7 +302,7 @@ class Training:
             "schedule": self.schedule.state_dict() if self.schedule else {},
             # Its integers are wider than a tensor's.
             "order": json.dumps(self.order.bit_generator.state),
-            "random": torch.get_rng_state(),
+            "random": random_states(self.device),
             "losses": self.losses,
             "held_losses": self.held_losses,
             "average": self.average.state() if self.average else {},
@@ -318,7 +319,7 @@ class Training:
         if self.schedule:
             self.schedule.load_state_dict(state["schedule"])
         self.order.bit_generator.state = json.loads(state["order"])
-        torch.set_rng_state(state["random"])
+        set_random_states(state["random"])
         self.losses = list(state["losses"])
         self.held_losses = list(state["held_losses"])
         if self.average:
@@ -351,11 +352,6 @@ class Training:
         )
         with self._averaged():
             return write_checkpoint(folder, checkpoint, self.policy.state_dict())
-
-
-def cuda_devices(device: torch.device) -> list[torch.device]:
-    """Return the CUDA devices whose random state a computation on `device` draws from."""
-    return [device] if device.type == "cuda" else []
 
 
 def _record(entry: Features) -> EncoderRecord:

@@ -34,9 +34,10 @@ from policies.base import Plugin, Policy, Recipe
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
+from surgicai_vision.features.devices import cuda_devices
 from surgicai_vision.training.checkpoint import Checkpoint
 from surgicai_vision.training.folder import begin, remove_state
-from surgicai_vision.training.loop import Log, Training, cuda_devices
+from surgicai_vision.training.loop import Log, Training
 from surgicai_vision.training.request import TrainingRequest, check_request, request_table
 from surgicai_vision.training.run_config import RunConfig
 from surgicai_vision.training.threads import one_thread
@@ -94,7 +95,9 @@ def train(
         return done
     _keep_memory()
     where = torch.device(device)
-    with torch.random.fork_rng(devices=cuda_devices(where)), one_thread():
+    # On a GPU the same seed gives the same weights only by kernels that sum in a fixed order.
+    same_bits = torch.backends.cudnn.flags(enabled=True, deterministic=True)
+    with torch.random.fork_rng(devices=cuda_devices(where)), one_thread(), same_bits:
         checkpoint = Training(request, start, where).run(out, save_every, progress, log)
     remove_state(out)
     return checkpoint

@@ -1,5 +1,6 @@
 """A machine without OpenGL: said in one line, before any work."""
 
+import ctypes.util
 import os
 import subprocess
 import sys
@@ -7,22 +8,40 @@ from pathlib import Path
 
 import pytest
 
-WITHOUT = {**os.environ, "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}
+Done = subprocess.CompletedProcess[str]
+WITHOUT = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}
 
 
-@pytest.mark.parametrize("verb", ["quickstart", "release", "render-demos"])
-def test_work_that_ends_in_images_is_refused_at_once(verb: str, tmp_path: Path) -> None:
-    environment = {**WITHOUT, "SURGICAI_VISION_RELEASED": str(tmp_path / "released")}
-    done = subprocess.run(
-        [sys.executable, "-m", "surgicai_vision", verb, "--out", "out"],
-        cwd=tmp_path,
-        env=environment,
+def run(
+    verb: str, *options: str, where: Path, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "surgicai_vision", verb, *options],
+        cwd=where,
+        env={**os.environ, **variables},
         capture_output=True,
         text=True,
         check=False,
     )
+
+
+@pytest.mark.parametrize("verb", ["quickstart", "release", "render-demos"])
+def test_work_that_ends_in_images_is_refused_at_once(verb: str, tmp_path: Path) -> None:
+    released = str(tmp_path / "released")
+    done = run(verb, "--out", "out", where=tmp_path, **WITHOUT, SURGICAI_VISION_RELEASED=released)
     (line,) = done.stderr.splitlines()
     assert done.returncode == 2, line
     assert "No image can be drawn: 'egl' gives no OpenGL" in line
     assert "apt-get install --yes --no-install-recommends libegl1 libgl1" in line
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(bool(ctypes.util.find_library("OSMesa")), reason="OSMesa is on this machine")
+def test_what_draws_nothing_runs_without_the_library_that_is_named(tmp_path: Path) -> None:
+    options = ("--task", "handoff", "--episodes", "1", "--out", "demos")
+    done = run("record-demos", *options, where=tmp_path, MUJOCO_GL="osmesa")
+    assert done.returncode == 0, done.stderr
+    done = run("render-demos", "--demos", "demos", where=tmp_path, MUJOCO_GL="osmesa")
+    assert done.returncode == 2
+    assert "'osmesa' gives no OpenGL (its library is not on this machine)" in done.stderr
+    assert "Traceback" not in done.stderr
