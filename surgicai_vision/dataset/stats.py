@@ -33,7 +33,7 @@ class ImageStatistics:
         if frame.dtype == np.uint8:
             for channel in range(3):
                 counts = cv2.calcHist([frame], [channel], None, [256], [0, 256])
-                self._histogram[channel] += counts[:, 0]
+                self._histogram[channel] += counts.ravel()
         else:
             self._depths.append(frame[::DEPTH_STRIDE, ::DEPTH_STRIDE].ravel().astype(np.float32))
 
