@@ -22,14 +22,20 @@ from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_enco
 from surgicai_vision.training.run_config import OWN, RunConfig
 
 OPTIONS = {
+    "act": ("--policy.chunk_size=25", "--policy.n_action_steps=5"),
     "diffusion": (
         "--policy.use_group_norm=true",
         "--policy.noise_scheduler_type=DDIM",
         "--policy.num_inference_steps=10",
     )
 }
-"""What a policy needs besides: to start its backbone from random weights, and ten steps of
-denoising in the place of a hundred, which take minutes an episode on a core."""
+"""What a policy is given besides LeRobot's defaults.
+
+ACT plans half a second and acts on its first tenth, as by recipe `act`; for each frame of a plan
+LeRobot decodes an image (docs/upstream.md), so that a shorter one also trains faster. Diffusion
+starts its backbone from random weights, and takes ten steps of denoising in the place of a hundred,
+which take minutes an episode on a core.
+"""
 SCRATCH = "export"
 VARIABLES = {**OFFLINE, "HF_DATASETS_DISABLE_PROGRESS_BARS": "1", "WANDB_MODE": "disabled"}
 """Environment of `lerobot-train`."""

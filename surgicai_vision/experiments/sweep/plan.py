@@ -16,6 +16,7 @@ from surgicai_vision.evaluation.storage import GRID_FILE, RESULT_FILE, read_vers
 from surgicai_vision.experiments.plan_config import plan_of
 from surgicai_vision.experiments.sweep.experiment import Experiment, Training
 from surgicai_vision.experiments.sweep.grid import Grid
+from surgicai_vision.experiments.sweep.lerobot import OPTIONS
 from surgicai_vision.experiments.sweep.rl_grid import RLGrid
 from surgicai_vision.experiments.sweep.selection import EVERYTHING, Choice, is_chosen
 from surgicai_vision.features import encoders
@@ -419,11 +420,13 @@ class Jobs:
         }
 
     def _inputs(self, run: RunConfig, dataset: str) -> list[str]:
-        """Return hashes of what a run reads: its dataset, its encoder, its recipe."""
+        """Return what a run depends on: its dataset, its encoder, its recipe or options."""
         inputs = [self.dataset_digest(dataset) or ""]
         if run.encoder and run.encoder != OWN:
             inputs.append(_card_digest(run.encoder))
-        if not run.by_lerobot_train:
+        if run.by_lerobot_train:
+            inputs.extend(OPTIONS.get(run.policy, ()))
+        else:
             inputs.append(_recipe_digest(run.policy, run.recipe, run.changes, run.privileged))
         return inputs
 
