@@ -71,8 +71,11 @@ def train_lerobot(
         root = out.with_name(SCRATCH)
         _export(run, dataset, root, weights, device or AUTO)
     arguments = _arguments(run, dataset, root, out)
+    where = find_device(device or CPU)
+    if where == CPU:
+        arguments.append("--num_workers=0")  # LeRobot's four would take the cores that train
     arguments += [
-        f"--policy.device={find_device(device or CPU)}",
+        f"--policy.device={where}",
         f"--steps={run.updates}",
         f"--save_freq={run.updates}",
         f"--batch_size={run.batch_size}",
@@ -109,7 +112,6 @@ def _arguments(run: RunConfig, dataset: Dataset, root: Path, out: Path) -> list[
         "--policy.pretrained_backbone_weights=null",
         "--policy.push_to_hub=false",
         "--env_eval_freq=0",
-        "--num_workers=0",
         f"--seed={run.seed}",
         f"--output_dir={out}",
         *OPTIONS.get(run.policy, ()),
