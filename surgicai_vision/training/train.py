@@ -24,8 +24,8 @@ machine.
 
 import ctypes
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
@@ -95,9 +95,7 @@ def train(
         return done
     _keep_memory()
     where = torch.device(device)
-    # On a GPU the same seed gives the same weights only by kernels that sum in a fixed order.
-    same_bits = torch.backends.cudnn.flags(enabled=True, deterministic=True)
-    with torch.random.fork_rng(devices=cuda_devices(where)), one_thread(), same_bits:
+    with _repeatable(where):
         checkpoint = Training(request, start, where).run(out, save_every, progress, log)
     remove_state(out)
     return checkpoint
@@ -125,12 +123,23 @@ def epochs_within(
     _keep_memory()
     where = torch.device(device)
     clock = time.process_time if where.type == "cpu" else time.perf_counter
-    with torch.random.fork_rng(devices=cuda_devices(where)), one_thread():
+    with _repeatable(where):
         begun = clock()
         training = Training(request, None, where)
         prepared = clock() - begun
         seconds = training.time_epoch(clock)
     return max(1, int((60 * minutes - prepared) / seconds))
+
+
+@contextmanager
+def _repeatable(device: torch.device) -> Iterator[None]:
+    """Let the same seed give the same weights, and the caller's random numbers be as they were.
+
+    On a GPU that takes kernels that sum in a fixed order.
+    """
+    fixed_order = torch.backends.cudnn.flags(enabled=True, deterministic=True)
+    with torch.random.fork_rng(devices=cuda_devices(device)), one_thread(), fixed_order:
+        yield
 
 
 def _keep_memory() -> None:

@@ -27,7 +27,7 @@ OPTIONS = {
         "--policy.use_group_norm=true",
         "--policy.noise_scheduler_type=DDIM",
         "--policy.num_inference_steps=10",
-    )
+    ),
 }
 """What a policy is given besides LeRobot's defaults.
 
