@@ -9,7 +9,7 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-import surgicai_vision.core.mujoco_import  # noqa: F401  # before all that imports MuJoCo
+import surgicai_vision.scene.mujoco_import  # noqa: F401  # before all that imports MuJoCo
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig, from_mapping
 from surgicai_vision.core.errors import InputError

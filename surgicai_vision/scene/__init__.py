@@ -4,7 +4,7 @@
 arms' kinematics in `scene.kinematics`. See `scene.compose` for the interface.
 """
 
-import surgicai_vision.core.mujoco_import  # noqa: F401  # before all that imports MuJoCo
+import surgicai_vision.scene.mujoco_import  # noqa: F401  # before all that imports MuJoCo
 from surgicai_vision.scene.compose import ArmIds, Scene, build_scene, build_spec
 
 __all__ = ["ArmIds", "Scene", "build_scene", "build_spec"]
