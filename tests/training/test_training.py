@@ -26,6 +26,7 @@ from surgicai_vision.training.checkpoint import (
     read_checkpoint,
 )
 from surgicai_vision.training.data import split
+from surgicai_vision.training.folder import read_state, write_state
 from surgicai_vision.training.policies import (
     load_policy,
     load_recipe,
@@ -172,6 +173,22 @@ def test_broken_off_training_resumes_to_the_same_weights(
     assert seen[0] == 5 and seen[-1] == recipe.epochs
     assert tensors_of(tmp_path / "whole") == tensors_of(tmp_path / "broken")
     assert not (tmp_path / "broken" / "training_state.pt").exists()
+
+
+def test_a_training_that_was_begun_on_a_gpu_goes_on_without_one(tmp_path: Path) -> None:
+    dataset = FakeDataset()
+
+    def stop(done: int, total: int) -> None:
+        if done == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path, progress=stop)
+    state = read_state(tmp_path)
+    assert state is not None
+    write_state(tmp_path, {**state, "random": {**state["random"], "cuda": torch.zeros(16)}})
+    checkpoint = train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path)
+    assert checkpoint.epoch == QUICK.epochs
 
 
 def test_training_again_does_nothing_and_another_request_is_refused(tmp_path: Path) -> None:
