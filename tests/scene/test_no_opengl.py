@@ -15,10 +15,12 @@ WITHOUT = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}
 def run(
     verb: str, *options: str, where: Path, **variables: str
 ) -> subprocess.CompletedProcess[str]:
+    # This process may have drawn with EGL, and PyOpenGL has written so into its environment.
+    ours = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
     return subprocess.run(
         [sys.executable, "-m", "surgicai_vision", verb, *options],
         cwd=where,
-        env={**os.environ, **variables},
+        env={**ours, **variables},
         capture_output=True,
         text=True,
         check=False,
