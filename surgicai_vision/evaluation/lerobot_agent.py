@@ -333,7 +333,7 @@ class LeRobotAgent(Agent):
             actions = []
             for slot, robot, observation in zip(slots, robots, observations, strict=True):
                 policy, states = self._slots[slot]
-                set_random_states(states)
+                set_random_states(states, self._device)
                 actions.append(self._act(policy, [robot], [observation]))
                 self._slots[slot] = policy, random_states(self._device)
             return np.concatenate(actions)

@@ -6,7 +6,7 @@ A computation on a GPU draws from two random states of torch, the CPU's and the 
 
     states = random_states("cuda")      # both
     …
-    set_random_states(states)           # what is drawn next is what was drawn then
+    set_random_states(states, "cuda")   # what is drawn next is what was drawn then
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def random_states(device: str | torch.device) -> dict[str, torch.Tensor]:
     """Return torch's random states that a computation on a device draws from, by device."""
     import torch
 
-    states = {str(cuda): torch.cuda.get_rng_state(cuda) for cuda in cuda_devices(device)}
+    states = {name: torch.cuda.get_rng_state(name) for name in _names(device) if name != CPU}
     return {CPU: torch.get_rng_state(), **states}
 
 
@@ -64,16 +64,25 @@ def seeded_random_states(device: str | torch.device, seed: int) -> dict[str, tor
     """Return what `random_states` returns right after `torch.manual_seed(seed)`."""
     import torch
 
-    names = [CPU, *map(str, cuda_devices(device))]
-    return {name: torch.Generator(name).manual_seed(seed).get_state() for name in names}
+    return {name: torch.Generator(name).manual_seed(seed).get_state() for name in _names(device)}
 
 
-def set_random_states(states: Mapping[str, torch.Tensor]) -> None:
-    """Put torch's random states where `random_states` found them."""
+def set_random_states(states: Mapping[str, torch.Tensor], device: str | torch.device) -> None:
+    """Put torch's random states where `random_states` found them.
+
+    Args:
+        states: from `random_states`; of another device than this one only the CPU's is taken.
+        device: what is computed on.
+    """
     import torch
 
-    for name, state in states.items():
+    for name in _names(device):
         if name == CPU:
-            torch.set_rng_state(state)
-        else:
-            torch.cuda.set_rng_state(state, name)
+            torch.set_rng_state(states[name])
+        elif name in states:
+            torch.cuda.set_rng_state(states[name], name)
+
+
+def _names(device: str | torch.device) -> list[str]:
+    """Return the devices whose random states a computation on a device draws from."""
+    return [CPU, *map(str, cuda_devices(device))]

@@ -319,10 +319,7 @@ class Training:
         if self.schedule:
             self.schedule.load_state_dict(state["schedule"])
         self.order.bit_generator.state = json.loads(state["order"])
-        # One that was begun on another device goes on with that of its own where there is one.
-        stored = state["random"]
-        kept = [name for name in random_states(self.device) if name in stored]
-        set_random_states({name: stored[name] for name in kept})
+        set_random_states(state["random"], self.device)
         self.losses = list(state["losses"])
         self.held_losses = list(state["held_losses"])
         if self.average:

@@ -61,6 +61,13 @@ class FakeDataset(FakeData):
         return dict(self._columns)
 
 
+def recorded(episodes: int = 5, steps: int = 40) -> FakeDataset:
+    """Return a dataset that tells the time of its frames."""
+    dataset = FakeDataset(episodes, steps)
+    dataset._columns["timestamp"] = np.tile(np.arange(steps) / names.FPS, episodes)
+    return dataset
+
+
 def fake_procedures(episodes: int = 6, steps: int = 40) -> FakeDataset:
     """Return whole procedures whose arms tell the phase and the time since it began."""
     dataset = FakeDataset(episodes, 5 * steps, TaskConfig(names.SUTURE), names.SUTURE)

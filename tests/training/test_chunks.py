@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 import pytest
 import torch
-from fake_dataset import DIM, FakeDataset, fake_procedures, features_of
+from fake_dataset import DIM, FakeDataset, fake_procedures, features_of, recorded
 from torch import nn
 
 from policies.base import ACTIONS, Plugin, Recipe
@@ -81,12 +81,6 @@ def registered(monkeypatch: pytest.MonkeyPatch):
     POLICIES.register("linear", LINEAR)
     yield
     POLICIES.unregister("linear")
-
-
-def recorded(episodes: int = 5, steps: int = 40) -> FakeDataset:
-    dataset = FakeDataset(episodes, steps)
-    dataset._columns["timestamp"] = np.tile(np.arange(steps) / names.FPS, episodes)
-    return dataset
 
 
 def chunked(stride: int = 1) -> tuple[FakeDataset, Dataset]:

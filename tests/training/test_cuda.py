@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fake_dataset import FakeDataset, features_of
+from fake_dataset import features_of, recorded
 from photographs import hopper
 from tiny_encoder import TINY
 
 from encoders.base import Encoder
-from surgicai_vision.core import names
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.devices import CPU, CUDA
 from surgicai_vision.training.chunks import timeline_of, with_chunks
@@ -32,8 +31,7 @@ def train_small(policy: str, out: Path, device: str, stop_after: int = 0) -> Non
 
     recipe = load_recipe(policy, RECIPES[policy], {"epochs": 7, "batch_size": 64, "map_shift": 1})
     plugin = policy_plugin(policy)
-    whole = FakeDataset()
-    whole._columns["timestamp"] = np.tile(np.arange(whole.steps) / names.FPS, whole.episodes)
+    whole = recorded()
     dataset: Dataset = whole
     if plugin.offsets:
         dataset = with_chunks(whole, timeline_of(whole), plugin.offsets(recipe))

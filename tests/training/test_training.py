@@ -42,6 +42,12 @@ def tensors_of(folder: Path) -> bytes:
     return (folder / WEIGHTS).read_bytes()
 
 
+def stop(done: int, total: int) -> None:
+    """Break a training off after its seventh epoch, as `progress`."""
+    if done == 7:
+        raise KeyboardInterrupt
+
+
 def test_paper_recipe_is_the_paper() -> None:
     assert load_recipe("bc", "paper") == Recipe()
     assert Recipe().hidden == (256, 256, 256) and Recipe().learning_rate == 1e-3
@@ -152,10 +158,6 @@ def test_broken_off_training_resumes_to_the_same_weights(
     recipe = replace(QUICK, **changes)
     dataset = FakeDataset()
 
-    def stop(done: int, total: int) -> None:
-        if done == 7:
-            raise KeyboardInterrupt
-
     train(dataset, [features_of(dataset)], BC, recipe, out=tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         train(dataset, [features_of(dataset)], BC, recipe, out=tmp_path / "broken", progress=stop)
@@ -177,10 +179,6 @@ def test_broken_off_training_resumes_to_the_same_weights(
 
 def test_a_training_that_was_begun_on_a_gpu_goes_on_without_one(tmp_path: Path) -> None:
     dataset = FakeDataset()
-
-    def stop(done: int, total: int) -> None:
-        if done == 7:
-            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path, progress=stop)
