@@ -22,19 +22,40 @@ from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_enco
 from surgicai_vision.training.run_config import OWN, RunConfig
 
 OPTIONS = {
-    "act": ("--policy.chunk_size=25", "--policy.n_action_steps=5"),
+    "act": (
+        "--policy.chunk_size=25",
+        "--policy.n_action_steps=5",
+        "--policy.dim_model=128",
+        "--policy.dim_feedforward=512",
+        "--policy.n_heads=4",
+        "--policy.n_encoder_layers=2",
+        "--policy.use_vae=false",
+        "--policy.optimizer_lr=1e-4",
+        "--policy.optimizer_lr_backbone=1e-4",
+    ),
     "diffusion": (
+        "--policy.n_obs_steps=1",
+        "--policy.horizon=16",
+        "--policy.n_action_steps=8",
+        "--policy.drop_n_last_frames=0",
         "--policy.use_group_norm=true",
+        "--policy.down_dims=[32,64,128]",
+        "--policy.diffusion_step_embed_dim=32",
         "--policy.noise_scheduler_type=DDIM",
         "--policy.num_inference_steps=10",
+        "--policy.prediction_type=sample",
+        "--policy.optimizer_lr=3e-4",
+        "--policy.scheduler_warmup_steps=100",
     ),
 }
 """What a policy is given besides LeRobot's defaults.
 
-ACT plans half a second and acts on its first tenth, as by recipe `act`; for each frame of a plan
-LeRobot decodes an image (docs/upstream.md), so that a shorter one also trains faster. Diffusion
-starts its backbone from random weights, and takes ten steps of denoising in the place of a hundred,
-which take minutes an episode on a core.
+Widths and plans are much as by the recipes `act` and `diffusion`: a core trains such networks in
+half an hour (docs/results/yardstick.md).
+
+ACT plans half a second and acts on its first tenth; for each frame of a plan LeRobot decodes an
+image (docs/upstream.md), so that a shorter one also trains faster. A backbone starts from random
+weights here, and LeRobot's learning rate for it, 1e-5, is for pretrained ones.
 """
 SCRATCH = "export"
 VARIABLES = {**OFFLINE, "HF_DATASETS_DISABLE_PROGRESS_BARS": "1", "WANDB_MODE": "disabled"}
