@@ -143,8 +143,8 @@ def _heat(item: Group | None, index: dict[Condition, int]) -> dict[str, object]:
         }
     back, front = charts.heat(item.rate)
     return {
-        "text": f"{100 * item.rate:.0f}",
-        "small": f"{100 * item.interval[0]:.0f}–{100 * item.interval[1]:.0f}",
+        "text": percentages.percent(item.rate).removesuffix(" %"),
+        "small": percentages.interval(item.interval).removesuffix(" %"),
         "title": f"{title}: {our_text(item)}",
         "group": group,
         "state": "",

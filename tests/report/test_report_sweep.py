@@ -420,6 +420,23 @@ def test_a_map_says_once_what_all_its_policies_share(groups):
     assert alone["columns"] == ["imagenet-lite-early · spatial · best"]
 
 
+def test_a_map_says_all_of_all_alone(groups):
+    result, row = groups[0].results[0], groups[0].rows[0]
+    won = [{**row, "success": True}] * 299
+    last = {"grasp": True, "place": False}
+    mine = [
+        replace(
+            groups[0],
+            condition=Condition(task, "imagenet-lite", ("front",)),
+            results=(replace(result, rows=[*won, {**row, "success": success}]),),
+        )
+        for task, success in last.items()
+    ]
+    (drawn,) = heat_maps(mine, {item.condition: at for at, item in enumerate(mine)})
+    cells = [cell["text"] for line in drawn["rows"] for cell in line["cells"]]
+    assert cells == ["100", "99.7"]
+
+
 def test_curves_procedure_and_probes_are_drawn_with_their_numbers(text, groups):
     for section in ("curves", "procedure", "probes"):
         assert f'<h2 id="{section}">' in text
