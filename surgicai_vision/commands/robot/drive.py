@@ -48,9 +48,10 @@ app = App(
     name="drive",
     help_epilogue="""\
 example:
-  surgicai-vision robot drive hierarchical.yaml --simulated --clock stepped --send
+  surgicai-vision robot drive released:suture --simulated --clock stepped --send
 at the simulation that this serves in another terminal:
-  surgicai-vision robot serve --clock stepped --advance told --view front,back
+  surgicai-vision robot serve --task suture --clock stepped --advance told \\
+      --view front_psm1,front_psm2,back_psm1,back_psm2
 
 Without --send nothing is sent: it prints what would be. docs/robot.md says what the guards ask.""",
 )

@@ -5,7 +5,7 @@ or only the images the agent is given (`core.corruption`); `all` does everything
 world every episode draws its own direction from its seed, uniform in ± the axis's size; the
 strength scales the size. It comes on top of the task's own randomisation of the axis.
 
-Strength 1 is where a person still recognises the scene, barely; `surgicai-vision scene --axis all`
+Strength 1 is where a person still recognises the scene, barely; `surgicai-vision scene --axes FILE`
 draws every axis at every strength.
 """
 

@@ -3,7 +3,7 @@
 `FAMILIES` is the table, in the order of `names.APPEARANCES`. A family owns its parts: no pattern,
 finish, lamp or colour of a held-out family is one of a family for training, and tests prove it
 (`tests/scene/test_appearance.py`). Colours are 0 to 255; they and all bounds were chosen by eye on
-the contact sheets (`surgicai-vision scene --appearance all`), not measured on tissue.
+the contact sheets (`surgicai-vision scene --looks FILE`), not measured on tissue.
 """
 
 from collections.abc import Callable, Mapping
