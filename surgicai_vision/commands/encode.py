@@ -67,7 +67,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     if options.export:
         if options.pool != "global":
             raise InputError(f"--export writes global features; leave --pool {options.pool} out.")
-        check_output(options.export)
+        check_output(options.export, option="--export")
     from surgicai_vision.features.cache import encode
 
     encoder = encoders.load_encoder(options.encoder, options.pool, weights, options.device)

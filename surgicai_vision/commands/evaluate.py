@@ -94,7 +94,7 @@ class Options:
     out: Annotated[
         Path | None,
         DIRECTORY,
-        default_text("outputs/evaluations/<task>-<policy>-starts<seed>+<episodes>"),
+        default_text("outputs/evaluations/<task>-<policy>-<training>-starts<seed>+<episodes>"),
     ] = None
     video: Annotated[Path | None, DIRECTORY] = None
     video_of: Annotated[str, Parameter(metavar="WHICH")] = "all"
@@ -108,7 +108,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     """Evaluate, keep the rows and print the summary."""
     from surgicai_vision.envs.upset import check_upset_task
     from surgicai_vision.evaluation.run import evaluate_into
-    from surgicai_vision.evaluation.storage import MARKER
+    from surgicai_vision.evaluation.storage import MARKER, OURS
 
     if options.expert_swap == ALL:
         refused = {
@@ -135,9 +135,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         check_upset_task(spec.config.task)
         spec = replace(spec, run=replace(spec.run, upset=True))
     seeds = range(options.seed, options.seed + options.episodes)
-    default = folders.evaluation_folder(spec.config.task, spec.name, options.seed, options.episodes)
-    out = options.out or default
-    folders.check_folder(out, MARKER)
+    out = options.out or folders.evaluation_folder(spec, options.seed, options.episodes)
+    folders.check_folder(out, MARKER, ours=OURS)
     filming = _filming(options)
     with console.stage(f"evaluating {spec.name} on {spec.config.task}", "steps") as progress:
         result = evaluate_into(out, spec, seeds, options.workers, progress, filming)
@@ -234,9 +233,7 @@ def _evaluate_swaps(options: Options, console: Console) -> dict[str, object]:
     weights = WeightsSource.parse(options.weights, options.accept_licence)
     variants = variants_of(path, cast("dict[str, JSON] | None", options.env), weights)
     plain = variants[AS_IT_IS]
-    default = folders.evaluation_folder(
-        plain.config.task, plain.name, options.seed, options.episodes
-    )
+    default = folders.evaluation_folder(plain, options.seed, options.episodes)
     out = options.out or default.with_name(f"{default.name}-expert-swaps")
     folders.check_folder(out, MARK)
     seeds = range(options.seed, options.seed + options.episodes)

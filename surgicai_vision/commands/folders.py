@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ from surgicai_vision.core.errors import BadFile, InputError, check_name
 
 if TYPE_CHECKING:
     from surgicai_vision.dataset import RenderedDataset
+    from surgicai_vision.evaluation.policy_spec import PolicySpec
 
 OUTPUTS = Path("outputs")
 CORES = len(os.sched_getaffinity(0))
@@ -31,20 +32,26 @@ def train_folder(task: str, name: str, seed: int) -> Path:
     return OUTPUTS / "train" / f"{task}-{name}-seed{seed}"
 
 
-def evaluation_folder(task: str, policy: str, seed: int, episodes: int) -> Path:
-    """Return the folder of one evaluation."""
-    return OUTPUTS / "evaluations" / f"{task}-{policy}-starts{seed}+{episodes}"
+def evaluation_folder(spec: "PolicySpec", seed: int, episodes: int) -> Path:
+    """Return the folder of one evaluation of a policy, by its first start and their number."""
+    return OUTPUTS / "evaluations" / f"{spec.folder_name}-starts{seed}+{episodes}"
 
 
-def check_folder(out: Path, marker: str, option: str = "--out") -> None:
+def robustness_folder(spec: "PolicySpec", seed: int, episodes: int) -> Path:
+    """Return the folder of one policy's curves, by its first start and their number."""
+    return OUTPUTS / "robustness" / f"{spec.folder_name}-starts{seed}+{episodes}"
+
+
+def check_folder(out: Path, marker: str, option: str = "--out", ours: Collection[str] = ()) -> None:
     """Refuse an output folder that cannot be written or holds something else, before any work.
 
     Args:
         out: the folder to be made or continued.
         marker: the file that marks it as ours.
         option: what the folder was given as, for the message.
+        ours: names of files that a killed run may leave without the mark.
     """
-    files.check_output(out, may_resume=marker, option=option)
+    files.check_output(out, may_resume=marker, option=option, ours=ours)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=files.TEMPORARY):

@@ -22,6 +22,7 @@ from surgicai_vision.commands.options import (
     VIEWS,
     EnvFields,
     default_text,
+    task_config,
     within,
 )
 from surgicai_vision.core import names
@@ -100,6 +101,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     from surgicai_vision.core.executor import LOCAL, RunContext, open_engine
     from surgicai_vision.dataset import render_demos
     from surgicai_vision.dataset.layouts import LAYOUTS
+    from surgicai_vision.dataset.render import check_request
     from surgicai_vision.scene.opengl import check_opengl
 
     # Everything that can be wrong is found before any work.
@@ -120,6 +122,10 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     of_others = "" if options.layout == "surgicai" else f"-{options.layout}"
     out = options.out or folders.dataset_folder(f"{task}{of_others}")
     folders.check_folder(out, names.META_FILE)
+    layout = LAYOUTS[options.layout]
+    check_request(options.view, options.size, options.frame_stride, options.video, options.layout)
+    if not options.demos:
+        layout.task_config(task_config(task, options.env), options.frame_stride)
     if context.engine == LOCAL:  # elsewhere it is the workers that must draw
         check_opengl()
     demos = options.demos or [_record(options, task, console)]
@@ -143,7 +149,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     return {
         **dataclasses.asdict(summary),
         "task": task,
-        "views": list(options.view) or list(LAYOUTS[options.layout].views),
+        "views": list(options.view) or list(layout.views),
         "dataset": str(out),
     }
 

@@ -72,7 +72,7 @@ class Options:
     out: Annotated[
         Path | None,
         DIRECTORY,
-        default_text("outputs/robustness/<task>-<policy>-starts<seed>+<episodes>"),
+        default_text("outputs/robustness/<task>-<policy>-<training>-starts<seed>+<episodes>"),
     ] = None
     env: EnvFields = None
 
@@ -89,8 +89,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         options.dataset,
         WeightsSource.parse(options.weights, options.accept_licence),
     )
-    name = f"{spec.config.task}-{spec.name}-starts{options.seed}+{options.episodes}"
-    out = options.out or folders.OUTPUTS / "robustness" / name
+    out = options.out or folders.robustness_folder(spec, options.seed, options.episodes)
     folders.check_folder(out, MARK)
     seeds = range(options.seed, options.seed + options.episodes)
     rows = robustness(

@@ -21,7 +21,7 @@ from surgicai_vision.commands.options import (
     task_config,
     within,
 )
-from surgicai_vision.core import names
+from surgicai_vision.core import files, names
 from surgicai_vision.core.cameras import camera_names
 
 app = App(
@@ -143,7 +143,8 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     figure = contact_sheet.sheet(
         rows, [f"{moment}: {modality}" for moment, modality in shown], title
     )
-    figure.savefig(path, dpi=140)
+    with files.whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=140)
     console.say(f"sheet: {path}")
     return {
         "sheet": str(path),
@@ -184,7 +185,8 @@ def _film(path: Path, options: Options, console: Console) -> dict[str, object]:
     figure = contact_sheet.sheet(
         rows, columns, f"the scripted expert, seed {options.seed}, seen by {options.view[0]}"
     )
-    figure.savefig(path, dpi=110)
+    with files.whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=110)
     console.say(f"film: {path}")
     return {"film": str(path), "view": options.view[0], "seed": options.seed, "subtasks": outcomes}
 
@@ -244,7 +246,8 @@ def _axes(path: Path, options: Options, console: Console) -> dict[str, object]:
         [f"strength {strength:g}" for strength in STRENGTHS],
         f"axes of robustness: {options.task}, seed {options.seed}, seen by {view}",
     )
-    figure.savefig(path, dpi=100)
+    with files.whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=100)
     console.say(f"sheet: {path}")
     return {"axes": {axis: AXES[axis].text for axis in shown}, "sheet": str(path), "view": view}
 
@@ -275,7 +278,8 @@ def _looks(path: Path, options: Options, console: Console) -> dict[str, object]:
             progress(done + 1, len(families))
     columns = [f"{view}, seed {seed}" for seed in seeds for view in options.view]
     figure = contact_sheet.sheet(rows, columns, f"looks: the start of {options.task}")
-    figure.savefig(path, dpi=80)
+    with files.whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=80)
     console.say(f"sheet: {path}")
     return {"looks": [name for name, _ in rows], "sheet": str(path), "views": list(options.view)}
 
@@ -291,6 +295,7 @@ def _world(path: Path, kind: str, options: Options, console: Console) -> dict[st
     with console.stage("rendering"):
         rows, columns = draw(config.scene, view, options.seed, options.size, options.quality)
     figure = contact_sheet.sheet(rows, columns, f"{kind} of a world that varies, seen by {view}")
-    figure.savefig(path, dpi=110)
+    with files.whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=110)
     console.say(f"sheet: {path}")
     return {"sheet": str(path), "view": view, "seed": options.seed}

@@ -108,7 +108,8 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         console.say(line)
     told = ", ".join(f"{result[name]} {name.replace('_', ' ')}" for name in COUNTS)
     console.say(f"{result['runs']} runs: {told}; {out}")
-    return {**result, "exit_code": 1 if result["failed"] else 0}
+    failed = result["failed"] or result["failed_beside"]
+    return {**result, "exit_code": 1 if failed else 0}
 
 
 def _list(
@@ -185,16 +186,13 @@ def read_grid(path: Path) -> Grid:
 
     A list of views may be written as "front,back", and an axis of one value without brackets.
     """
-    table = read_yaml(path)
+    table = _with_lists(read_yaml(path))
     views = table.get("view")
     if isinstance(views, list):
         table["view"] = [_listed(view) for view in views]
     ablations = table.get("ablation")
     if isinstance(ablations, list):
         table["ablation"] = [_ablation(ablation) for ablation in ablations]
-    for name in AXES:
-        if name in table and isinstance(table[name], (str, int)):
-            table[name] = [table[name]]
     for name in ("task", "encoder", "view"):
         table.setdefault(name, [])
     return from_mapping(Grid, table, str(path))

@@ -1,6 +1,7 @@
 """`train`: train a policy on a dataset's features, or with `--algo` by reinforcement learning."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -183,6 +184,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
         return _reinforce(options, options.algo, console)
     if options.device is not None:
         find_device(options.device)
+    _refuse_reinforcement(options)
     weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     encoder = None if options.encoder in (NO_ENCODER, STATE) else options.encoder
     if encoder:
@@ -220,10 +222,13 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
             f"needle; '{run.policy}' learns that too. `cut-demos` takes a subtask's visits without."
         )
     dataset: Dataset = rendered
-    if options.subtask:
-        from surgicai_vision.dataset.subset import of_subtask
+    if options.demonstrations or options.subtask:
+        from surgicai_vision.dataset.subset import first_episodes, of_subtask
 
-        dataset = of_subtask(dataset, options.subtask)
+        if options.demonstrations:
+            dataset = first_episodes(dataset, options.demonstrations)
+        if options.subtask:
+            dataset = of_subtask(dataset, options.subtask)
     run = replace(run, env=dataset.config)
     with open_log(options.log, out) as log:
         train_run(
@@ -271,6 +276,25 @@ def _views(options: Options, encoder: str | None) -> tuple[str, ...]:
 
 IMITATION = ("dataset", "subtask", "view", "start", "epochs", "minutes", "device")
 """Options that only imitation from a dataset reads."""
+REINFORCEMENT = ("observation", "env_steps", "updates", "validation", "seeds", "decisions", "bound")
+"""Options that it does not read, nor `env`; `workers` changes no result."""
+
+
+def _refuse_reinforcement(options: Options) -> None:
+    """Refuse what imitation would leave unread, wherever it is not the default."""
+    if options.env:
+        raise InputError(
+            "env is for --algo: imitation takes the env of its dataset; leave it out, or record "
+            "and render demonstrations in it."
+        )
+    defaults = {field.name: field.default for field in fields(Options)}
+    for name in REINFORCEMENT:
+        if getattr(options, name) != defaults[name]:
+            option = name.replace("_", "-")
+            raise InputError(
+                f"--{option} is for --algo, and imitation from a dataset does not read it; leave "
+                "it out" + (", and give --seed, one call each." if name == "seeds" else ".")
+            )
 
 
 def _reinforce(options: Options, algo: str, console: Console) -> dict[str, object]:
@@ -313,12 +337,7 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
         raise InputError("--out names one folder; leave it out where --seeds trains several.")
     from surgicai_vision.rl.train import run_of, train_seeds
 
-    outs = []
-    for request in requests:
-        run = run_of(request)
-        out = options.out or folders.train_folder(run.task, run.name, run.seed)
-        folders.check_folder(out, REQUEST)
-        outs.append(out)
+    outs = _checked_folders(options, [run_of(request) for request in requests])
     unit = "control steps" if algorithm.is_online else "updates"
     with console.stage(f"policy: {run_of(requests[0]).name}", unit) as progress:
         train_seeds(
@@ -333,6 +352,14 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
         console.say(f"checkpoint: {out}")
     console.say(f"next: surgicai-vision evaluate {outs[0]}")
     return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}
+
+
+def _checked_folders(options: Options, runs: Sequence[RunConfig]) -> list[Path]:
+    """Return the runs' checkpoint folders; refuse any that cannot be one, before any work."""
+    outs = [options.out or folders.train_folder(run.task, run.name, run.seed) for run in runs]
+    for out in outs:
+        folders.check_folder(out, REQUEST)
+    return outs
 
 
 def _high_level(options: Options, low: Path, console: Console) -> dict[str, object]:
@@ -365,15 +392,12 @@ def _high_level(options: Options, low: Path, console: Console) -> dict[str, obje
     ]
     from surgicai_vision.rl.high_level import run_of, train_high_level
 
-    outs = []
-    for request in requests:
-        run = run_of(request, TaskConfig(names.SUTURE))
-        out = options.out or folders.train_folder(run.task, run.name, run.seed)
-        folders.check_folder(out, REQUEST)
+    runs = [run_of(request, TaskConfig(names.SUTURE)) for request in requests]
+    outs = _checked_folders(options, runs)
+    for request, run, out in zip(requests, runs, outs, strict=True):
         with console.stage(f"high-level policy: {run.name}", "decisions") as progress:
             train_high_level(request, out, progress=progress)
         console.say(f"checkpoint: {out}")
-        outs.append(out)
     console.say(f"next: give {outs[0]} as hlp: of {low}, and surgicai-vision evaluate {low}")
     return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}
 
@@ -405,14 +429,12 @@ def _residual(options: Options, base: Path, console: Console) -> dict[str, objec
     ]
     from surgicai_vision.rl.residual import base_of, run_of, train_residual
 
-    outs = []
-    for request in requests:
-        run = run_of(request, base_of(request).run)
-        out = options.out or folders.train_folder(run.task, run.name, run.seed)
-        folders.check_folder(out, REQUEST)
+    corrected = base_of(requests[0]).run
+    runs = [run_of(request, corrected) for request in requests]
+    outs = _checked_folders(options, runs)
+    for request, run, out in zip(requests, runs, outs, strict=True):
         with console.stage(f"policy: {run.name}", "control steps") as progress:
             train_residual(request, out, progress=progress)
         console.say(f"checkpoint: {out}")
-        outs.append(out)
     console.say(f"next: surgicai-vision evaluate {outs[0]}")
     return {"checkpoint": str(outs[0]), "checkpoints": [str(out) for out in outs]}

@@ -376,8 +376,10 @@ def convert(hint: object, value: object, where: str) -> object:
         if isinstance(value, str) or not isinstance(value, (list, tuple)):
             raise InputError(f"{where}: expected a list, got {value!r}.")
         return tuple(convert(arguments[0], item, where) for item in value)
-    if origin is dict:
-        hint = dict
+    if origin in (dict, Mapping):
+        if not isinstance(value, Mapping):
+            raise InputError(f"{where}: expected a table of keys, got {value!r}.")
+        return value
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if isinstance(hint, type) and (

@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,8 @@ def read_json(path: Path) -> Any:
         raise BadFile(f"Cannot read {path}: {error.strerror}.") from None
     except ValueError as error:
         raise BadFile(f"{path} is not valid JSON ({error}).") from None
+    except RecursionError:
+        raise BadFile(f"{path} is refused: its JSON is nested too deeply.") from None
 
 
 def read_yaml(path: Path, *, may_be_empty: bool = False) -> dict[str, object]:
@@ -155,19 +157,27 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def check_output(path: Path, *, may_resume: str | None = None, option: str = "--out") -> None:
+def check_output(
+    path: Path,
+    *,
+    may_resume: str | None = None,
+    option: str = "--out",
+    ours: Collection[str] = (),
+) -> None:
     """Refuse an output folder that cannot be written or holds other files, before any work.
 
     Args:
         path: the folder to be made.
         may_resume: name of a file that marks the folder as one to be continued.
         option: what the folder was given as, for the message.
+        ours: names of files that a killed run may leave without the mark; a folder of these alone,
+            and of their temporary names, is as good as an empty one.
     """
     if path.exists():
         if not path.is_dir():
             raise OutputExists(f"{option} {path} is a file; give a folder that does not exist yet.")
-        ours = may_resume is not None and (path / may_resume).exists()
-        if any(path.iterdir()) and not ours:
+        is_marked = may_resume is not None and (path / may_resume).exists()
+        if not is_marked and any(not _is_left(file.name, ours) for file in path.iterdir()):
             raise OutputExists(
                 f"{option} {path} already holds files; give a folder that does not exist yet."
             )
@@ -178,6 +188,24 @@ def check_output(path: Path, *, may_resume: str | None = None, option: str = "--
         raise InputError(
             f"{option} {path} cannot be written: no permission on {parent}; choose another folder."
         )
+
+
+def _is_left(name: str, ours: Collection[str]) -> bool:
+    """Return True if a file is one of `ours`, or what was to become one when a run was killed."""
+    temporary = name.startswith(TEMPORARY) and name.endswith(tuple(f"-{one}" for one in ours))
+    return name in ours or temporary
+
+
+def remove_partial(folder: Path, ours: Collection[str]) -> None:
+    """Remove temporary files that killed runs left in a folder and nobody writes any more.
+
+    Args:
+        folder: the folder.
+        ours: names of the files that they were to become.
+    """
+    for name in ours:
+        for left in folder.glob(f"{TEMPORARY}*-{name}"):
+            left.unlink(missing_ok=True)
 
 
 def claim(path: Path, owner: Mapping[str, object], what: str) -> None:
@@ -209,8 +237,11 @@ PACKAGE = Path(__file__).parent.parent
 """The package `surgicai_vision`."""
 FAMILIES = ("encoders", "policies")
 """Packages beside this one whose sources decide results."""
-SHARED = (PACKAGE / "core" / "names.py", PACKAGE / "core" / "config.py")
-"""Modules whose sources decide every stage's results."""
+SHARED = tuple(
+    PACKAGE / "core" / f"{name}.py"
+    for name in ("cameras", "config", "corruption", "names", "runs", "tasks", "variants", "video")
+)
+"""Modules of `core` whose sources decide results, of whichever stage."""
 
 
 @functools.cache

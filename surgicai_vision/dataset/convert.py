@@ -33,7 +33,7 @@ from surgicai_vision.dataset.metadata import (
 )
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
 from surgicai_vision.dataset.schema import Table
-from surgicai_vision.dataset.video import CODECS, PIXELS
+from surgicai_vision.dataset.video import AV1_SIZE, CODECS, PIXELS
 from surgicai_vision.dataset.video_jobs import Encoded, Place, encode_views
 from surgicai_vision.dataset.writer import DataFiles
 
@@ -77,7 +77,8 @@ def convert_dataset(
 
     Raises:
         UnknownName: a view that the dataset does not have, an unknown codec.
-        InputError: a video was asked of a dataset of videos.
+        InputError: a video was asked of a dataset of videos, or of images of a size that it does
+            not have.
         OutputExists: `out` holds something else.
     """
     started = time.monotonic()
@@ -87,7 +88,7 @@ def convert_dataset(
         check_name("view of this dataset", view, dataset.views)
     if not views or len(set(views)) != len(views):
         raise InputError(f"views are {', '.join(views) or 'none'}; give at least one, each once.")
-    check_video(video)
+    check_video(video, dataset.image_size)
     if video and dataset.video:
         raise InputError(
             f"{path} holds videos already ({dataset.video}); make others from a dataset of images."
@@ -106,10 +107,30 @@ def convert_dataset(
     return finished(out, request, started)
 
 
-def check_video(video: str | None) -> None:
-    """Raise `UnknownName` unless `video` is a codec or None."""
-    if video is not None:
-        check_name("video codec", video, CODECS)
+def check_video(video: str | None, size: int) -> None:
+    """Refuse a video that cannot be made.
+
+    Args:
+        video: codec, or None for images.
+        size: side of the images [px].
+
+    Raises:
+        UnknownName: an unknown codec.
+        InputError: a size that the codec does not have.
+    """
+    if video is None:
+        return
+    check_name("video codec", video, CODECS)
+    if video == "h264" and size % 2:
+        raise InputError(
+            f"size is {size}, and a video of h264 needs an even one; render at {size + 1}, take "
+            "av1, or leave the images lossless."
+        )
+    if video == "av1" and size < AV1_SIZE:
+        raise InputError(
+            f"size is {size}, and a video of av1 needs at least {AV1_SIZE}; render larger, take "
+            "h264, or leave the images lossless."
+        )
 
 
 def finished(out: Path, request: Table, started: float) -> DatasetSummary:
@@ -171,6 +192,7 @@ def write_converted(
         else:
             places = _copy_videos(files, folder, [key for key in keys if key in dataset.video_keys])
         rows = _write_data(files, folder, features, places)
+        _check_complete(files, rows, dataset)
         write_metadata(folder, features, list(files.tasks.values()), rows, files.info)
         meta = {
             **dataset.meta,
@@ -232,6 +254,19 @@ def _write_data(
         rows.append(dataclasses.replace(row, videos=places[number]) if places else row)
     data.close()
     return rows
+
+
+def _check_complete(
+    files: LeRobotFiles, rows: Sequence[EpisodeMetadata], dataset: RenderedDataset
+) -> None:
+    """Refuse a dataset of which not every episode and frame could be read."""
+    frames = rows[-1].stop if rows else 0
+    if len(rows) != len(files.rows) or frames != dataset.length:
+        raise BadFile(
+            f"{dataset.path} is damaged: {len(rows)} of {len(files.rows)} episodes and {frames} of "
+            f"{dataset.length} frames can be read ({' '.join(files.problems)}); repair it first "
+            "with 'lerobot-salvage repair'."
+        )
 
 
 def _copy_videos(files: LeRobotFiles, folder: Path, keys: Sequence[str]) -> list[dict[str, Place]]:

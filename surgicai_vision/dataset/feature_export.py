@@ -17,8 +17,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, OutputExists
-from surgicai_vision.core.files import write_json
+from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.files import TEMPORARY, check_output, write_json
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.reader import RenderedDataset
@@ -39,11 +39,10 @@ def export_features(
         out: the new dataset's folder.
 
     Raises:
-        OutputExists: there is something at `out`.
+        OutputExists: there is something at `out` other than an empty folder.
         InputError: features of another number of frames.
     """
-    if out.exists():
-        raise OutputExists(f"{out} exists; give a folder that does not exist yet.")
+    check_output(out, option="--export")
     for entry in rows:
         if len(entry) != dataset.length:
             raise InputError(
@@ -52,9 +51,10 @@ def export_features(
     width = sum(entry.shape[1] for entry in rows)
     features = schema.features((), dataset.image_size, depth=False, segmentation=False)
     features[names.ENVIRONMENT_STATE] = {"dtype": "float32", "shape": (width,), "names": None}
-    columns = {key: dataset.columns()[key] for key in schema.COLUMNS}
+    held = dataset.columns()
+    columns = {key: held[key] for key in schema.COLUMNS}
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as scratch:
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=TEMPORARY) as scratch:
         shards = []
         digests = []
         for episode in np.unique(dataset.episode_index):

@@ -40,7 +40,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import JSON, TaskConfig
+from surgicai_vision.core.config import ACTION_REPEAT_LIMIT, JSON, TaskConfig
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.schema import Table
@@ -149,7 +150,14 @@ class OpenHLayout:
 
     def task_config(self, config: TaskConfig, frame_stride: int) -> TaskConfig:
         """Return the config in which an action is held until the next frame."""
-        return dataclasses.replace(config, action_repeat=config.action_repeat * frame_stride)
+        held = config.action_repeat * frame_stride
+        if held > ACTION_REPEAT_LIMIT:
+            raise InputError(
+                f"frame_stride is {frame_stride} and action_repeat {config.action_repeat}: an "
+                f"action of layout 'open-h' would be held for {held} control steps; allowed: at "
+                f"most {ACTION_REPEAT_LIMIT}. Give a smaller frame_stride, or our own layout."
+            )
+        return dataclasses.replace(config, action_repeat=held)
 
 
 def instruction(task: str, phase: int) -> str:

@@ -83,17 +83,15 @@ def render_demos(
 
     Raises:
         UnknownName: a view, codec or layout that does not exist.
-        InputError: a folder of demonstrations that is given twice, a video or too long a frame
-            stride of a layout that has none.
+        InputError: a folder of demonstrations that is given twice, a size or frame stride that is
+            not allowed, a video or too long a frame stride of a layout that has none.
         BadFile: `demos` holds no readable demonstrations, or of another scene.
         OutputExists: `out` holds something else.
     """
     started = time.monotonic()
-    chosen = LAYOUTS[check_name("layout", layout, LAYOUTS)]
+    check_request(views, size, frame_stride, video, layout)
+    chosen = LAYOUTS[layout]
     views = views or chosen.views
-    _check_images(views, size, video)
-    check_frame_stride(frame_stride)
-    _check_layout(layout, frame_stride, video)
     check_output(out, may_resume=names.META_FILE)
     sources = _distinct([demos] if isinstance(demos, Path) else demos)
     paths = [path for source in sources for path in list_demos(source)]
@@ -114,6 +112,7 @@ def render_demos(
     counts = [len(range(0, origin.length, frame_stride)) for origin in origins]
     if variants:
         config = variants.shown(config)
+    acted_in = chosen.task_config(config, frame_stride)
     jobs = [
         _job(path, options | ({"variant": variant} if variants else {}), count)
         for path, count in zip(paths, counts, strict=True)
@@ -124,7 +123,7 @@ def render_demos(
         shards = run(jobs, store, context, progress=progress, unit="frames")
         summaries = [read_json(shard / SUMMARY_FILE) for shard in shards]
         meta = {
-            **_meta(sources, request, chosen.task_config(config, frame_stride), summaries, origins),
+            **_meta(sources, request, acted_in, summaries, origins),
             **({"layout": layout} if layout != SURGICAI else {}),
             **chosen.about,
         }
@@ -136,6 +135,16 @@ def render_demos(
             whole = open_dataset(lossless)
             write_converted(whole, result, views, video, {}, store, context, progress)
     return finished(out, request, started)
+
+
+def check_request(
+    views: Sequence[str], size: int, frame_stride: int, video: str | None, layout: str
+) -> None:
+    """Refuse arguments of `render_demos` that are wrong whatever the demonstrations are."""
+    chosen = LAYOUTS[check_name("layout", layout, LAYOUTS)]
+    _check_images(views or chosen.views, size, video)
+    check_frame_stride(frame_stride)
+    _check_layout(layout, frame_stride, video)
 
 
 def _distinct(folders: Sequence[Path]) -> list[Path]:
@@ -169,7 +178,7 @@ def _check_images(views: Sequence[str], size: int, video: str | None) -> None:
         raise InputError(f"views are {', '.join(views) or 'none'}; give at least one, each once.")
     if not SIZES[0] <= size <= SIZES[1]:
         raise InputError(f"size is {size}; it must be within {SIZES[0]} and {SIZES[1]} pixels.")
-    check_video(video)
+    check_video(video, size)
 
 
 def _check_layout(layout: str, frame_stride: int, video: str | None) -> None:

@@ -28,6 +28,8 @@ CODECS = MappingProxyType(
 the same frames give the same bytes."""
 
 PIXELS = "yuv420p"
+AV1_SIZE = 32
+"""Smallest side of the images of an av1 video [px]: SVT-AV1 ends the process at 24 px and less."""
 
 
 class VideoWriter:

@@ -240,7 +240,8 @@ def error_in_base(pose: Matrix, goal: Matrix, step: StepSize) -> Matrix:
     return np.concatenate([shift, turn])
 
 
-def _angle_between(a: Matrix, b: Matrix) -> float:
+def angle_between(a: Matrix, b: Matrix) -> float:
+    """Return the angle of the turn from one pose to the other [rad]."""
     return float(np.linalg.norm(matrix_to_rotvec(a[:3, :3].T @ b[:3, :3])))
 
 
@@ -267,7 +268,7 @@ def approach_and_grasp(world: WorldState, goal: Matrix, back: float, opened: flo
     offset = world.tip[:3, 3] - goal[:3, 3]
     depth = float(offset @ axis)
     beside = float(np.linalg.norm(offset - depth * axis))
-    turned = _angle_between(world.tip, goal)
+    turned = angle_between(world.tip, goal)
     lined_up = beside < 2 * ALIGNED and turned < 2 * ALIGNED_ANGLE
     closing = world.command_jaw < opened - 2 * world.step.jaw
     # Close, go in, or line up, whichever is due.
@@ -336,7 +337,7 @@ def _place(world: WorldState) -> ToolTarget:
     outward = world.stitch.pair.entry.rotation[:, 2]
     line = world.needle[:3, :3] @ world.needle_line.T + world.needle[:3, 3:4]
     is_low = float(line[2].min()) < SURFACE + CLEAR
-    if is_low and _angle_between(world.needle, goal) > math.radians(20.0):
+    if is_low and angle_between(world.needle, goal) > math.radians(20.0):
         lifted = _shifted(world.command, np.array([0.0, 0.0, LIFT]))
         if is_free(world, command_error(world, lifted)):
             return ToolTarget(lifted, 0.0)
@@ -344,7 +345,7 @@ def _place(world: WorldState) -> ToolTarget:
     beside = float(np.linalg.norm(offset - (offset @ outward) * outward))
     away = (
         0.0
-        if beside < 0.0015 and _angle_between(world.needle, goal) < math.radians(7.0)
+        if beside < 0.0015 and angle_between(world.needle, goal) < math.radians(7.0)
         else OUTSIDE
     )
     return ToolTarget(world.tip_for_needle(_shifted(goal, away * outward)), 0.0)
@@ -361,7 +362,7 @@ def _insert(world: WorldState) -> ToolTarget:
     turned = turn_about_wound(start, world.needle)
     if world.task_state.holes_passed == 0:
         near = float(np.linalg.norm(local)) < 0.0009
-        tilt = _angle_between(world.needle, on_path(world.stitch, max(turned, 0.0)))
+        tilt = angle_between(world.needle, on_path(world.stitch, max(turned, 0.0)))
         if not (near and tilt < math.radians(4.0)):
             return _place(world)
     pivot = turn_about_wound(start, world.stitch.on_arc(world.stitch.tip_angle))

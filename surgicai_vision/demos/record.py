@@ -21,7 +21,13 @@ from typing import TYPE_CHECKING, Any
 from surgicai_vision.core import names
 from surgicai_vision.core.banks import check_training_starts
 from surgicai_vision.core.config import JSON, TaskConfig, from_mapping, to_mapping
-from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError, check_name
+from surgicai_vision.core.errors import (
+    InputError,
+    OutputExists,
+    PhysicsError,
+    SurgicaiError,
+    check_name,
+)
 from surgicai_vision.core.executor import Job, RunContext, building, job, run, work_folder
 from surgicai_vision.core.files import (
     check_output,
@@ -103,15 +109,20 @@ def record_into(
     behaviour: BehaviourPolicy | None = None,
 ) -> None:
     """Run `seed` in `env` and write the episode, or why it failed, into `folder`."""
-    result = rollout(
-        env,
-        make_demonstrator(demonstrator, env, demos, source),
-        seed,
-        demonstrator,
-        Disturbance(noise, perturb_start_fraction, noise_from, upset_fraction, late, jaw_noise),
-        post_success_steps,
-        behaviour,
-    )
+    try:
+        result = rollout(
+            env,
+            make_demonstrator(demonstrator, env, demos, source),
+            seed,
+            demonstrator,
+            Disturbance(noise, perturb_start_fraction, noise_from, upset_fraction, late, jaw_noise),
+            post_success_steps,
+            behaviour,
+        )
+    except PhysicsError as error:  # another try would meet the same start
+        failed = {"seed": seed, "success": False, "reason": str(error)}
+        write_json(folder / "result.json", failed | ({"upset": ""} if upset_fraction else {}))
+        return
     if result.success:
         write_demo(folder, 0, result.demo)
     told = {"seed": seed, "success": result.success, "reason": result.reason}

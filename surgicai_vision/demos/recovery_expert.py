@@ -44,6 +44,7 @@ from surgicai_vision.demos.expert import (
     ToolTarget,
     WorldState,
     action_towards,
+    angle_between,
     approach_and_grasp,
     on_path,
     turn_about_wound,
@@ -55,7 +56,7 @@ from surgicai_vision.envs.reach import insertion, is_followed
 from surgicai_vision.envs.starts import GRASP_ANGLES
 from surgicai_vision.envs.suture import Suture
 from surgicai_vision.scene.arm import GRASP_DEPTH
-from surgicai_vision.scene.rotations import matrix_to_rotvec, rotvec_to_matrix
+from surgicai_vision.scene.rotations import rotvec_to_matrix
 
 GRASP, PLACE, INSERT, HANDOFF, PULLOUT = range(len(names.SUBTASKS))
 
@@ -188,7 +189,7 @@ class RecoveryExpert(Demonstrator):
         turned = turn_about_wound(stitch.place(), now)
         path = on_path(stitch, max(turned, 0.0))
         near = float(np.linalg.norm(now[:3, 3] - path[:3, 3])) < ON_PATH
-        return near and _angle_between(now, path) < ON_PATH_ANGLE
+        return near and angle_between(now, path) < ON_PATH_ANGLE
 
     def _grasp(self, world: WorldState) -> ToolTarget:
         """Grasp the needle in the middle of the range of goals.
@@ -272,9 +273,4 @@ def _above(tip: Matrix) -> Matrix:
 def _has_moved(then: Matrix, now: Matrix) -> bool:
     """Return True if the needle has moved or turned from one pose to the other, T_world_needle."""
     moved = float(np.linalg.norm(then[:3, 3] - now[:3, 3]))
-    return moved > MOVED or _angle_between(then, now) > MOVED_ANGLE
-
-
-def _angle_between(a: Matrix, b: Matrix) -> float:
-    """Return the angle of the turn from one pose to the other [rad]."""
-    return float(np.linalg.norm(matrix_to_rotvec(a[:3, :3].T @ b[:3, :3])))
+    return moved > MOVED or angle_between(then, now) > MOVED_ANGLE

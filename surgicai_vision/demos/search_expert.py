@@ -4,10 +4,11 @@ The goal of a grasp is a point of the needle drawn from 5° to 20° of its arc (
 image shows. Success is 1 mm: a grasp in the middle meets at most 11.3° of those 15°, and one that
 is 1 mm off fewer. `SearchExpert` grasps in the middle and, where the episode has not ended by the
 next of its `ATTEMPTS`, opens and grasps at another angle; beyond the range too, since a learner
-does not grasp exactly where it aims. Its labels depend on the images and on the time, so a policy
-with a clock can learn them (`benchmarks/grasp_ceiling.py` measures each way). It goes on after a
-success (`persists`), so that every demonstration shows every attempt. In every other subtask it is
-the expert.
+does not grasp exactly where it aims. The goals on a needle of another arc lie further along it
+(`Stitch.grasps`), and so do the attempts. Its labels depend on the images and on the time, so a
+policy with a clock can learn them (`benchmarks/grasp_ceiling.py` measures each way). It goes on
+after a success (`persists`), so that every demonstration shows every attempt. In every other
+subtask it is the expert.
 """
 
 import math
@@ -28,6 +29,7 @@ from surgicai_vision.demos.expert import (
 )
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.geometry import grasp_in_needle
+from surgicai_vision.envs.starts import GRASP_ANGLES
 
 
 class SearchExpert(Demonstrator):
@@ -38,7 +40,7 @@ class SearchExpert(Demonstrator):
     """
 
     ATTEMPTS = (12.5, 6.5, 18.5, 2.5, 22.5)
-    """Angles at which the needle is grasped, one attempt after the other [deg]."""
+    """Angles at which a needle of 120° is grasped, one attempt after the other [deg]."""
     SECOND_ATTEMPT_STEP = 100
     """Control step of the second attempt, since the expert's own grasp takes 70 to 85. Another
     follows every `CLOCK_PERIOD`, in which the clock that policies have goes round once."""
@@ -73,7 +75,9 @@ class SearchExpert(Demonstrator):
         attempt = min(max(0, period + 1), len(self.ATTEMPTS) - 1)
         if attempt and steps_into_period < self.OPENING_STEPS:
             return ToolTarget(world.command, self.OPEN_JAW)
-        goal = world.needle @ grasp_in_needle(world.arm, math.radians(self.ATTEMPTS[attempt]))
+        moved = world.stitch.grasps(*GRASP_ANGLES)[0] - GRASP_ANGLES[0]
+        angle = moved + math.radians(self.ATTEMPTS[attempt])
+        goal = world.needle @ grasp_in_needle(world.arm, angle, radius=world.stitch.radius)
         if attempt:
             return approach_and_grasp(world, goal, 0.0, self.OPEN_JAW)
         return approach_and_grasp(world, goal, HOVER, OPEN_ABOVE)

@@ -110,7 +110,12 @@ def sweep_ends(
     ]
     # Whatever pairs are tried: a later call may try others in the same folder.
     policy = {**to_mapping(given), "confidence": None, "patience": None}
-    owner = {"hierarchical": policy, "env": dict(env or {}), "starts": to_mapping(starts)}
+    owner = {
+        "hierarchical": policy,
+        "env": dict(env or {}),
+        "starts": to_mapping(starts),
+        **open_policy(path, env=env, weights=weights).content,
+    }
     files.claim(out / MARK, owner, "the ends")
     tried: dict[HierarchicalConfig, Ends] = {}
     for config in configs:

@@ -13,6 +13,7 @@ from surgicai_vision.core.config import JSON, to_mapping
 from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
+from surgicai_vision.evaluation.rollout import check_seeds
 from surgicai_vision.evaluation.run import evaluate_into
 from surgicai_vision.evaluation.statistics import clopper_pearson, holm, mcnemar
 from surgicai_vision.evaluation.storage import MARKER, Row, parquet_bytes, read_rows
@@ -62,8 +63,10 @@ def evaluate_swaps(
         workers: processes.
 
     Raises:
+        InputError: seeds that `check_seeds` refuses.
         OutputExists: `out` holds another policy or other starts.
     """
+    check_seeds(seeds)
     _claim(out, variants[AS_IT_IS], seeds)
     successes: dict[str, list[bool]] = {}
     rows: list[Row] = []
@@ -110,6 +113,7 @@ def _claim(out: Path, spec: PolicySpec, seeds: Sequence[int]) -> None:
     mine = {
         "hierarchical": spec.about["hierarchical"],
         "task_config": to_mapping(spec.config),
+        **spec.content,
         "seeds": [int(seed) for seed in seeds],
     }
     files.claim(out / MARK, mine, "the expert swaps")

@@ -171,7 +171,9 @@ def _circumstances(
 
     They are told by its env, its dataset or `task`.
     """
-    env, root = training.get("env") or {}, (training.get("dataset") or {}).get("root")
+    path = folder / TRAINING
+    env = _part(path, training, "env")
+    root = _part(path, training, "dataset").get("root")
     features: Mapping[str, Any] = {}
     if env.get("type") == ENV_TYPE:
         fields = {
@@ -179,19 +181,25 @@ def _circumstances(
             for field in dataclasses.fields(TaskConfig)
             if field.name in env
         }
-        config = from_mapping(TaskConfig, fields, str(folder / TRAINING))
+        config = from_mapping(TaskConfig, fields, str(path))
         if env.get("encoder"):
-            views, sha256 = env["cameras"], env.get("encoder_sha256", "")
+            _check_keys(path, env, "cameras", "image_size")
             features = {
                 "encoder": env["encoder"],
-                "views": views,
-                "weights_sha256": sha256,
+                "views": env["cameras"],
+                "weights_sha256": env.get("encoder_sha256", ""),
                 "size": env["image_size"],
             }
     elif root and (Path(root) / names.META_FILE).is_file():
-        meta = read_json(Path(root) / names.META_FILE)
-        config = from_mapping(TaskConfig, meta["task_config"], str(Path(root) / names.META_FILE))
-        features = {**meta["features"], "size": meta["image_size"]} if meta.get("features") else {}
+        path = Path(root) / names.META_FILE
+        meta = _table(path)
+        _check_keys(path, meta, "task_config")
+        config = from_mapping(TaskConfig, meta["task_config"], str(path))
+        exported = _part(path, meta, "features")
+        if exported:
+            _check_keys(path, meta, "image_size")
+            _check_keys(path, exported, "encoder", "views", "weights_sha256")
+            features = {**exported, "size": meta["image_size"]}
     elif task:
         config = TaskConfig(task=task)
     else:
@@ -270,7 +278,45 @@ def _table(path: Path) -> dict[str, Any]:
     content = read_json(path)
     if not isinstance(content, dict) or (path.name == CONFIG and not content.get("type")):
         raise BadFile(f"{path} is no configuration of LeRobot.")
+    if path.name == CONFIG:
+        _check_features(path, content)
     return content
+
+
+def _check_features(path: Path, policy: Mapping[str, Any]) -> None:
+    """Refuse a policy's configuration whose features have no type or no shape."""
+    for kind in ("input_features", "output_features"):
+        for key, feature in _part(path, policy, kind).items():
+            if not _is_feature(feature):
+                raise BadFile(
+                    f"{path} is damaged: '{key}' of {kind} has no type or no shape; "
+                    "copy the checkpoint again."
+                )
+
+
+def _is_feature(feature: object) -> bool:
+    """Return True for a table with the type and the shape of a feature, three sizes of an image."""
+    if not isinstance(feature, dict) or not isinstance(feature.get("type"), str):
+        return False
+    shape = feature.get("shape")
+    if not isinstance(shape, list) or not all(type(size) is int for size in shape):
+        return False
+    return feature["type"] != VISUAL or len(shape) == 3
+
+
+def _part(path: Path, table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """Return a table within a table of the file `path`; empty where there is none."""
+    part = table.get(key) or {}
+    if not isinstance(part, dict):
+        raise BadFile(f"{path} is damaged: '{key}' is no table; copy it again.")
+    return part
+
+
+def _check_keys(path: Path, table: Mapping[str, Any], *keys: str) -> None:
+    """Refuse a table of the file `path` that lacks one of `keys`."""
+    for key in keys:
+        if key not in table:
+            raise BadFile(f"{path} is damaged: '{key}' is missing; copy it again.")
 
 
 @final

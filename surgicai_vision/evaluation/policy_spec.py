@@ -48,7 +48,7 @@ from surgicai_vision.evaluation.hierarchical_config import (
 from surgicai_vision.features import encoders
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource
 from surgicai_vision.training import policies, released
-from surgicai_vision.training.checkpoint import read_checkpoint
+from surgicai_vision.training.checkpoint import Checkpoint, read_checkpoint
 from surgicai_vision.training.progress_input import progress_policy_folder
 from surgicai_vision.training.run_config import OWN, RunConfig, evaluated_in
 
@@ -57,6 +57,9 @@ if TYPE_CHECKING:
     from surgicai_vision.dataset.protocol import Dataset
 
 REPLAY = ReplayAgent.name
+CONTENT = ("checkpoint", "dataset", "parts")
+"""Keys of `PolicySpec.about` that hold hashes: of a checkpoint, of the dataset that is replayed,
+and of the checkpoints of a hierarchical policy."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +70,14 @@ class PolicySpec:
         run: what it is, as data; `run.env` is the task.
         make: makes the agent in a worker process.
         about: more to be kept beside the result: hashes and folders.
+        training: what tells it from others of its name in the names of folders: its training seed,
+            or the beginning of a hash where that is not known; empty where there are no others.
     """
 
     run: RunConfig
     make: MakeAgent
     about: Mapping[str, JSON] = field(default_factory=dict)
+    training: str = ""
 
     @property
     def name(self) -> str:
@@ -82,6 +88,21 @@ class PolicySpec:
     def config(self) -> TaskConfig:
         """The task."""
         return self.run.env
+
+    @property
+    def folder_name(self) -> str:
+        """How folders call what is evaluated: its task, name, training and, if not plain, env."""
+        parts = [self.config.task, self.name]
+        if self.training and not self.name.endswith(f"-{self.training}"):
+            parts.append(self.training)
+        if self.config != TaskConfig(self.config.task):
+            parts.append(f"env-{digest(self.config)[:8]}")
+        return "-".join(parts)
+
+    @property
+    def content(self) -> dict[str, JSON]:
+        """The hashes of what acts, by `CONTENT`: another training has others in the same folder."""
+        return {key: self.about[key] for key in CONTENT if key in self.about}
 
     @property
     def make_agent(self) -> MakeAgent:
@@ -218,7 +239,8 @@ def _replay(dataset: "Dataset") -> PolicySpec:
     actions = mean_demonstration(dataset.columns()[names.ACTION], dataset.episode_index)
     run = RunConfig(dataset.config, policy=REPLAY)
     about: dict[str, JSON] = {"dataset": dataset.fingerprint}
-    return PolicySpec(run, functools.partial(ReplayAgent, actions), about)
+    make = functools.partial(ReplayAgent, actions)
+    return PolicySpec(run, make, about, dataset.fingerprint[:8])
 
 
 def _from_factory(target: str, config: TaskConfig) -> PolicySpec:
@@ -235,6 +257,9 @@ def make_from_factory(target: str) -> Agent:
     Raises:
         InputError: there is no such function, or it returns something else.
     """
+    module, _, name = target.partition(":")
+    if not name or not all(module.split(".")):
+        raise InputError(f"{target} names no function of a module; give module:factory.")
     try:
         factory = resolve(target)
     except (ImportError, AttributeError) as error:
@@ -265,7 +290,7 @@ def _from_folder(
         "checkpoint": {"policy_sha256": known.policy_sha256},
         "folder": str(lerobot),
     }
-    return PolicySpec(run, make, about)
+    return PolicySpec(run, make, about, known.policy_sha256[:8])
 
 
 def _from_checkpoint(folder: Path, weights: WeightsSource, changes: tuple[str, ...]) -> PolicySpec:
@@ -289,18 +314,25 @@ def _from_checkpoint(folder: Path, weights: WeightsSource, changes: tuple[str, .
         if record:
             encoders.find_weights(record.name, weights)
     about: dict[str, JSON] = {
-        "checkpoint": {
-            "weights_sha256": encoder.weights_sha256 if encoder else None,
-            "policy_sha256": checkpoint.policy_sha256,
-            "dataset": checkpoint.dataset,
-        },
+        "checkpoint": _hashes(checkpoint),
         "folder": str(folder),
     }
     acted_by = read_changes(changes)
     if acted_by:
         policies.restore(checkpoint, acted_by)  # refuses what is not allowed
     make = functools.partial(acting_agent, folder, weights, acted_by)
-    return PolicySpec(replace(checkpoint.run, acted_by=changes), make, about)
+    run = replace(checkpoint.run, acted_by=changes)
+    return PolicySpec(run, make, about, f"seed{run.seed}")
+
+
+def _hashes(checkpoint: Checkpoint) -> dict[str, JSON]:
+    """Return what tells a checkpoint of ours from another one in the same folder."""
+    encoder = checkpoint.encoder
+    return {
+        "weights_sha256": encoder.weights_sha256 if encoder else None,
+        "policy_sha256": checkpoint.policy_sha256,
+        "dataset": checkpoint.dataset,
+    }
 
 
 def acting_agent(
@@ -392,6 +424,7 @@ def hierarchical_policy(
     # With experts in every place a policy knows no scene: the task is that of all its policies.
     known: dict[str, RunConfig] = {}
     low: dict[str, MakeAgent] = {}
+    parts: dict[str, JSON] = {}
     sees_goal = expert_swap is not None
     for subtask, policy in config.low.items():
         if _names_code(policy):
@@ -404,6 +437,7 @@ def hierarchical_policy(
         sees_goal |= spec.run.sees_goal
         if spec.run.is_trained:
             known[subtask] = spec.run
+            parts[subtask] = spec.about["checkpoint"]
     about: dict[str, JSON] = {"hierarchical": to_mapping(config)}
     high: functools.partial[PolicyAgent] | None = None
     if config.hlp != ORDER:
@@ -420,11 +454,15 @@ def hierarchical_policy(
                 "stage_errors": to_mapping(checkpoint.stage_errors),
             }
         known["hlp"] = checkpoint.run
+        parts["hlp"] = _hashes(checkpoint)
         high = functools.partial(policy_agent, folder, weights)
     env = _common_env([run.env for run in known.values()])
     if expert_swap is not None:
         low[check_name("subtask", expert_swap, names.SUBTASKS)] = BASELINES["expert"]
         known.pop(expert_swap, None)
+        parts.pop(expert_swap, None)
+    if parts:
+        about["parts"] = parts
     seen = {view for run in known.values() for view in run.views}
     run = RunConfig(
         replace(env, task=names.SUTURE, max_steps=config.max_steps, advance=config.advance),

@@ -24,6 +24,27 @@ from surgicai_vision.evaluation.slot import Episode, Slot
 
 BATCH = 8
 """Slots of a process: what an encoder computes at once (`encoders.base`)."""
+LARGEST_SEED = 2**63 - 1
+"""Largest seed of a start: what a column of whole numbers holds."""
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Refuse start seeds from which no rows can be made, before any work.
+
+    Raises:
+        InputError: no seeds, repeated seeds, or one that is too large or negative.
+    """
+    # A range is ordered, and may be far too long to be counted.
+    ends = (seeds[0], seeds[-1]) if isinstance(seeds, range) and seeds else seeds
+    if any(not 0 <= seed <= LARGEST_SEED for seed in ends):
+        raise InputError(
+            f"Start seeds reach from {min(ends)} to {max(ends)}; allowed: 0 to {LARGEST_SEED}. "
+            "Give another --seed, or fewer episodes."
+        )
+    if not seeds or len(set(seeds)) != len(seeds):
+        raise InputError(
+            f"{len(seeds)} start seeds, {len(set(seeds))} of them different; give each once."
+        )
 
 
 def evaluate(
@@ -50,14 +71,12 @@ def evaluate(
         upset: let one thing go wrong in every episode (`envs.upset`), drawn from its seed.
 
     Raises:
-        InputError: no seeds, repeated seeds, numbers below 1, or upsets in a task that has none.
+        InputError: seeds that `check_seeds` refuses, numbers below 1, or upsets in a task that has
+            none.
     """
     if upset:
         check_upset_task(task_config.task)
-    if not seeds or len(set(seeds)) != len(seeds):
-        raise InputError(
-            f"{len(seeds)} start seeds, {len(set(seeds))} of them different; give each once."
-        )
+    check_seeds(seeds)
     if batch < 1 or (workers is not None and workers < 1):
         raise InputError(f"batch is {batch} and workers {workers}; both must be at least 1.")
     count = workers or min(len(os.sched_getaffinity(0)), -(-len(seeds) // 4))

@@ -103,6 +103,7 @@ class Slot:
             )
         self.env = env_of(self.agent, self.task_config)
         self._mishap = Upset(self.env, None)
+        self._has_begun = False
         self.monitor = EpisodeMonitor(self.env)
         self.watch = VisitWatch(self.env) if isinstance(self.env, Suture) else None
 
@@ -114,6 +115,8 @@ class Slot:
         self.moments = []
         self.ended = self.diverged = self.touched = False
         self.error = ""
+        self._mishap = Upset(self.env, None)
+        self._has_begun = False
         self.monitor.clear()
         try:
             self.observation, self.info = self.env.reset(seed=seed)
@@ -125,6 +128,7 @@ class Slot:
         except PhysicsError as error:
             self.info, self.ended, self.error = {}, True, str(error)
         else:
+            self._has_begun = True
             plan = plan_upset(seed, self.task_config.task) if self.upset else None
             self._mishap = Upset(self.env, plan)
             self._let_happen()
@@ -169,7 +173,9 @@ class Slot:
         monitor = self.monitor
         bite = monitor.bite
         held = not self.error and monitor.is_held()
-        visits = self.watch.visits() if self.watch else ()
+        # After a start that could not be made the watch still holds the episode before.
+        watch = self.watch if self._has_begun else None
+        visits = watch.visits() if watch else ()
         delays = [visit.delay for visit in visits if visit.delay is not None]
         failure = failure_kind(self.error, self.diverged, self.touched, bite.wrong_hole, held)
         row = EpisodeMetrics(
@@ -202,7 +208,7 @@ class Slot:
             upset=self._mishap.kind,
             upset_step=self._mishap.step,
             recovered=success and bool(self._mishap.kind),
-            false_ends=sum(visit.is_false_end for visit in visits) if self.watch else math.nan,
+            false_ends=sum(visit.is_false_end for visit in visits) if watch else math.nan,
             end_delay_s=statistics.median(delays) if delays else math.nan,
         )
         self.seed = None

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import JSON, from_mapping, to_mapping
-from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.errors import BadFile, first_line
 from surgicai_vision.envs.visits import LAST, Visit
 from surgicai_vision.evaluation.metrics import as_table, measured_ends, summary
 from surgicai_vision.evaluation.slot import Episode, Film
@@ -27,6 +27,8 @@ MARKER = "evaluation.json"
 EPISODES = "episodes.parquet"
 FILMS = "films.safetensors"
 VISITS = "visits.parquet"
+OURS = (MARKER, EPISODES, FILMS, VISITS)
+"""Every file of an evaluation; a killed one leaves some of them without the marker."""
 RUN_FILE = "run.json"
 GRID_FILE = "sweep.json"
 RESULT_FILE = "result.json"
@@ -74,10 +76,14 @@ def read_evaluation(folder: Path) -> Evaluation:
     """Read `evaluation.json`.
 
     Raises:
-        BadFile: there is none, or another version wrote it.
+        BadFile: there is none, it is damaged, or another version wrote it.
     """
-    stored = read_versioned(folder / MARKER)
-    run = from_mapping(RunConfig, stored["run"], str(folder / MARKER))
+    path = folder / MARKER
+    stored = read_versioned(path)
+    for key in ("run", "summary", "about"):
+        if not isinstance(stored.get(key), dict):
+            raise BadFile(f"{path} is damaged: it has no table '{key}'. Evaluate again.")
+    run = from_mapping(RunConfig, stored["run"], str(path))
     return Evaluation(run, stored["summary"], stored["about"])
 
 
@@ -99,6 +105,9 @@ def write_evaluation(
 
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MARKER).unlink(missing_ok=True)
+    # An earlier evaluation may have had visits that this one has not.
+    (folder / VISITS).unlink(missing_ok=True)
+    files.remove_partial(folder, OURS)
     rows = [episode.row for episode in episodes]
     files.write_bytes(folder / EPISODES, parquet_bytes(as_table(rows)))
     arrays: dict[str, NDArray[np.generic]] = {}
@@ -140,25 +149,42 @@ def parquet_bytes(table: list[Row]) -> bytes:
 
 
 def read_rows(folder: Path) -> list[Row]:
-    """Return the rows of an evaluation, one dictionary an episode."""
+    """Return the rows of an evaluation, one dictionary an episode.
+
+    Raises:
+        BadFile: there is none, or it is damaged.
+    """
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     path = folder / EPISODES
     if not path.is_file():
         raise BadFile(f"{folder} holds no evaluation ({EPISODES} is missing).")
-    rows: list[Row] = pq.read_table(path).to_pylist()
+    try:
+        rows: list[Row] = pq.read_table(path).to_pylist()
+    except (pa.ArrowException, OSError) as error:
+        raise BadFile(f"{path} is damaged ({first_line(error)}); evaluate again.") from None
     return rows
 
 
 def read_film(folder: Path, seed: int) -> Film:
-    """Return the states kept of one episode; a film without states where none were kept."""
-    from safetensors import safe_open
+    """Return the states kept of one episode; a film without states where none were kept.
+
+    Raises:
+        BadFile: the file is damaged, or holds no film of this episode.
+    """
+    from safetensors import SafetensorError, safe_open
 
     if not (folder / FILMS).is_file():
         return Film(np.zeros(0, np.int64), np.zeros((0, 0)))
-    with safe_open(str(folder / FILMS), framework="numpy") as file:
-        steps = file.get_tensor(f"{seed}.steps")
-        states = file.get_tensor(f"{seed}.states")
+    try:
+        with safe_open(str(folder / FILMS), framework="numpy") as file:
+            steps = file.get_tensor(f"{seed}.steps")
+            states = file.get_tensor(f"{seed}.states")
+    except SafetensorError as error:
+        raise BadFile(
+            f"{folder / FILMS} is damaged ({first_line(error)}); evaluate again."
+        ) from None
     return Film(np.asarray(steps), np.asarray(states))
 
 

@@ -217,4 +217,5 @@ def _strip(
     with contact_sheet.state_renderer(sewer.spec.config, STRIP_SIZE) as draw:
         rows = [(view, [draw(state, view) for state in shown]) for view in LOOK.views]
     figure = contact_sheet.sheet(rows, columns, f"The whole procedure by {sewer.who}")
-    figure.savefig(path, dpi=100)
+    with files.whole_file(path) as whole:
+        figure.savefig(whole, dpi=100)

@@ -1,10 +1,11 @@
 """Checks of a plan: what is refused before any work; see `plan_config`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from surgicai_vision.core import names
 from surgicai_vision.core.banks import BANKS
+from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.evaluation.robustness.axes import AXES
 from surgicai_vision.experiments.dataset_config import (
@@ -38,6 +39,7 @@ def check_plan(plan: "Plan") -> None:
         first_seed(seed)
     check_at_least(1, episodes=plan.episodes, size=plan.size, epochs=plan.epochs)
     for recorded in plan.demonstrations:
+        _check_env(f"demonstrations {recorded.name}", recorded.env, "recorded")
         _check_looks(plan, recorded)
         if recorded.episodes > MOST_EPISODES:
             raise InputError(
@@ -57,6 +59,15 @@ def check_plan(plan: "Plan") -> None:
             f"The plan has {len(plan.runs)} runs, {len(set(plan.runs))} of them different; "
             "leave out policies that differ in nothing but their names."
         )
+
+
+def _check_env(where: str, env: Mapping[str, JSON], done: str) -> None:
+    """Refuse fields of an env that are not the file's to say."""
+    for key in ("task", "advance"):
+        if key in env:
+            raise InputError(
+                f"{where}: env has '{key}', which follows from what is {done}; leave it out."
+            )
 
 
 def _check_visits(plan: "Plan", recorded: Demonstrations) -> None:
@@ -146,12 +157,7 @@ def _check_condition(plan: "Plan", condition: Condition) -> None:
     for seed in condition.seed:
         check_name("training seed", str(seed), [str(seed) for seed in plan.seed])
     check_at_least(1, **{f"condition {condition.name}: episodes": condition.episodes})
-    for key in ("task", "advance"):
-        if key in {**plan.env, **condition.env}:
-            raise InputError(
-                f"condition {condition.name}: env has '{key}', which follows from what is "
-                "evaluated; leave it out."
-            )
+    _check_env(f"condition {condition.name}", {**plan.env, **condition.env}, "evaluated")
     plan.task_config(names.SUTURE, condition)
     if condition.shift is not None:
         check_name("axis", condition.shift.axis, AXES)

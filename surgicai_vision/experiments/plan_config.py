@@ -150,17 +150,20 @@ class Plan:
         fields = {**self.env, **recorded.env, "task": task or recorded.task}
         return from_mapping(TaskConfig, fields, "env")
 
-    def evaluated_env(self, condition: Condition | None = None) -> Mapping[str, JSON]:
+    def evaluated_env(self, run: RunConfig, condition: Condition) -> Mapping[str, JSON]:
         """Return the fields of `TaskConfig` that an evaluation has, whatever was trained on.
 
         An empty table keeps the env that the policies were trained in: so what demonstrations
-        alone have, looks they are rendered in among it, is named with its default.
+        alone have, looks they are rendered in among it, is named with its default in the task. The
+        whole procedure's step limit is not: it is no policy's, but `HierarchicalConfig`'s.
         """
-        plain = to_mapping(TaskConfig(names.SUTURE))
+        plain = to_mapping(TaskConfig(run.task))
         own = [key for recorded in self.demonstrations for key in recorded.env]
         own += ["randomisation"] if any(each.looks for each in self.demonstrations) else []
+        if run.is_hierarchical:
+            own = [key for key in own if key != "max_steps"]
         theirs = {key: plain[key] for key in own}
-        return {**theirs, **self.env, **(condition.env if condition else {})}
+        return {**theirs, **self.env, **condition.env}
 
     def recorded(self, policy: PlannedPolicy) -> Demonstrations:
         """Return what a policy is trained on."""
@@ -398,7 +401,7 @@ class Plan:
         """Return how a run is evaluated."""
         condition = next(each for each in self.conditions if each.name == run.condition)
         procedure = {**self.procedure, **condition.procedure}
-        return Evaluated(self.evaluated_env(condition), procedure)
+        return Evaluated(self.evaluated_env(run, condition), procedure)
 
     def references(self, runs: Sequence[RunConfig]) -> tuple[RunConfig, ...]:
         """Return the expert on each task and condition of the runs, where it is asked for."""

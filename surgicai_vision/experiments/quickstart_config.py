@@ -60,6 +60,8 @@ class Quickstart:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if not self.policies:
+            raise InputError("policies is empty; give at least one; {} is one without images.")
         check_frame_stride(self.frame_stride)
         if not 0.0 <= self.noise <= 1.0:
             raise InputError(f"noise is {self.noise:g}; it must be within 0 and 1.")

@@ -5,13 +5,14 @@ import os
 import shutil
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from fake_demos import render_with_fake_env, write_demos
 
 from surgicai_vision.commands.options import VIDEO
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import InputError, OutputExists, UnknownName
+from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.dataset import (
     check_dataset,
@@ -166,6 +167,24 @@ def test_the_same_command_again_does_nothing_and_wrong_ones_are_refused(tmp_path
         convert_dataset(tmp_path / "set", tmp_path / "other", views=("back", "back"))
     assert not (tmp_path / "other").exists()
     assert not list(tmp_path.glob("*.work"))
+
+
+def test_a_damaged_page_is_refused_and_leaves_nothing(tmp_path, demos):
+    render(demos, tmp_path / "set")
+    data = tmp_path / "set/data/chunk-000/file-000.parquet"
+    episode = pq.ParquetFile(data).metadata.row_group(1)
+    columns = (episode.column(number) for number in range(episode.num_columns))
+    start = next(
+        column.data_page_offset
+        for column in columns
+        if column.path_in_schema == f"{names.image_key('front')}.bytes"
+    )
+    content = bytearray(data.read_bytes())
+    content[start : start + 16] = b"\xff" * 16
+    data.write_bytes(content)
+    with pytest.raises(BadFile, match=r"1 of 3 episodes and .* cannot be read further"):
+        convert_dataset(tmp_path / "set", tmp_path / "back", views=("back",))
+    assert not (tmp_path / "back").exists()
 
 
 def test_the_command_line_knows_the_codecs(tmp_path, demos, capsys):

@@ -14,6 +14,7 @@ from fake_env import FakeEnv
 from shown import showing
 
 from surgicai_vision import envs
+from surgicai_vision.commands import record_demos
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
@@ -197,9 +198,30 @@ def test_bad_requests_are_refused_before_any_work(tmp_path, demos):
         render(demos, tmp_path / "set", views=("front", "front"))
     with pytest.raises(InputError, match="size is 4"):
         render(demos, tmp_path / "set", size=4)
+    with pytest.raises(InputError, match="size is 63, and a video of h264 needs an even one"):
+        render(demos, tmp_path / "set", size=63, video="h264")
+    with pytest.raises(InputError, match="size is 16, and a video of av1 needs at least 32"):
+        render(demos, tmp_path / "set", size=16, video="av1")
     with pytest.raises(BadFile, match="not a folder of demonstrations"):
         render(tmp_path / "nothing", tmp_path / "set")
     assert not (tmp_path / "set.work").exists()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (["--frame-stride", "3"], "frame_stride is 3"),
+        (["--size", "63", "--video", "h264"], "size is 63"),
+        (["--layout", "open-h", "--video", "h264"], "convert_image_to_video"),
+        (["--layout", "open-h", "--frame-stride", "5", "--config", "held.yaml"], "for 20 control"),
+    ],
+)
+def test_the_command_refuses_them_before_it_records(tmp_path, monkeypatch, capsys, wrong, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "held.yaml").write_text("env: {action_repeat: 4}")
+    monkeypatch.setattr(record_demos, "run", None)
+    assert main(["render-demos", *wrong]) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_demos_of_another_scene_are_refused(tmp_path, fake, demos, monkeypatch):

@@ -121,5 +121,10 @@ def test_what_it_is_not_for_is_refused(demos: Path, dataset: Path, tmp_path: Pat
         render_demos(demos, tmp_path / "video", layout="open-h", video="h264")
     with pytest.raises(InputError, match="frame_stride is 25"):
         render_demos(demos, tmp_path / "stride", layout="open-h", frame_stride=25)
+    slow = TaskConfig("grasp", action_repeat=2)
+    held = record(slow, episodes=1, out=tmp_path / "held", context=RunContext(0))
+    with pytest.raises(InputError, match="frame_stride is 10 and action_repeat 2"):
+        render_demos(held[0].parent, tmp_path / "rendered", layout="open-h", frame_stride=10)
+    assert not (tmp_path / "rendered.work").exists()
     with pytest.raises(UnknownName, match="layout"):
         render_demos(demos, tmp_path / "layout", layout="suturebot")

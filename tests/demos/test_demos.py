@@ -10,7 +10,13 @@ from shown import showing
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
+from surgicai_vision.core.errors import (
+    BadFile,
+    InputError,
+    OutputExists,
+    PhysicsError,
+    SurgicaiError,
+)
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.files import write_json
 from surgicai_vision.demos import record as recording
@@ -278,6 +284,21 @@ def test_record_skips_failed_seeds_and_writes_them_down(tmp_path, fake):
     assert sorted([demo.seed for demo in demos] + skipped) == list(range(6 + len(skipped)))
     assert seen[-1] == (6, 6, "episodes")
     assert [path.name for path in tmp_path.iterdir()] == ["demos"]
+
+
+def test_a_start_that_cannot_be_made_is_skipped(tmp_path, fake, monkeypatch):
+    reset = FakeEnv.reset
+
+    def sometimes(self, *, seed=None, options=None):
+        if seed == 1:
+            raise PhysicsError("No start of 'grasp' was physical in 20 draws.")
+        return reset(self, seed=seed)
+
+    monkeypatch.setattr(FakeEnv, "reset", sometimes)
+    paths = record(CONFIG, episodes=3, seed=0, out=tmp_path / "demos", context=RunContext(0))
+    assert 1 not in [read_demo(path).seed for path in paths]
+    skipped = {row["seed"]: row["reason"] for row in read_marker(tmp_path / "demos")["skipped"]}
+    assert skipped[1] == "No start of 'grasp' was physical in 20 draws."
 
 
 def test_record_again_does_nothing_and_another_request_is_refused(tmp_path, fake, monkeypatch):

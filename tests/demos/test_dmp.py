@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgicai_vision import envs
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.demos.dmp import fit
@@ -30,6 +30,7 @@ from surgicai_vision.demos.expert import Expert
 from surgicai_vision.demos.imports.surgicai import import_demos
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.rollout import rollout
+from surgicai_vision.demos.stitch_path import CLEARANCE, deviation_from_path, project
 from surgicai_vision.demos.store import list_demos, read_demo, read_marker, write_demo
 from surgicai_vision.envs import poses
 
@@ -238,6 +239,15 @@ def test_one_demonstration_teaches_other_starts(demonstrated, task):
     assert sum(successes) >= 4, successes
 
 
+def test_a_half_circle_is_grasped_at_the_same_share_of_its_arc(demonstrated):
+    """The demonstration is of a third of a circle."""
+    half_circles = RandomisationConfig(needle_arc="1/2", needle_size=0.2)
+    env = envs.make(TaskConfig("handoff", randomisation=half_circles))
+    demos = [demonstrated["handoff"]]
+    successes = [rollout(env, DmpController(env, demos), seed).success for seed in range(500, 502)]
+    assert all(successes), successes
+
+
 def test_an_insertion_is_cut_at_the_entry_and_a_pull_out_at_the_exit(demonstrated):
     for task, holes in (("insert", 1.0), ("pullout", 3.0)):
         demo = read_demo(demonstrated[task])
@@ -316,10 +326,10 @@ def test_a_projected_path_keeps_its_turns_and_lies_in_the_holes(demonstrated):
     measured = fit.demo_poses(read_demo(demonstrated["insert"]))
     cut = fit.CARRY_PHASES["insert"][0].end(measured)
     path = measured.needle[cut:]
-    assert fit._deviation_from_path(measured.stitch, path) < fit.CLEARANCE
+    assert deviation_from_path(measured.stitch, path) < CLEARANCE
     away = path.copy()
     away[:, :3, 3] += [0.003, 0.002, -0.004]
-    assert fit._deviation_from_path(measured.stitch, away) > fit.CLEARANCE
-    for projected, pose in zip(fit._project(measured.stitch, away), path, strict=True):
+    assert deviation_from_path(measured.stitch, away) > CLEARANCE
+    for projected, pose in zip(project(measured.stitch, away), path, strict=True):
         assert poses.angle(poses.flat(projected), poses.flat(pose)) < math.radians(0.5)
         assert poses.distance(poses.flat(projected), poses.flat(pose)) < 0.0003

@@ -119,6 +119,23 @@ def test_the_same_import_finds_it_finished(demos: list[Demo], tmp_path: Path) ->
     assert first[0].out == tmp_path / "out"
 
 
+def test_episodes_that_do_not_show_the_task_are_skipped(demos: list[Demo], tmp_path: Path) -> None:
+    """One of another subtask, and one of a single frame."""
+    rows = rows_of(demos[0], 1)
+    other = {**rows, "phase": [0] * len(demos[0]), "episode_index": [0] * len(demos[0])}
+    short = {key: values[:1] for key, values in rows_of(demos[1], 2).items()}
+    path = write_dataset(tmp_path / "dataset", [other, rows, short])
+    (made,) = import_dataset(path, task="place", out=tmp_path / "out")
+    assert len(made.paths) == 1
+    reasons = {row["bag"]: row["reason"] for row in made.skipped}
+    assert reasons["episode 0"] == (
+        "The recording shows no place; segmented by labels it shows grasp"
+    )
+    assert reasons["episode 2"].startswith("The topics overlap in 0.0 s")
+    with pytest.raises(InputError, match="episode 0: insert: The recording shows no insert"):
+        import_dataset(path, task="insert", out=tmp_path / "none")
+
+
 def test_elements_are_found_by_name_or_order(demos: list[Demo], tmp_path: Path) -> None:
     """Of a set with short names, one with an ECM among them, and one without names."""
     rows = rows_of(demos[0], 0)

@@ -12,6 +12,7 @@ import pytest
 from surgicai_vision.core import names
 from surgicai_vision.core.config import STEPS
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
+from surgicai_vision.core.processes import ONE_THREAD
 from surgicai_vision.demos.imports import replay, sandbox, surgicai_pickle
 from surgicai_vision.demos.imports.sandbox import read_sandboxed
 from surgicai_vision.demos.imports.surgicai import (
@@ -332,6 +333,25 @@ def test_the_reading_process_cannot_leave_its_limits(tmp_path, name):
     assert child.returncode != 0
     assert child.stdout.split() == ["limited"], child.stderr
     assert not (tmp_path / "other").exists()
+
+
+ALONE = """
+import os, runpy, sys
+sys.argv = ["sandbox", str(os.getppid()), "missing.pkl", os.devnull, "surgicai", "{}"]
+os.unshare = lambda namespaces: print(len(os.listdir("/proc/self/task")), flush=True)
+runpy.run_module("surgicai_vision.demos.imports.sandbox", run_name="__main__")
+"""
+
+
+def test_the_reading_process_has_one_thread_when_it_leaves_the_network():
+    """The kernel gives a user namespace, which others than root need for it, to no other."""
+    child = subprocess.run(
+        [sys.executable, "-c", ALONE],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **ONE_THREAD},
+    )
+    assert child.stdout.split() == ["1"], child.stderr
 
 
 def test_what_the_child_cannot_finish_is_a_bad_file(tmp_path, recording, monkeypatch):

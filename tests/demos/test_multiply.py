@@ -18,6 +18,7 @@ from surgicai_vision.demos.multiply import cuts, segments
 from surgicai_vision.demos.multiply.multiplier import Multiplier
 from surgicai_vision.demos.record import record
 from surgicai_vision.demos.rollout import Disturbance, rollout
+from surgicai_vision.demos.stitch_path import turns_along
 from surgicai_vision.demos.store import read_demo, read_marker, write_demo, write_marker
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.geometry import Stitch
@@ -101,7 +102,7 @@ def test_a_longer_needle_keeps_its_shares_of_the_way(sources):
     ideal = dataclasses.replace(tissue, off=np.broadcast_to(np.eye(4), tissue.off.shape))
     shares = [
         np.interp(
-            cuts._turns(moment.stitch, ideal.reposed(moment)),
+            turns_along(moment.stitch, ideal.reposed(moment)),
             segments.turn_knots(moment.stitch),
             np.arange(4.0),
         )

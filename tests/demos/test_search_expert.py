@@ -13,11 +13,21 @@ from policies.base import Recipe
 from policies.bc import BC
 from surgicai_vision import envs
 from surgicai_vision.core import names
-from surgicai_vision.core.config import CLOCK_PERIOD, CLOCK_SIZE, SUBTASK_STEPS, TaskConfig, clock
+from surgicai_vision.core.config import (
+    CLOCK_PERIOD,
+    CLOCK_SIZE,
+    SUBTASK_STEPS,
+    RandomisationConfig,
+    TaskConfig,
+    clock,
+)
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.rollout import rollout
 from surgicai_vision.demos.search_expert import SearchExpert
+from surgicai_vision.envs.geometry import Stitch
+from surgicai_vision.envs.starts import GRASP_ANGLES
 from surgicai_vision.evaluation.agents import PolicyAgent
+from surgicai_vision.scene.holes import PAIRS, HolePair
 from surgicai_vision.training.policies import load_policy
 from surgicai_vision.training.train import train
 
@@ -48,6 +58,17 @@ def test_it_meets_every_goal_and_reads_none() -> None:
     )
     steps = [len(grasp(env, 500_000, goal)[1]) for goal in (12.5, 5.0, 20.0)]
     assert steps[0] < second < steps[1] < third < steps[2] < SUBTASK_STEPS
+
+
+def test_its_attempts_go_where_the_goals_on_a_half_circle_lie() -> None:
+    half_circles = RandomisationConfig(needle_arc="1/2", needle_size=0.2)
+    env = envs.make(TaskConfig("grasp", randomisation=half_circles))
+    assert all(grasp(env, seed)[0] for seed in range(500_000, 500_004))
+
+
+@pytest.mark.parametrize("pair", [pair for pairs in PAIRS.values() for pair in pairs])
+def test_its_attempts_on_our_own_needle_are_the_angles_named(pair: HolePair) -> None:
+    assert Stitch.of(pair).grasps(*GRASP_ANGLES)[0] == GRASP_ANGLES[0]
 
 
 def test_its_demonstrations_show_every_attempt() -> None:

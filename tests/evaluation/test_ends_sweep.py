@@ -14,6 +14,7 @@ from surgicai_vision.core.progress import silent_stage
 from surgicai_vision.evaluation.ends_sweep import CHOSEN, Ends, sweep_ends
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.storage import MARKER, VISITS, read_evaluation
+from surgicai_vision.training.checkpoint import read_checkpoint, read_tensors, write_checkpoint
 from surgicai_vision.training.run_config import Starts
 
 
@@ -64,6 +65,21 @@ def test_every_pair_is_evaluated_once_and_the_best_is_a_policy(
     assert before == [(out / name / MARKER).stat().st_mtime_ns for name in folders]
     with pytest.raises(OutputExists, match="holds the ends of another"):
         sweep_ends(policy_file, Starts(names.VALIDATION_SEED, 3), out, silent_stage)
+
+
+def train_again(folder: Path) -> None:
+    """Put other weights into the folder of a checkpoint."""
+    stored = read_checkpoint(folder)
+    others = {name: 2 * tensor for name, tensor in read_tensors(stored).items()}
+    write_checkpoint(folder, stored, others)
+
+
+def test_a_high_level_policy_trained_anew_is_another_one(policy_file: Path, tmp_path: Path) -> None:
+    starts = Starts(names.VALIDATION_SEED, 1)
+    sweep_ends(policy_file, starts, tmp_path / "out", silent_stage, (0.5,), (1,), workers=1)
+    train_again(tmp_path / "hlp")
+    with pytest.raises(OutputExists, match="the ends of another policy"):
+        sweep_ends(policy_file, starts, tmp_path / "out", silent_stage, (0.5,), (1,), workers=1)
 
 
 def test_test_starts_and_privileged_ends_are_refused(policy_file: Path, tmp_path: Path) -> None:

@@ -15,8 +15,9 @@ from surgicai_vision import envs
 from surgicai_vision.commands.evaluate import summary_line
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import InputError, PhysicsError
+from surgicai_vision.core.errors import BadFile, InputError, PhysicsError
 from surgicai_vision.envs.bite_measures import BiteMeasures
+from surgicai_vision.envs.visits import Visit
 from surgicai_vision.evaluation import policy_spec, slot, storage
 from surgicai_vision.evaluation.agent import Agent
 from surgicai_vision.evaluation.agents import PolicyAgent, RandomAgent, ZeroAgent
@@ -198,9 +199,12 @@ def test_progress_ends_at_the_total(fake_envs):
     assert [done for done, _ in calls] == sorted(done for done, _ in calls)
 
 
-@pytest.mark.parametrize("seeds", [[], [1, 1]])
+FAR = 99999999999999999999
+
+
+@pytest.mark.parametrize("seeds", [[], [1, 1], [-1], [2**63], range(FAR, FAR + 2)])
 def test_seeds_are_checked(seeds):
-    with pytest.raises(InputError, match="start seeds"):
+    with pytest.raises(InputError, match=r"[Ss]tart seeds"):
         evaluate(ZeroAgent, SHORT, seeds)
 
 
@@ -236,6 +240,36 @@ def test_rows_and_summary_hold_what_was_measured(fake_envs, tmp_path):
     assert result["tears"] == result["thread_mm"] == NEVER_MEASURED
     assert json.loads((tmp_path / storage.MARKER).read_text())["summary"] == result
     assert repr(storage.read_rows(tmp_path)) == repr(as_table(rows_of(episodes)))
+
+
+def test_a_damaged_evaluation_is_refused_in_one_line(fake_envs, tmp_path):
+    episodes = evaluate(ZeroAgent, SHORT, [3], workers=1)
+    storage.write_evaluation(tmp_path, episodes, RunConfig(policy="zero"), {})
+    stored = json.loads((tmp_path / storage.MARKER).read_text())
+    for key in ("run", "summary", "about"):
+        rest = {other: value for other, value in stored.items() if other != key}
+        (tmp_path / storage.MARKER).write_text(json.dumps(rest))
+        with pytest.raises(BadFile, match=f"no table '{key}'"):
+            storage.read_evaluation(tmp_path)
+    reads = {
+        storage.EPISODES: lambda: storage.read_rows(tmp_path),
+        storage.FILMS: lambda: storage.read_film(tmp_path, 3),
+    }
+    for name, read in reads.items():
+        read()
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-20])
+        with pytest.raises(BadFile, match=f"{name} is damaged") as refused:
+            read()
+        assert "\n" not in str(refused.value)
+
+
+def test_visits_of_an_earlier_evaluation_go_with_it(fake_envs, tmp_path):
+    episodes = evaluate(ZeroAgent, SHORT, [3], workers=1)
+    visited = [replace(episodes[0], visits=(Visit(0, 0, 3, 1, 2, False),))]
+    storage.write_evaluation(tmp_path, visited, RunConfig(policy="zero"), {})
+    assert (tmp_path / storage.VISITS).is_file()
+    storage.write_evaluation(tmp_path, episodes, RunConfig(policy="zero"), {})
+    assert not (tmp_path / storage.VISITS).exists()
 
 
 def test_kinds_of_failure():

@@ -4,11 +4,15 @@ import json
 
 import pyarrow.parquet as pq
 import pytest
+from checkpoints import checkpoint
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
-from surgicai_vision.evaluation.expert_swap import AS_IT_IS, CURVES, variants_of
+from surgicai_vision.core.errors import OutputExists
+from surgicai_vision.core.progress import silent_stage
+from surgicai_vision.evaluation.expert_swap import AS_IT_IS, CURVES, evaluate_swaps, variants_of
 from surgicai_vision.evaluation.storage import MARKER, read_rows
+from surgicai_vision.training.checkpoint import read_checkpoint, read_tensors, write_checkpoint
 
 POLICY = (
     "hlp: order\ngrasp: expert\nplace: zero\ninsert: expert\nhandoff: random\npullout: expert\n"
@@ -61,6 +65,26 @@ def test_a_swapped_expert_lets_the_procedure_go_on_to_the_next_weak_link(
     assert json.loads(capsys.readouterr().out.splitlines()[-1]) == result
     assert main([*command, "--seed", "5"]) == 2
     assert "the expert swaps of another" in capsys.readouterr().err
+
+
+def train_again(folder):
+    """Put other weights into the folder of a checkpoint."""
+    stored = read_checkpoint(folder)
+    others = {name: 2 * tensor for name, tensor in read_tensors(stored).items()}
+    write_checkpoint(folder, stored, others)
+
+
+def test_a_part_trained_anew_in_the_same_folder_is_another_policy(tmp_path):
+    path = tmp_path / "hierarchical.yaml"
+    checkpoint(tmp_path / "place", "place")
+    given = POLICY.replace("place: zero", f"place: {tmp_path / 'place'}")
+    path.write_text(given.replace("handoff: random", "handoff: expert").replace("520", "2"))
+    seeds = [names.TEST_SEED]
+    evaluate_swaps(variants_of(path), seeds, tmp_path / "out", silent_stage, 1)
+    evaluate_swaps(variants_of(path), seeds, tmp_path / "out", silent_stage, 1)
+    train_again(tmp_path / "place")
+    with pytest.raises(OutputExists, match="the expert swaps of another policy"):
+        evaluate_swaps(variants_of(path), seeds, tmp_path / "out", silent_stage, 1)
 
 
 def test_one_subtask_can_be_swapped_alone(policy_file, tmp_path, capsys):

@@ -95,6 +95,9 @@ def test_a_factory_elsewhere_makes_the_agent(tmp_path: Path) -> None:
         (f"{__name__}:not_an_agent", "gives int"),
         (f"{__name__}:nothing", "cannot be imported"),
         ("no_such_module:make", "cannot be imported"),
+        (":x", "names no function"),
+        ("json:", "names no function"),
+        (".json:loads", "names no function"),
         ("replay", "give a dataset"),
         ("missing.yaml", "Cannot read"),
         ("expret", "Did you mean 'expert'"),
@@ -104,6 +107,41 @@ def test_a_factory_elsewhere_makes_the_agent(tmp_path: Path) -> None:
 def test_what_is_no_policy_is_refused(given: str, told: str) -> None:
     with pytest.raises(InputError, match=told):
         open_policy(given)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "told"),
+    [
+        ("config.json", {"input_features": {"observation.state": {"type": "STATE"}}}, "no shape"),
+        (
+            "config.json",
+            {"input_features": {"image": {"type": "VISUAL", "shape": [3]}}},
+            "no shape",
+        ),
+        ("config.json", {"output_features": {"action": {"shape": [7]}}}, "no type"),
+        ("config.json", {"output_features": [7]}, "'output_features' is no table"),
+        ("train_config.json", {"env": ["surgicai"]}, "'env' is no table"),
+        ("train_config.json", {"env": {"type": "surgicai", "encoder": "random"}}, "'cameras' is"),
+    ],
+)
+def test_a_damaged_checkpoint_of_lerobot_is_refused(tmp_path, file, content, told):
+    (tmp_path / "model.safetensors").write_bytes(b"")
+    (tmp_path / "config.json").write_text('{"type": "act"}')
+    (tmp_path / file).write_text(json.dumps({"type": "act", **content}))
+    with pytest.raises(BadFile, match=told) as refused:
+        open_policy(tmp_path, task="grasp")
+    assert str(tmp_path / file) in str(refused.value)
+
+
+@pytest.mark.parametrize("more", [["evaluate"], ["robustness", "--axis", "latency"]])
+def test_a_seed_that_no_row_holds_is_refused_before_any_work(tmp_path, more, capsys):
+    verb, *options = more
+    out = tmp_path / "out"
+    command = [verb, "zero", "--seed", "99999999999999999999", "--out", str(out), *options]
+    assert main(command) == 2
+    told = capsys.readouterr().err.strip().splitlines()
+    assert len(told) == 1 and "allowed: 0 to 9223372036854775807" in told[0]
+    assert not out.exists()
 
 
 def test_options_that_do_not_go_with_a_policy_are_refused(tmp_path: Path) -> None:

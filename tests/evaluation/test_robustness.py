@@ -2,6 +2,7 @@
 
 import json
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -300,6 +301,18 @@ def test_running_again_does_only_what_is_missing(tmp_path, pretend):
     assert pretend.calls[done:] == [("light", 0.5), ("smoke", 0.5), ("smoke", 1.0)]
     with pytest.raises(OutputExists, match="of another policy"):
         curves.robustness(seeing_spec(), range(5), tmp_path, silent, ("light",))
+
+
+@pytest.mark.parametrize("key", ["checkpoint", "dataset", "parts"])
+def test_curves_of_what_was_made_anew_are_not_taken_for_its_own(tmp_path, pretend, key):
+    for made in ("first", "first", "second"):
+        spec = replace(seeing_spec(), about={key: {"policy_sha256": made}, "folder": made})
+        if made == "second":
+            with pytest.raises(OutputExists, match="of another policy"):
+                curves.robustness(spec, SEEDS, tmp_path, silent, ("light",), (0.0,))
+        else:
+            curves.robustness(spec, SEEDS, tmp_path, silent, ("light",), (0.0,))
+    assert len(pretend.calls) == 1
 
 
 def test_without_images_only_the_arm_can_shift(tmp_path):

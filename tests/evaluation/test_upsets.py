@@ -2,18 +2,22 @@
 
 import dataclasses
 import json
+import math
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, PhysicsError
 from surgicai_vision.envs.upset import plan_upset
-from surgicai_vision.evaluation.agents import ExpertAgent
+from surgicai_vision.evaluation.agents import ExpertAgent, ZeroAgent
 from surgicai_vision.evaluation.metrics import as_table, summary
 from surgicai_vision.evaluation.policy_spec import open_policy
 from surgicai_vision.evaluation.rollout import evaluate
+from surgicai_vision.evaluation.slot import Slot
 from surgicai_vision.report.experiment_key import condition_of
 from surgicai_vision.training.run_config import RunConfig, of_training
 
@@ -40,6 +44,26 @@ def test_rows_say_what_went_wrong_when_and_whether_it_was_recovered():
     plain = evaluate(ExpertAgent, GRASP, SEEDS[:1], workers=1)
     assert (plain[0].row.upset, plain[0].row.upset_step, plain[0].row.recovered) == ("", -1, False)
     assert "upsets" not in summary([plain[0].row])
+
+
+def test_a_start_that_cannot_be_made_has_nothing_of_the_episode_before(monkeypatch):
+    slot = Slot(0, ZeroAgent(), TaskConfig(names.SUTURE, max_steps=2), upset=True)
+    slot.begin(SEEDS[0])
+    while not slot.ended:
+        slot.step(np.zeros(7, np.float32))
+    slot._mishap = SimpleNamespace(kind="push", step=33)
+    slot.take()
+
+    def impossible(**_):
+        raise PhysicsError("impossible start")
+
+    monkeypatch.setattr(slot.env, "reset", impossible)
+    slot.begin(SEEDS[1])
+    episode = slot.take()
+    slot.env.close()
+    assert episode.row.error == "impossible start" and episode.visits == ()
+    assert (episode.row.upset, episode.row.upset_step, episode.row.recovered) == ("", -1, False)
+    assert math.isnan(episode.row.false_ends) and math.isnan(episode.row.end_delay_s)
 
 
 def test_a_disturbed_evaluation_is_another_run_with_another_name():

@@ -160,6 +160,21 @@ def test_a_field_of_an_env_stands_whole_in_the_place_of_the_plans_and_the_others
     assert recorded.tolerance == "released"
 
 
+def test_a_step_limit_of_demonstrations_is_no_evaluations():
+    """Each policy is evaluated with its task's, as its key says, the procedure with its own."""
+    env = {"max_steps": 300, "hold_jaw": True}
+    recorded = [{**each, "env": env} for each in TABLE["demonstrations"]]
+    whole = {"name": "all", "view": ["back"], **WHOLE}  # one policy for the whole procedure
+    table = {"demonstrations": recorded, "policies": [*TABLE["policies"], whole]}
+    plan = plan_of({**TABLE, **table, "conditions": [{"name": "standing"}]}, "a test")
+    for run in plan.runs:
+        evaluated = plan.evaluated(run).env
+        limit = None if run.is_hierarchical else run.env.max_steps
+        assert evaluated.get("max_steps") == limit
+        assert not evaluated["hold_jaw"] and not run.env.hold_jaw
+    assert {run.env.max_steps for run in plan.runs if not run.is_hierarchical} == {200, 1000}
+
+
 def test_everything_is_built_once_and_evaluated_on_the_same_starts(quiet, tiny):
     out, result = quiet
     assert counts(result) == (RUNS, RUNS, 0, 0, 0, 0), result["problems"]
@@ -300,6 +315,16 @@ def test_a_file_is_tried_small_beside_the_whole(tmp_path, monkeypatch, capsys):
         ({"conditions": [{"name": "a", "seed": [7]}]}, "training seed '7'"),
         ({"conditions": [{"name": "a", "env": {"task": "grasp"}}]}, "leave it out"),
         ({"conditions": [{"name": "a", "env": {"randomisation": {"licht": 1}}}]}, "'light'"),
+        ({"conditions": [{"name": "a", "env": ["b"]}]}, "expected a table of keys"),
+        ({"env": 5}, "expected a table of keys"),
+        (
+            {"demonstrations": [{**TABLE["demonstrations"][0], "env": {"task": "grasp"}}]},
+            "demonstrations whole: env has 'task'",
+        ),
+        (
+            {"demonstrations": [{**TABLE["demonstrations"][0], "env": {"advance": "told"}}]},
+            "demonstrations whole: env has 'advance'",
+        ),
         ({"conditions": [{"name": "a", "procedure": {"terminatoin": "x"}}]}, "'termination'"),
         ({"conditions": [{"name": "a"}, {"name": "a"}]}, "each once"),
         (

@@ -12,7 +12,9 @@ import yaml
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
+from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.video import read_video
+from surgicai_vision.experiments.quickstart_config import Quickstart
 
 TINY = {
     "task": "grasp",
@@ -66,6 +68,11 @@ def run(folder, *arguments):
         patch.setenv("SURGICAI_VISION_RELEASED", str(folder / "nothing"))
         code = main([*arguments, "--json"])
     return code, json.loads(told.getvalue().splitlines()[-1])
+
+
+def test_a_quickstart_without_policies_is_refused():
+    with pytest.raises(InputError, match="policies is empty; give at least one"):
+        Quickstart(policies=())
 
 
 def times(folder):

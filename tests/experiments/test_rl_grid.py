@@ -79,6 +79,20 @@ def test_what_cannot_be_run_is_refused_at_once(changes, error):
         RLGrid(**{"task": ("grasp",), "algo": ("bc",), **changes})
 
 
+@pytest.mark.parametrize("line", ["change: 5", "env: foo"])
+def test_a_table_of_another_kind_is_refused(line, tmp_path):
+    path = tmp_path / "grid.yaml"
+    path.write_text(f"task: grasp\nalgo: bc\n{line}\n")
+    with pytest.raises(InputError, match="expected a table of keys"):
+        read_experiment(path)
+
+
+def test_an_algorithm_without_demonstrations_has_one_procedure_whatever_their_numbers():
+    grid = RLGrid(names.SUBTASKS, ("ppo", "td3-bc"), demonstrations=(50, 100), hierarchical=True)
+    procedures = [(run.algo, run.demonstrations) for run in grid.runs if run.is_hierarchical]
+    assert procedures == [("ppo", None), ("td3-bc", 50), ("td3-bc", 100)]
+
+
 def test_a_task_has_changes_of_its_own_in_rows_and_procedures():
     grid = RLGrid(
         names.SUBTASKS,

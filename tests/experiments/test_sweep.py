@@ -6,6 +6,7 @@ Whatever happens, each run is done once and the digest is the same.
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,21 +18,25 @@ import pyarrow.parquet as pq
 import pytest
 
 from surgicai_vision.commands.console import QuietConsole
+from surgicai_vision.commands.main import main
 from surgicai_vision.commands.sweep import read_grid
-from surgicai_vision.core import names
+from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, UnknownName
 from surgicai_vision.core.executor import JOBS, RunContext
+from surgicai_vision.core.executor.store import LOCK
 from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.codecs import DEPTH_FAR, DEPTH_NEAR, grey
 from surgicai_vision.dataset.subset import first_episodes, with_frame_stride
-from surgicai_vision.evaluation.storage import read_evaluation
+from surgicai_vision.evaluation.storage import FORMAT, GRID_FILE, read_evaluation
 from surgicai_vision.experiments.sweep.driver import run_sweep
 from surgicai_vision.experiments.sweep.estimate import estimate
 from surgicai_vision.experiments.sweep.grid import Grid, parts_of
 from surgicai_vision.experiments.sweep.lerobot import _arguments
 from surgicai_vision.experiments.sweep.plan import Jobs, plan, read_experiment_of, run_key
+from surgicai_vision.experiments.sweep.rl_grid import RLGrid
 from surgicai_vision.experiments.sweep.selection import read_choice
+from surgicai_vision.report import collect
 from surgicai_vision.report.experiment_key import condition_of
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import read_checkpoint
@@ -50,11 +55,19 @@ BLIND = Grid(
     size=32,
 )
 """Four runs that see nothing: half a second each."""
+GROWING = RLGrid(("grasp",), ("bc",), seed=(0, 1), demonstrations=(1,), updates=2, episodes=1)
+"""A sweep to which seeds may be added."""
 
 
 def sweep(grid, out, workers=0, stage=QUIET, only=()):
     context = RunContext(workers, stage=stage)
     return run_sweep(grid, out, context, choice=read_choice(only, grid.runs))
+
+
+def store_table(experiment, out):
+    """Make a folder the experiment's."""
+    out.mkdir(exist_ok=True)
+    files.write_json(out / GRID_FILE, {"format": FORMAT, experiment.kind: dict(experiment.table())})
 
 
 def counts(result):
@@ -208,6 +221,56 @@ def test_a_failing_run_is_recorded_the_rest_goes_on_and_it_is_tried_again(tmp_pa
     assert not failure.exists()
 
 
+def test_a_run_that_fails_when_it_is_done_again_counts_no_longer(quiet, tmp_path):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("epochs: 1\n")
+    out = tmp_path / "out"
+    shutil.copytree(quiet[0] / "data", out / "data")
+    grid = replace(BLIND, seed=(0,), recipe=("paper", str(recipe)), epochs=None, expert=False)
+    grid = replace(grid, demonstrations=(2,))
+    store_table(grid, out)
+    assert counts(sweep(grid, out)) == (2, 2, 0, 0, 0, 0)
+    key = next(state.key for state in plan(grid, out) if state.run.recipe == str(recipe))
+    path = out / "runs" / key / "result.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "job": "other"}))
+    recipe.write_text("learning_rate: 1.0e+38\nepochs: 3\n")
+    assert counts(sweep(grid, out)) == (2, 0, 1, 1, 0, 0)
+    left = {each.name for each in path.parent.iterdir()}
+    assert "failed.json" in left and not left & {"result.json", "evaluation"}
+    assert pq.read_table(out / "episodes.parquet").num_rows == 1
+    assert [missing.state for missing in collect(out).missing] == ["failed"]
+
+
+def test_a_refused_call_changes_nothing(tmp_path):
+    out = tmp_path / "out"
+    store_table(replace(GROWING, seed=(0,)), out)
+    before = (out / "sweep.json").read_bytes()
+    (out / "work").mkdir()
+    with (
+        files.locked(out / "work" / LOCK),
+        pytest.raises(InputError, match="Another run is working"),
+    ):
+        sweep(GROWING, out)
+    assert (out / "sweep.json").read_bytes() == before
+
+
+def test_what_fails_beside_the_runs_is_counted_and_ends_the_command_with_1(
+    quiet, tmp_path, monkeypatch, capsys
+):
+    def broken(*arguments, **options):
+        raise InputError("no expert")
+
+    out = tmp_path / "out"
+    shutil.copytree(quiet[0], out)
+    shutil.rmtree(out / "references")
+    monkeypatch.setattr("surgicai_vision.experiments.sweep.jobs.open_policy", broken)
+    result = sweep(BLIND, out)
+    assert (result["failed"], result["failed_beside"]) == (0, 1)
+    monkeypatch.setattr("surgicai_vision.experiments.sweep.driver.run_sweep", lambda *_: result)
+    assert main(["sweep", "smoke"]) == 1
+    assert "failed: expert-grasp: no expert" in capsys.readouterr().out
+
+
 def test_hierarchical_runs_share_their_policies():
     grid = Grid(
         ("suture",),
@@ -325,6 +388,16 @@ def test_a_grid_is_read_with_single_values(tmp_path):
             read_grid(path)
 
 
+@pytest.mark.parametrize(
+    ("text", "views"),
+    [("front", [["front"]]), ("front,back", [["front", "back"]]), ("[front, back]", None)],
+)
+def test_a_single_set_of_views_stands_without_brackets(text, views, tmp_path):
+    path = tmp_path / "grid.yaml"
+    path.write_text(f"task: grasp\nencoder: random\nview: {text}\n")
+    assert [list(view) for view in read_grid(path).view] == (views or [["front"], ["back"]])
+
+
 def test_a_grid_says_who_demonstrates_and_how_much_disturbed(tmp_path):
     grid = replace(
         BLIND,
@@ -392,3 +465,19 @@ def test_keys_count_every_module_that_can_change_a_run():
     counted = set(JOBS["sweep-run"].stages)
     harmless = {"core", "report", "rl"}  # rl: names and settings of algorithms
     assert loaded - counted - harmless == set()
+
+
+def test_keys_count_every_module_of_core_that_can_change_a_run():
+    code = (
+        "import sys, surgicai_vision.experiments.sweep.rl_jobs, surgicai_vision.demos.record,"
+        " surgicai_vision.dataset.render_jobs, surgicai_vision.experiments.sweep.jobs;"
+        " print(*{name.split('.')[2] for name in sys.modules if"
+        " name.startswith('surgicai_vision.core.')})"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+    harmless = {"errors", "executor", "files", "lazy", "plugins", "processes", "progress"}
+    harmless |= {"banks", "yaml_text"}  # what they give is in the arguments of a job
+    assert set(said.split()) - {path.stem for path in files.SHARED} - harmless == set()
+    assert all(path.is_file() for path in files.SHARED)

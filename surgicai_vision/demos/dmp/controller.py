@@ -39,6 +39,7 @@ from surgicai_vision.demos.expert import (
 from surgicai_vision.demos.store import read_demo
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.geometry import grasp_in_needle
+from surgicai_vision.scene import needle
 from surgicai_vision.scene.rotations import geodesic_angle, matrix_to_quaternion
 
 Matrix = NDArray[np.float64]
@@ -111,8 +112,8 @@ class DmpController(Demonstrator):
             before = self._phases[self._index]
             after = self._phases[self._index + 1]
             stitch = self.env.stitch
-            needle_pose = before.goal(stitch) @ pose @ np.linalg.inv(before.frame())
-            start = np.linalg.inv(after.goal(stitch)) @ needle_pose @ after.frame()
+            needle_pose = before.goal(stitch) @ pose @ np.linalg.inv(before.frame(stitch))
+            start = np.linalg.inv(after.goal(stitch)) @ needle_pose @ after.frame(stitch)
             self._start_phase(self._index + 1, start)
         elif execution.done:
             execution.set_goal(*_split(np.eye(4)))
@@ -128,13 +129,14 @@ class DmpController(Demonstrator):
         if not self._phases:
             return np.linalg.inv(self._grasp_pose(world)) @ world.tip
         phase = self._phases[0]
-        return np.linalg.inv(phase.goal(world.stitch)) @ world.needle @ phase.frame()
+        return np.linalg.inv(phase.goal(world.stitch)) @ world.needle @ phase.frame(world.stitch)
 
     # -- tool targets ------------------------------------------------------------------------------
 
     def _carry(self, world: WorldState) -> ToolTarget:
         phase = self._phases[self._index]
-        needle_pose = phase.goal(world.stitch) @ self._next_pose() @ np.linalg.inv(phase.frame())
+        frame = phase.frame(world.stitch)
+        needle_pose = phase.goal(world.stitch) @ self._next_pose() @ np.linalg.inv(frame)
         return ToolTarget(world.tip_for_needle(needle_pose), 0.0)
 
     def _grasp(self, world: WorldState) -> ToolTarget:
@@ -150,8 +152,9 @@ class DmpController(Demonstrator):
 
     def _grasp_pose(self, world: WorldState) -> Matrix:
         """Return T_world_tip of the grasp, at the episode's angle or else the demonstrated one."""
-        angle = world.task_state.grasp_angle or self.fit.grasp_angle
-        return world.needle @ grasp_in_needle(world.arm, angle)
+        share = world.stitch.tip_angle / needle.TIP_ANGLE
+        angle = world.task_state.grasp_angle or self.fit.grasp_angle * share
+        return world.needle @ grasp_in_needle(world.arm, angle, radius=world.stitch.radius)
 
 
 def _split(pose: Matrix) -> tuple[Matrix, Matrix]:

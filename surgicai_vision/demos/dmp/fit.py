@@ -36,19 +36,15 @@ from surgicai_vision.demos.dmp.primitive import (
     multiply,
     without_pauses,
 )
-from surgicai_vision.demos.expert import on_path, turn_about_wound
+from surgicai_vision.demos.stitch_path import CLEARANCE, OUTSIDE, deviation_from_path, project
 from surgicai_vision.demos.store import Demo
 from surgicai_vision.envs import poses
-from surgicai_vision.envs.geometry import HANDOFF_ANGLE, Stitch, grasp_in_needle, needle_frame
+from surgicai_vision.envs.geometry import Stitch, grasp_in_needle, needle_frame
 from surgicai_vision.scene import needle
 from surgicai_vision.scene.rotations import matrix_to_quaternion, quaternion_to_matrix
 
 Array = NDArray[np.float64]
 
-CLEARANCE = 0.0009
-"""Clearance of the needle on the path from the openings' edges [m]; see `envs.geometry`."""
-OUTSIDE = 0.0003
-"""The needle enters when its tip was last further than this outside the entry [m]."""
 STRAIGHT_DURATION = 0.5
 """Duration of a phase of which too few samples are left to learn a shape [s]."""
 
@@ -79,21 +75,21 @@ class CarryPhase:
     """A phase of a subtask in which the needle is carried.
 
     Attributes:
-        point: the frame that moves is the needle's at this angle [rad]; None: at its origin, the
-            arc's centre.
+        point: the frame that moves is the stitch's needle's at this angle [rad]; None: at its
+            origin, the arc's centre.
         goal: where that frame ends when the subtask is done perfectly, T_world_point (4, 4).
         end: index of the demonstration's last sample of the phase.
         in_tissue: the needle is in the tissue.
     """
 
-    point: float | None
+    point: Callable[[Stitch], float] | None
     goal: Callable[[Stitch], Array]
     end: Callable[[DemoPoses], int]
     in_tissue: bool = False
 
-    def frame(self) -> Array:
-        """Return T_needle_point (4, 4)."""
-        return np.eye(4) if self.point is None else needle_frame(self.point)
+    def frame(self, stitch: Stitch) -> Array:
+        """Return T_needle_point (4, 4) on the stitch's needle."""
+        return np.eye(4) if self.point is None else needle_frame(self.point(stitch), stitch.radius)
 
 
 def _last(demo: DemoPoses) -> int:
@@ -102,7 +98,8 @@ def _last(demo: DemoPoses) -> int:
 
 def _entered(demo: DemoPoses) -> int:
     """Return the first sample after the tip was last outside the entry."""
-    tips = demo.needle[:, :3, :3] @ needle.point(needle.TIP_ANGLE) + demo.needle[:, :3, 3]
+    tip = needle.point(demo.stitch.tip_angle, demo.stitch.radius)
+    tips = demo.needle[:, :3, :3] @ tip + demo.needle[:, :3, 3]
     entry = demo.stitch.pair.entry
     outside = np.flatnonzero((tips - np.asarray(entry.centre)) @ entry.rotation[:, 2] > OUTSIDE)
     return min(int(outside[-1]) + 1, _last(demo)) if len(outside) else 0
@@ -110,17 +107,17 @@ def _entered(demo: DemoPoses) -> int:
 
 def _left(demo: DemoPoses) -> int:
     """Return the first sample with the whole needle beyond the exit."""
-    points = (
-        np.einsum("tij,pj->tpi", demo.needle[:, :3, :3], needle.polyline(13))
-        + demo.needle[:, None, :3, 3]
-    )
+    line = needle.polyline(13, demo.stitch.radius, demo.stitch.tip_angle)
+    points = np.einsum("tij,pj->tpi", demo.needle[:, :3, :3], line) + demo.needle[:, None, :3, 3]
     leave = demo.stitch.pair.exit
     beyond = ((points - np.asarray(leave.centre)) @ leave.rotation[:, 2]).min(axis=1) > 0.0
     return int(np.argmax(beyond)) if beyond.any() else _last(demo)
 
 
 _ENTER = CarryPhase(
-    needle.TIP_ANGLE, lambda stitch: stitch.place() @ needle_frame(needle.TIP_ANGLE), _entered
+    lambda stitch: stitch.tip_angle,
+    lambda stitch: stitch.place() @ needle_frame(stitch.tip_angle, stitch.radius),
+    _entered,
 )
 CARRY_PHASES: Mapping[str, tuple[CarryPhase, ...]] = MappingProxyType(
     {
@@ -132,7 +129,9 @@ CARRY_PHASES: Mapping[str, tuple[CarryPhase, ...]] = MappingProxyType(
         "pullout": (
             CarryPhase(None, lambda stitch: stitch.inserted(), _left, in_tissue=True),
             CarryPhase(
-                HANDOFF_ANGLE, lambda stitch: stitch.pulled() @ needle_frame(HANDOFF_ANGLE), _last
+                lambda stitch: stitch.handoff_angle,
+                lambda stitch: stitch.pulled() @ needle_frame(stitch.handoff_angle, stitch.radius),
+                _last,
             ),
         ),
     }
@@ -160,7 +159,8 @@ class SubtaskFit:
     Attributes:
         task: the subtask.
         phases: one per phase of `CARRY_PHASES`, or one where the needle is grasped.
-        grasp_angle: the needle's point that was grasped [rad]; where the needle is grasped.
+        grasp_angle: the point of a 120° needle that was grasped, of another one that at the same
+            share of its arc [rad]; where the needle is grasped.
         jaw_opening: jaw angle before closing [rad]; where the needle is grasped.
         projected: number of demonstrations that had to be projected onto the path through the
             holes.
@@ -239,38 +239,25 @@ def _fit_carrying(task: str, demos: list[DemoPoses], scaled: bool) -> SubtaskFit
         for phase in phases:
             last = max(phase.end(demo), first)
             path = demo.needle[first : last + 1]
-            if phase.in_tissue and _deviation_from_path(demo.stitch, path) > CLEARANCE:
-                path = _project(demo.stitch, path)
+            if phase.in_tissue and deviation_from_path(demo.stitch, path) > CLEARANCE:
+                path = project(demo.stitch, path)
                 projected += 1
             paths.append(path)
             first = last
         # Express each phase in the coordinates of its goal.
         for index, phase in enumerate(phases):
             inverse = np.linalg.inv(phase.goal(demo.stitch))
-            motions[index].append(as_motion(inverse @ paths[index] @ phase.frame(), demo.dt))
+            frame = phase.frame(demo.stitch)
+            motions[index].append(as_motion(inverse @ paths[index] @ frame, demo.dt))
             # A phase before one in the tissue ends where that one, projected or not, begins.
             before_tissue = index + 1 < len(paths) and phases[index + 1].in_tissue
             end = paths[index + 1][0] if before_tissue else paths[index][-1]
-            goals[index].append(inverse @ end @ phase.frame())
+            goals[index].append(inverse @ end @ frame)
     fitted = tuple(
         _fit_phase(phase_motions, phase_goals, scaled)
         for phase_motions, phase_goals in zip(motions, goals, strict=True)
     )
     return SubtaskFit(task, fitted, projected=projected)
-
-
-def _project(stitch: Stitch, path: Array) -> Array:
-    """Return needle poses (T, 4, 4) on the path through the holes, at the same turns."""
-    turns = np.unwrap([turn_about_wound(stitch.place(), pose) for pose in path])
-    turns += 2 * np.pi * (turns[-1] < 0.0)
-    return np.array([on_path(stitch, max(float(turn), 0.0)) for turn in turns])
-
-
-def _deviation_from_path(stitch: Stitch, path: Array) -> float:
-    """Return the largest distance of a point of the needle from its place on the path [m]."""
-    points = np.column_stack([needle.polyline(5), np.ones(5)])
-    difference = np.einsum("tij,pj->tpi", path - _project(stitch, path), points)
-    return float(np.linalg.norm(difference[..., :3], axis=-1).max())
 
 
 def _fit_phase(motions: list[Motion], goals: list[Array], scaled: bool) -> FittedPhase:
@@ -306,9 +293,9 @@ def _fit_grasping(task: str, demos: list[DemoPoses], scaled: bool) -> SubtaskFit
         in_needle = np.linalg.inv(demo.needle[0]) @ demo.tip
         last = closing(demo.jaw)
         angle = float(np.arctan2(in_needle[last, 1, 3], -in_needle[last, 0, 3]))
-        goal = np.linalg.inv(grasp_in_needle(demo.arm, angle))
+        goal = np.linalg.inv(grasp_in_needle(demo.arm, angle, radius=demo.stitch.radius))
         motions.append(as_motion(goal @ in_needle[: last + 1], demo.dt))
-        angles.append(angle)
+        angles.append(angle * (needle.TIP_ANGLE / demo.stitch.tip_angle))
         openings.append(float(demo.jaw[last]))
     phase = _fit_phase(motions, [np.eye(4)], scaled)
     return SubtaskFit(

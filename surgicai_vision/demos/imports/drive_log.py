@@ -38,6 +38,8 @@ DEMONSTRATOR = "drive"
 """Who demonstrates, as it is stored."""
 SEVEN = 7
 """Numbers of an arm: x y z [m], roll pitch yaw, one finger's angle [rad]."""
+MAX_STEP = 10**9
+"""Largest control step that is read: more than half a year."""
 POSE = "geometry_msgs/PoseStamped"
 JOINT = "sensor_msgs/JointState"
 
@@ -127,12 +129,14 @@ def _steps(path: Path) -> Iterator[_Step]:
             if not arms:
                 continue
             seed, step, phase = (int(cast(int, row[key])) for key in ("episode", "step", "phase"))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise BadFile(
                 f"{path}, line {number} is none of a log ({first_line(error)})."
             ) from None
         if len(arms) != 2 * SEVEN or not np.isfinite(arms).all():
             raise BadFile(f"{path}, line {number}: both_arms must be {2 * SEVEN} finite numbers.")
+        if not 0 <= step <= MAX_STEP:
+            raise BadFile(f"{path}, line {number}: step must be within 0 and {MAX_STEP}.")
         if not 0 <= phase < len(names.SUBTASKS):
             raise BadFile(f"{path}, line {number}: there is no subtask {phase}.")
         yield _Step(run, seed, step, phase, arms)

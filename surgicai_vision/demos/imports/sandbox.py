@@ -3,11 +3,11 @@
     arrays = read_sandboxed(Path("regrasp_all_episodes_merged.pkl"))
     arrays = read_sandboxed(Path("trial.bag"), "bag", topics={"psm2_pose": "/PSM2/measured_cp"})
 
-The child sets its limits before it opens the file: memory, processor time, size of what it writes,
-and, where the kernel allows it, an empty network namespace of its own. An audit hook that cannot be
-removed then ends every attempt to start a process, to open a socket, or to write any file (its one
-result is open by then). It returns plain arrays (npz without pickles). Whatever fails in it is a
-`BadFile`, or the `InputError` of its reader.
+The child begins with an empty network namespace of its own, where the kernel allows it, and sets
+its limits before it opens the file: memory, processor time, size of what it writes. An audit hook
+that cannot be removed then ends every attempt to start a process, to open a socket, or to write any
+file (its one result is open by then). It returns plain arrays (npz without pickles). Whatever fails
+in it is a `BadFile`, or the `InputError` of its reader.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core.config import JSON
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
-from surgicai_vision.core.processes import ONE_THREAD, run_module
+from surgicai_vision.core.processes import ONE_THREAD, end_with_parent
 
 READERS: Mapping[str, str] = MappingProxyType(
     {
@@ -90,14 +90,17 @@ def read_sandboxed(
     with tempfile.TemporaryDirectory(prefix="surgicai-vision-") as folder:
         result = Path(folder) / "arrays.npz"
         try:
-            child = run_module(
-                "surgicai_vision.demos.imports.sandbox",
-                str(path),
-                str(result),
-                kind,
-                json.dumps(options),
-                variables={**ONE_THREAD, "PYTHONPATH": _search_path()},
+            child = subprocess.run(
+                [
+                    *(sys.executable, "-m", "surgicai_vision.demos.imports.sandbox"),
+                    *(str(os.getpid()), str(path), str(result), kind, json.dumps(options)),
+                ],
+                env={**os.environ, **ONE_THREAD, "PYTHONPATH": _search_path()},
+                capture_output=True,
+                text=True,
+                stdin=subprocess.DEVNULL,
                 timeout=WALL_SECONDS,
+                check=False,
             )
         except subprocess.TimeoutExpired:
             raise BadFile(f"{path} was not read within {WALL_SECONDS} s.") from None
@@ -118,16 +121,24 @@ def _search_path() -> str:
     return str(Path(__file__).parents[3])
 
 
+def _leave_network() -> None:
+    """Take this process into an empty network namespace.
+
+    Users other than root need a user namespace for it, which only a process of one thread may make:
+    this comes before everything that starts another.
+    """
+    for namespaces in (os.CLONE_NEWNET, os.CLONE_NEWUSER | os.CLONE_NEWNET):
+        with contextlib.suppress(OSError):  # not every kernel and container lets us
+            os.unshare(namespaces)
+            break
+
+
 def _limit() -> None:
     """Take from this process the rights that reading a file does not need."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (PROCESSOR_SECONDS, PROCESSOR_SECONDS))
     resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_WRITTEN, MAX_WRITTEN))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    for namespaces in (os.CLONE_NEWNET, os.CLONE_NEWUSER | os.CLONE_NEWNET):
-        with contextlib.suppress(OSError):  # not every kernel and container lets us
-            os.unshare(namespaces)
-            break
 
     def hook(event: str, arguments: tuple[object, ...]) -> None:
         flags = arguments[2] if event == "open" else None
@@ -154,4 +165,6 @@ def main(path: str, result: str, kind: str, options: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    _leave_network()
+    end_with_parent(int(sys.argv[1]))
+    sys.exit(main(*sys.argv[2:]))

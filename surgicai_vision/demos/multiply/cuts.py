@@ -26,7 +26,6 @@ from surgicai_vision.core.errors import InputError
 from surgicai_vision.core.files import sha256_file
 from surgicai_vision.core.runs import runs_of
 from surgicai_vision.demos.demonstrator import GOAL_FREE_DEMONSTRATORS
-from surgicai_vision.demos.expert import on_path, turn_about_wound
 from surgicai_vision.demos.multiply.segments import (
     STILL,
     Frame,
@@ -45,9 +44,15 @@ from surgicai_vision.demos.multiply.segments import (
     tip_of_needle,
     turn_knots,
 )
+from surgicai_vision.demos.stitch_path import (
+    CLEARANCE,
+    OUTSIDE,
+    deviation_from_path,
+    project,
+    turns_along,
+)
 from surgicai_vision.demos.store import Demo, read_demo
 from surgicai_vision.envs import poses
-from surgicai_vision.envs.geometry import Stitch
 from surgicai_vision.scene import needle
 
 Array = NDArray[np.float64]
@@ -63,10 +68,6 @@ LIFTED = 0.004
 """Height over its place from which a needle may travel [m] (the expert's `CLEAR`)."""
 CLOSED = 0.1
 """A jaw commanded below this is closed [rad]: `control.SQUEEZE_BELOW`."""
-CLEARANCE = 0.0009
-"""Room of the needle between the openings' edges [m]; see `envs.geometry`."""
-OUTSIDE = 0.0003
-"""The needle enters when its tip was last further than this outside the entry [m]."""
 OTHER_JAWS = 0.002
 """A grasp that ends further from the goal was made by other jaws than ours [m]; the tolerances of
 grasp and handoff are 1 mm and 2 mm."""
@@ -308,10 +309,9 @@ def _tissue(track: Track, first: int, last: int) -> TissueSegment:
     """Return the states `first` to `last` relative to the path through the holes."""
     stitch = track.moment.stitch
     carried = track.carried[first : last + 1]
-    turn = _turns(stitch, carried)
-    ideal = np.array([on_path(stitch, float(value)) for value in np.maximum(turn, 0.0)])
-    off = np.linalg.inv(ideal) @ carried
-    if _strays(stitch, track.needle[first : last + 1]):
+    turn = turns_along(stitch, carried)
+    off = np.linalg.inv(project(stitch, carried)) @ carried
+    if deviation_from_path(stitch, track.needle[first : last + 1]) > CLEARANCE:
         off = np.broadcast_to(np.eye(4), carried.shape)
     return TissueSegment(
         np.maximum(turn, 0.0),
@@ -320,20 +320,3 @@ def _tissue(track: Track, first: int, last: int) -> TissueSegment:
         track.jaw[first : last + 1],
         track.step[first : last + 1],
     )
-
-
-def _turns(stitch: Stitch, path: Array) -> Array:
-    """Return the turns about the wound of needle poses (n, 4, 4), without jumps, (n,) [rad]."""
-    start = stitch.place()
-    wrapped = np.array([turn_about_wound(start, pose) for pose in path])
-    turns: Array = np.unwrap(wrapped).astype(np.float64)
-    return turns + (2 * np.pi if turns[-1] < 0.0 else 0.0)
-
-
-def _strays(stitch: Stitch, path: Array) -> bool:
-    """Return True if needle poses (n, 4, 4) leave the room that the openings have."""
-    turns = np.maximum(_turns(stitch, path), 0.0)
-    ideal = np.array([on_path(stitch, float(turn)) for turn in turns])
-    line = np.column_stack([needle.polyline(5, stitch.radius, stitch.tip_angle), np.ones(5)])
-    apart = np.einsum("tij,pj->tpi", path - ideal, line)[..., :3]
-    return bool(np.linalg.norm(apart, axis=-1).max() > CLEARANCE)

@@ -19,6 +19,7 @@ from surgicai_vision.core.progress import Stage
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.robustness import CURVES, MARK, STRENGTHS
 from surgicai_vision.evaluation.robustness.axes import AXES, axes_of, shifted
+from surgicai_vision.evaluation.rollout import check_seeds
 from surgicai_vision.evaluation.run import evaluate_into
 from surgicai_vision.evaluation.statistics import (
     area_interval,
@@ -56,11 +57,12 @@ def robustness(
 
     Raises:
         UnknownName: an axis that does not exist.
-        InputError: strengths out of range or order, or an axis of images for a policy that sees
-            none.
+        InputError: strengths out of range or order, seeds that `check_seeds` refuses, or an axis
+            of images for a policy that sees none.
         OutputExists: `out` holds the curves of another policy or of other starts.
     """
     chosen = _checked(spec, axes, strengths)
+    check_seeds(seeds)
     _claim(out, spec, seeds)
     rows: list[Row] = []
     plain: Path | None = None
@@ -113,6 +115,7 @@ def _claim(out: Path, spec: PolicySpec, seeds: Sequence[int]) -> None:
         "run": to_mapping(spec.run),
         "checkpoint": spec.about.get("checkpoint"),
         "seeds": [int(seed) for seed in seeds],
+        **spec.content,
     }
     files.claim(out / MARK, mine, "the curves")
 

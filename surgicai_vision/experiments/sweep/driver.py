@@ -52,6 +52,8 @@ from surgicai_vision.training.run_config import RunConfig
 
 EPISODES, PROBES = "episodes.parquet", "probes.parquet"
 WORK = "work"
+EVALUATION = "evaluation"
+"""Folder of a run's episodes, beside its result."""
 ATTEMPTS = 3
 """How often a run is started whose worker dies."""
 
@@ -76,8 +78,9 @@ def run_sweep(
             encoded on a GPU where there is one, and trained on the CPU.
 
     Returns:
-        {"runs", "done" (by this call), "cached", "failed", "not_run", "left", "digest" (of all
-        rows there are), "problems": one line for each run that failed or was not done}.
+        {"runs", "done" (by this call), "cached", "failed", "not_run", "left", "failed_beside" (the
+        references and probes that failed), "digest" (of all rows there are), "problems": one line
+        for each run that failed or was not done, and for what failed beside them}.
 
     Raises:
         InputError: `out` cannot be written, or another sweep is at work in it.
@@ -92,6 +95,7 @@ def run_sweep(
             check_upset_task(run.task)
     _open(experiment, out)
     with claim(out / WORK):
+        _extend(experiment, out)
         states = plan(experiment, out, choice)
         asked = [state.run for state in states if state.state != LEFT]
         sweep = _Sweep(experiment, out, context, attempts, experiment.references(asked), device)
@@ -123,31 +127,46 @@ def run_sweep(
         "failed": len(sweep.errors),
         "not_run": len(skipped),
         "left": sum(state.state == LEFT for state in states),
+        "failed_beside": len(sweep.problems),
     }
     lines = [*problems, *sweep.problems]
     return {**counts, "digest": digest(table), "problems": lines, "out": str(out)}
 
 
 def _open(experiment: Experiment, out: Path) -> None:
-    """Make the folder, or accept the one of the same experiment."""
+    """Make the folder, or accept the one of the same experiment, in which nothing is changed."""
     files.check_output(out, may_resume=GRID_FILE)
-    table = experiment.table()
     if (out / GRID_FILE).exists():
-        stored = read_experiment_of(out)
-        if stored.kind != experiment.kind or not experiment.extends(stored.table()):
-            raise OutputExists(
-                f"--out {out} holds another sweep (see {out / GRID_FILE}); give another folder. "
-                "To a plan, training seeds and conditions may be added; the rest must stay."
-            )
-        if stored.table() == table:
-            return
+        _stored(experiment, out)
+        return
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
             f"--out {out} cannot be written: {error.strerror}; choose another folder."
         ) from None
-    files.write_json(out / GRID_FILE, {"format": FORMAT, experiment.kind: table})
+    _store_table(experiment, out)
+
+
+def _extend(experiment: Experiment, out: Path) -> None:
+    """Store what is added to the experiment of the folder, which this call holds alone."""
+    if _stored(experiment, out).table() != experiment.table():
+        _store_table(experiment, out)
+
+
+def _stored(experiment: Experiment, out: Path) -> Experiment:
+    """Return the experiment of the folder, or refuse one that does not go on as this one."""
+    stored = read_experiment_of(out)
+    if stored.kind != experiment.kind or not experiment.extends(stored.table()):
+        raise OutputExists(
+            f"--out {out} holds another sweep (see {out / GRID_FILE}); give another folder. "
+            "To a plan, training seeds and conditions may be added; the rest must stay."
+        )
+    return stored
+
+
+def _store_table(experiment: Experiment, out: Path) -> None:
+    files.write_json(out / GRID_FILE, {"format": FORMAT, experiment.kind: experiment.table()})
 
 
 @final
@@ -367,9 +386,14 @@ class _Sweep:
         return self.out / "references" / "-".join(parts)
 
     def _fail(self, state: RunState, error: SurgicaiError) -> None:
-        """Keep a run's error, and its traceback where it was none of ours."""
+        """Keep a run's error, and its traceback where it was none of ours.
+
+        A result that other code or other data gave is removed: it counts no longer.
+        """
         folder = run_folder(self.out, state.key)
         folder.mkdir(parents=True, exist_ok=True)
+        (folder / RESULT_FILE).unlink(missing_ok=True)  # first: without it nothing is counted
+        shutil.rmtree(folder / EVALUATION, ignore_errors=True)
         details = "\n".join([str(error), *getattr(error, "__notes__", [])])
         failed = {"format": FORMAT, "run": to_mapping(state.run), "error": details}
         files.write_json(folder / FAILED_FILE, failed)
@@ -399,7 +423,7 @@ def _collect(experiment: Experiment, out: Path) -> list[Row]:
         folder = run_folder(out, run_key(run))
         if (folder / RESULT_FILE).exists():
             about = _about(run)
-            table += [{**about, **row} for row in read_rows(folder / "evaluation")]
+            table += [{**about, **row} for row in read_rows(folder / EVALUATION)]
     files.write_bytes(out / EPISODES, parquet_bytes(table))
     return table
 

@@ -160,14 +160,16 @@ class RLGrid:
         """Yield the whole procedure over the actors of each algorithm and seed."""
         if not self.hierarchical:
             return
-        for algo, count, seed in itertools.product(self.algo, self.demonstrations, self.seed):
-            low = self._actor(algo, names.SUBTASKS[0], count, seed)
-            yield replace(
-                low,
+        axes = (self.algo, self.demonstrations, self.seed)
+        yield from dict.fromkeys(
+            replace(
+                self._actor(algo, names.SUBTASKS[0], count, seed),
                 env=self.config(names.SUTURE),
                 changes=self._changes_of(algo),
                 termination="privileged",
             )
+            for algo, count, seed in itertools.product(*axes)
+        )
 
     @property
     def bank(self) -> Starts:

@@ -59,8 +59,8 @@ class BagSummary:
         clipped: steps faster than the preset allows, whose action was clipped to [-1, 1].
         pauses: samples left out because the arm rested.
         succeeded: demonstrations whose last state meets the task's tolerances in our scene.
-        skipped: segments that could not be replayed, {"bag", "task", "from", "to", "reason"};
-            times in seconds.
+        skipped: segments that could not be replayed, and recordings that show nothing of what is
+            wanted, {"bag", "task", "from", "to", "reason"}; times in seconds.
     """
 
     task: str
@@ -98,8 +98,8 @@ def import_bags(
     Raises:
         UnknownName: an unknown task.
         BadFile: an unreadable bag.
-        InputError: topics that are not there, nothing to segment by, nothing found, nothing that
-            can be replayed.
+        InputError: topics that are not there, nothing to segment by, nothing found in any of them,
+            nothing that can be replayed.
         OutputExists: `out` holds something else.
     """
     base = base_config(task, env)
@@ -157,7 +157,9 @@ def write_tracks(
         InputError: nothing can be replayed.
     """
     if not tracks:
-        raise InputError(f"Nothing can be imported: {skipped[0]['task']}: {skipped[0]['reason']}.")
+        first = skipped[0]
+        what = f"{first['bag']}: {first['task']}" if first["task"] else first["bag"]
+        raise InputError(f"Nothing can be imported: {what}: {first['reason']}.")
     # Make a folder for each subtask that was found, or find it finished.
     summaries = []
     done = 0
@@ -172,7 +174,7 @@ def write_tracks(
             _build(
                 folder,
                 of_subtask,
-                [row for row in skipped if row["task"] == name],
+                [row for row in skipped if row["task"] in (name, "")],
                 base,
                 config,
                 asked,

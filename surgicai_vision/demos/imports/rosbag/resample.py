@@ -37,6 +37,10 @@ ENDOSCOPE_FRAMES = ("ecm", "cam")
 Arrays = Mapping[str, NDArray[np.generic]]
 
 
+class NothingShown(InputError):
+    """A recording without what is wanted of it; others of the same import may have it."""
+
+
 @dataclass(frozen=True)
 class Arm:
     """One arm's motion.
@@ -84,19 +88,23 @@ def resample(arrays: Arrays, config: BagConfig, instrument: str) -> Recording:
         instrument: the instrument whose joints these are, where there are joints and no pose.
 
     Raises:
-        InputError: no arm, no time in which all topics overlap, poses in a frame that is not the
-            arm's base.
+        NothingShown: no time in which all topics overlap.
+        InputError: no arm, a recording that is too long, poses in a frame that is not the arm's
+            base.
     """
     times = _times(arrays, config)
     roles = _roles(arrays, config)
     steady = [role for role in roles if not _is_command(role, config)]
     begin = max(times[role].min() for role in steady)
     end = min(times[role].max() for role in steady)
-    if not begin < end <= begin + MAX_DURATION * 1e9 * config.speed:
-        raise InputError(
-            f"The topics overlap in {(end - begin) / 1e9:.1f} s; "
-            f"that must be above 0 and at most {MAX_DURATION:.0f} s."
-        )
+    overlap = (
+        f"The topics overlap in {(end - begin) / 1e9:.1f} s; "
+        f"that must be above 0 and at most {MAX_DURATION:.0f} s."
+    )
+    if not begin < end:
+        raise NothingShown(overlap)
+    if end > begin + MAX_DURATION * 1e9 * config.speed:
+        raise InputError(overlap)
     step = 1e9 / RATE * config.speed
     grid = np.arange(0.0, (end - begin) + 1e-6 * step, step)
     values = {role: arrays[f"{role}.value"].astype(np.float64, copy=False) for role in roles}

@@ -28,7 +28,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import InputError
 from surgicai_vision.demos.dmp.primitive import PAUSE_SPEED, PAUSE_TURN_RATE
 from surgicai_vision.demos.imports.rosbag.config import NOTHING, BagConfig
-from surgicai_vision.demos.imports.rosbag.resample import RATE, Recording
+from surgicai_vision.demos.imports.rosbag.resample import RATE, NothingShown, Recording
 from surgicai_vision.envs import hole_crossing, poses
 from surgicai_vision.envs.geometry import Stitch, needle_frame
 from surgicai_vision.envs.insert import START_SHIFT, START_TURN
@@ -86,7 +86,8 @@ def segments(
             for all.
 
     Raises:
-        InputError: nothing to segment by, an unknown label, or nothing found.
+        NothingShown: nothing found.
+        InputError: nothing to segment by, or an unknown label.
     """
     method = config.segmentation
     if method == "auto" and recording.label is not None:
@@ -104,7 +105,7 @@ def segments(
     wanted = [segment for segment in found if task in (None, segment.task)]
     if not wanted:
         shown = ", ".join(sorted({segment.task for segment in found})) or "none"
-        raise InputError(
+        raise NothingShown(
             f"The recording shows no {task or 'subtask'}; segmented by {method} it shows {shown}."
         )
     return wanted

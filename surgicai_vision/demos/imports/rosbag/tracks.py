@@ -14,7 +14,13 @@ from surgicai_vision.core.config import JSON, TaskConfig
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.demos.imports.replay import Episode, Track, grip_error, needle_path
 from surgicai_vision.demos.imports.rosbag.config import BagConfig, topic_list
-from surgicai_vision.demos.imports.rosbag.resample import Arm, Arrays, Recording, resample
+from surgicai_vision.demos.imports.rosbag.resample import (
+    Arm,
+    Arrays,
+    NothingShown,
+    Recording,
+    resample,
+)
 from surgicai_vision.demos.imports.rosbag.segments import Segment, holes_passed, moving, segments
 from surgicai_vision.demos.imports.sandbox import read_sandboxed
 from surgicai_vision.scene import kinematics, needle
@@ -63,7 +69,8 @@ def extract_tracks(
 ) -> tuple[list[SegmentTrack], list[dict[str, JSON]]]:
     """Return the tracks of a bag's segments, and what is skipped.
 
-    A skipped segment is {"bag", "task", "from", "to", "reason"}.
+    A skipped segment is {"bag", "task", "from", "to", "reason"}; so is a recording that shows
+    nothing of what is wanted, whose task is "" where all were.
 
     Args:
         bag: the bag.
@@ -73,7 +80,7 @@ def extract_tracks(
 
     Raises:
         BadFile: an unreadable bag.
-        InputError: topics that are not there, nothing to segment by, nothing found.
+        InputError: topics that are not there, nothing to segment by.
     """
     arrays = read_sandboxed(
         bag, "bag", topics=config.all_topics, needed=list(config.topics.given())
@@ -93,9 +100,13 @@ def tracks_of(
         config: how to read it.
         base: the scene.
     """
+    begin = 0.0
+    end = 0.0
     try:
         recording = resample(arrays, config, base.scene.instrument)
         pair = PAIRS[base.scene.layout][base.scene.hole_pair - 1]
+        begin = float(recording.time[0])
+        end = float(recording.time[-1])
         found = segments(recording, pair, config, task)
         passed = None if recording.needle is None else holes_passed(recording.needle, pair)
         tracks = []
@@ -108,6 +119,8 @@ def tracks_of(
                 tracks.append(SegmentTrack(path.name, segment.task, begin, end, track, pauses))
             except UnusableSegment as error:
                 skipped.append(_row(path.name, segment.task, begin, end, str(error)))
+    except NothingShown as error:
+        return [], [_row(path.name, task or "", begin, end, str(error).rstrip("."))]
     except InputError as error:
         raise type(error)(f"{path}: {error}") if type(error) is InputError else error from None
     return tracks, skipped
