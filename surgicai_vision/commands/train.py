@@ -98,7 +98,7 @@ class Options:
             (docs/rl.md); --change then changes its settings.
         demos: Folder of the demonstrations that it learns from; without --algo those of the
             dataset, for a policy that plans chunks of a dataset with few frames.
-        demonstrations: Take the first N of them.
+        demonstrations: Take the first N of them, or of the dataset.
         observation: What the actor sees of the state.
         env_steps: Control steps in the env; offline algorithms take none.
         updates: Updates of an offline algorithm.
