@@ -18,7 +18,7 @@ from surgicai_vision.commands.options import (
     WeightFiles,
     within,
 )
-from surgicai_vision.core import files, names
+from surgicai_vision.core import names
 from surgicai_vision.features.encoders import WeightsSource
 
 SUFFIXES = (".png", ".jpg", ".pdf", ".svg")
@@ -59,6 +59,7 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Run one episode, hide parts of the images at some steps, and draw what mattered."""
+    from surgicai_vision.envs import contact_sheet
     from surgicai_vision.evaluation.occlusion import occlusion
 
     folders.check_file(options.out, "--out", SUFFIXES)
@@ -73,8 +74,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         found = occlusion(spec.make_agent(), spec.config, options.seed, options.step, options.patch)
     ended = f"{'success' if found.success else 'failure'} after {found.steps} steps"
     title = f"{spec.name}: {spec.config.task}, start {options.seed}, {ended}"
-    with files.whole_file(options.out) as temporary:
-        found.sheet(title).savefig(temporary, dpi=100)
+    contact_sheet.write(found.sheet(title), options.out, dpi=100)
     console.say(f"{ended}; an action changes by up to {found.largest:.2f} of its range")
     console.say(f"image: {options.out}")
     return {

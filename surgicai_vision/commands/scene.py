@@ -21,7 +21,7 @@ from surgicai_vision.commands.options import (
     task_config,
     within,
 )
-from surgicai_vision.core import files, names
+from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
 
 app = App(
@@ -143,8 +143,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     figure = contact_sheet.sheet(
         rows, [f"{moment}: {modality}" for moment, modality in shown], title
     )
-    with files.whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=140)
+    contact_sheet.write(figure, path, dpi=140)
     console.say(f"sheet: {path}")
     return {
         "sheet": str(path),
@@ -185,8 +184,7 @@ def _film(path: Path, options: Options, console: Console) -> dict[str, object]:
     figure = contact_sheet.sheet(
         rows, columns, f"the scripted expert, seed {options.seed}, seen by {options.view[0]}"
     )
-    with files.whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    contact_sheet.write(figure, path, dpi=110)
     console.say(f"film: {path}")
     return {"film": str(path), "view": options.view[0], "seed": options.seed, "subtasks": outcomes}
 
@@ -246,8 +244,7 @@ def _axes(path: Path, options: Options, console: Console) -> dict[str, object]:
         [f"strength {strength:g}" for strength in STRENGTHS],
         f"axes of robustness: {options.task}, seed {options.seed}, seen by {view}",
     )
-    with files.whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=100)
+    contact_sheet.write(figure, path, dpi=100)
     console.say(f"sheet: {path}")
     return {"axes": {axis: AXES[axis].text for axis in shown}, "sheet": str(path), "view": view}
 
@@ -278,8 +275,7 @@ def _looks(path: Path, options: Options, console: Console) -> dict[str, object]:
             progress(done + 1, len(families))
     columns = [f"{view}, seed {seed}" for seed in seeds for view in options.view]
     figure = contact_sheet.sheet(rows, columns, f"looks: the start of {options.task}")
-    with files.whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=80)
+    contact_sheet.write(figure, path, dpi=80)
     console.say(f"sheet: {path}")
     return {"looks": [name for name, _ in rows], "sheet": str(path), "views": list(options.view)}
 
@@ -295,7 +291,6 @@ def _world(path: Path, kind: str, options: Options, console: Console) -> dict[st
     with console.stage("rendering"):
         rows, columns = draw(config.scene, view, options.seed, options.size, options.quality)
     figure = contact_sheet.sheet(rows, columns, f"{kind} of a world that varies, seen by {view}")
-    with files.whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    contact_sheet.write(figure, path, dpi=110)
     console.say(f"sheet: {path}")
     return {"sheet": str(path), "view": view, "seed": options.seed}

@@ -29,10 +29,14 @@ def turns_along(stitch: Stitch, path: Array) -> Array:
     return turns + (2 * np.pi if turns[-1] < 0.0 else 0.0)
 
 
+def at_turns(stitch: Stitch, turns: Array) -> Array:
+    """Return the needle poses (n, 4, 4) on the path through the holes at turns (n,) [rad]."""
+    return np.array([on_path(stitch, max(float(turn), 0.0)) for turn in turns])
+
+
 def project(stitch: Stitch, path: Array) -> Array:
     """Return needle poses (n, 4, 4) on the path through the holes, at the same turns."""
-    turns = turns_along(stitch, path)
-    return np.array([on_path(stitch, max(float(turn), 0.0)) for turn in turns])
+    return at_turns(stitch, turns_along(stitch, path))
 
 
 def deviation_from_path(stitch: Stitch, path: Array) -> float:

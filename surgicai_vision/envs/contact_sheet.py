@@ -3,12 +3,13 @@
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.core import names
+from surgicai_vision.core import files, names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.envs import make
 from surgicai_vision.scene.rendering import Frame
@@ -132,6 +133,12 @@ def sheet(
     for column, axis in zip(columns, axes[0], strict=True):
         axis.set_title(column, fontsize=10)
     return figure
+
+
+def write(figure: "Figure", path: Path, dpi: int) -> None:
+    """Write a sheet whole: a kill leaves what was there; the suffix names the format."""
+    with files.whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)
 
 
 def jpeg(image: Image, quality: int = 85) -> bytes:

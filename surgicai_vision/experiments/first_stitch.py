@@ -217,5 +217,4 @@ def _strip(
     with contact_sheet.state_renderer(sewer.spec.config, STRIP_SIZE) as draw:
         rows = [(view, [draw(state, view) for state in shown]) for view in LOOK.views]
     figure = contact_sheet.sheet(rows, columns, f"The whole procedure by {sewer.who}")
-    with files.whole_file(path) as whole:
-        figure.savefig(whole, dpi=100)
+    contact_sheet.write(figure, path, dpi=100)

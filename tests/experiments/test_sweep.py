@@ -451,33 +451,34 @@ def test_a_sweep_of_another_version_is_refused(tmp_path):
         sweep(BLIND, tmp_path)
 
 
-def test_keys_count_every_module_that_can_change_a_run():
-    """What a worker imports for a run is counted in its key, or named here as harmless."""
-    code = (
-        "import sys, surgicai_vision.experiments.sweep.jobs, surgicai_vision.demos.record;"
-        " print(*{name.split('.')[1] for name in sys.modules if"
-        " name.startswith('surgicai_vision.')})"
-    )
+def loaded_parts(modules, depth):
+    """Return the names at `depth` below the package of all its modules that importing loads."""
+    code = f"import sys, {', '.join(modules)}; print(*sys.modules)"
     said = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout
-    loaded = set(said.split())
+    ours = (name.split(".") for name in said.split() if name.startswith("surgicai_vision."))
+    return [parts[1 : depth + 1] for parts in ours if len(parts) > depth]
+
+
+def test_keys_count_every_module_that_can_change_a_run():
+    """What a worker imports for a run is counted in its key, or named here as harmless."""
+    modules = ("surgicai_vision.experiments.sweep.jobs", "surgicai_vision.demos.record")
+    loaded = {package for (package,) in loaded_parts(modules, 1)}
     counted = set(JOBS["sweep-run"].stages)
     harmless = {"core", "report", "rl"}  # rl: names and settings of algorithms
     assert loaded - counted - harmless == set()
 
 
 def test_keys_count_every_module_of_core_that_can_change_a_run():
-    code = (
-        "import sys, surgicai_vision.experiments.sweep.rl_jobs, surgicai_vision.demos.record,"
-        " surgicai_vision.dataset.render_jobs, surgicai_vision.experiments.sweep.jobs;"
-        " print(*{name.split('.')[2] for name in sys.modules if"
-        " name.startswith('surgicai_vision.core.')})"
+    modules = (
+        "surgicai_vision.experiments.sweep.rl_jobs",
+        "surgicai_vision.demos.record",
+        "surgicai_vision.dataset.render_jobs",
+        "surgicai_vision.experiments.sweep.jobs",
     )
-    said = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout
+    loaded = {module for package, module in loaded_parts(modules, 2) if package == "core"}
     harmless = {"errors", "executor", "files", "lazy", "plugins", "processes", "progress"}
     harmless |= {"banks", "yaml_text"}  # what they give is in the arguments of a job
-    assert set(said.split()) - {path.stem for path in files.SHARED} - harmless == set()
+    assert loaded - {path.stem for path in files.SHARED} - harmless == set()
     assert all(path.is_file() for path in files.SHARED)

@@ -47,8 +47,8 @@ from surgicai_vision.demos.multiply.segments import (
 from surgicai_vision.demos.stitch_path import (
     CLEARANCE,
     OUTSIDE,
+    at_turns,
     deviation_from_path,
-    project,
     turns_along,
 )
 from surgicai_vision.demos.store import Demo, read_demo
@@ -310,7 +310,7 @@ def _tissue(track: Track, first: int, last: int) -> TissueSegment:
     stitch = track.moment.stitch
     carried = track.carried[first : last + 1]
     turn = turns_along(stitch, carried)
-    off = np.linalg.inv(project(stitch, carried)) @ carried
+    off = np.linalg.inv(at_turns(stitch, turn)) @ carried
     if deviation_from_path(stitch, track.needle[first : last + 1]) > CLEARANCE:
         off = np.broadcast_to(np.eye(4), carried.shape)
     return TissueSegment(
