@@ -1,9 +1,10 @@
-"""Documentation: what it names exists: verbs, options, files, modules."""
+"""Documentation: what it names exists: verbs, options, files, modules; its tables are whole."""
 
 import contextlib
 import functools
 import importlib.util
 import io
+import itertools
 import re
 import shlex
 from pathlib import Path
@@ -27,6 +28,7 @@ PAGES = [
     ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs/recipes").glob("*.md")),
+    *sorted((ROOT / "docs/results").rglob("*.md")),
 ]
 COMMAND = re.compile(rf"^(?:\s{{4,}}|\| `|`){PROGRAM} ([a-z][^`|#\n]*)", re.MULTILINE)
 FILE = re.compile(
@@ -34,6 +36,8 @@ FILE = re.compile(
     r"[\w./-]+)`"
 )
 GROUPS = {ENCODERS_GROUP, POLICIES_GROUP, TASKS_GROUP, CAMERAS_GROUP, ENGINES_GROUP}
+RULE = re.compile(r"\|(:?-{3,}:?\|)+")
+"""The line between a table's head and its rows."""
 MODULE = re.compile(r"\b(surgicai_vision(?:\.[a-z_]+)+)\b")
 
 
@@ -52,7 +56,12 @@ def commands(page: Path) -> list[list[str]]:
     return [shlex.split(found) for found in COMMAND.findall(text)]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def name_of(page: Path) -> str:
+    """A page's path in the repository."""
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_commands_in_docs_have_verbs_and_options_that_exist(page: Path) -> None:
     for words in commands(page):
         if words[0].startswith("-") or words[0].isupper():
@@ -76,16 +85,37 @@ def _grouped(verb: str) -> set[str]:
     return {f"{verb} {name.replace('_', '-')}" for name in names}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_files_named_in_docs_exist(page: Path) -> None:
     named = [name for name in FILE.findall(page.read_text()) if not name.endswith("-v0")]
     assert not [name for name in named if not (ROOT / name).exists()]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_modules_named_in_docs_exist(page: Path) -> None:
     for name in sorted(set(MODULE.findall(page.read_text())) - GROUPS):
         module, _, attribute = name.rpartition(".")
         found = importlib.import_module(module)
         if not hasattr(found, attribute):
             assert importlib.util.find_spec(name) is not None, f"{page.name}: {name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_row_of_a_table_has_as_many_cells_as_its_head(page: Path) -> None:
+    """A row that was wrapped, or joined to another, is shown as prose full of bars."""
+    lines = page.read_text(encoding="utf-8").splitlines()
+    broken = [line for line in lines if "|---" in line and not RULE.fullmatch(line.strip())]
+    for index, line in enumerate(lines):
+        if not RULE.fullmatch(line.strip()):
+            continue
+        for row in (lines[index - 1], *itertools.takewhile(str.strip, lines[index + 1 :])):
+            if _cells(row) != _cells(line):
+                broken.append(row)
+    assert broken == []
+
+
+def _cells(row: str) -> int:
+    """How many cells a table's row has; 0 where it is none."""
+    text = row.strip()
+    whole = text.startswith("|") and text.endswith("|")
+    return len(re.findall(r"(?<!\\)\|", text)) - 1 if whole else 0
