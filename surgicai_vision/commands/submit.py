@@ -39,10 +39,10 @@ class Options:
     evaluation: Annotated[Path, Parameter(metavar="DIR")] = field(kw_only=False)
     name: str
     by: str
-    link: str = ""
+    link: Annotated[str, Parameter(show_default=False)] = ""
     minutes: Annotated[float | None, Parameter(validator=validators.Number(gte=0))] = None
-    hardware: str = ""
-    note: str = ""
+    hardware: Annotated[str, Parameter(show_default=False)] = ""
+    note: Annotated[str, Parameter(show_default=False)] = ""
     out: Annotated[
         Path | None,
         Parameter(metavar="FILE.json"),
