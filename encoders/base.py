@@ -7,7 +7,8 @@ Interface:
   (B, 3, S, S) normalised images → (B, dim).
 * `Encoder(card, network, pool)`: the final class. `encoder(frames (B, H, W, 3) uint8 RGB) -> (B,
   dim) float32`, frozen for good: eval mode, no gradient, and nothing can put it back into training.
-* `state_sha256(module)`: one hash over all parameters and buffers.
+* `state_sha256(module)`: one hash over all parameters and buffers; `network_sha256(module)`: one
+  over its layers and their code.
 * `read_tensors(path)`: safetensors, or a torch file read with `weights_only=True`.
 * `load_exactly(network, tensors, where)`: load; names and shapes must fit to the last.
 
@@ -28,8 +29,11 @@ beside any neighbours. So:
 BatchNorms are folded into the convolutions before them (`encoders.fold_batchnorm`).
 """
 
+import contextlib
 import functools
 import hashlib
+import inspect
+import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import final
@@ -60,9 +64,13 @@ __all__ = [
 
 POOLS = ("global", "spatial", "tokens")
 CUDA_BATCH = 64
+LIBRARIES = ("torch", "torchvision", "open_clip", "timm")
+"""Packages whose classes are known by their names: the lock file pins what they compute."""
+ADDRESS = re.compile(r" at 0x[0-9a-f]+")
+"""Where in memory a function is that a layer prints; another in every process."""
 SMALL = (4, 2, 1)  # smaller pieces that are tried; each costs as much an image as a whole one
 PROBE_SEED = 0
-FINGERPRINT_VERSION = 2  # raise when the same weights and card begin to give other features
+FINGERPRINT_VERSION = 3  # raise when the same weights and card begin to give other features
 
 
 class MapNetwork(nn.Sequential):
@@ -116,6 +124,22 @@ def best_dtype(device: torch.device) -> torch.dtype:
     return torch.bfloat16 if native else torch.float32
 
 
+def network_sha256(network: nn.Module) -> str:
+    """sha256 (hex) over what `network` computes with, besides its weights.
+
+    These are its layers as torch prints them, and the source of those classes among them that are
+    no library's: a class that is changed gives other features. A function that they call is not
+    seen; a card's `revision` tells of it.
+    """
+    total = hashlib.sha256(ADDRESS.sub("", repr(network)).encode())
+    classes = {type(part) for part in network.modules()}
+    for kind in sorted(classes, key=lambda kind: (kind.__module__, kind.__qualname__)):
+        if kind.__module__.partition(".")[0] not in LIBRARIES:
+            with contextlib.suppress(OSError, TypeError):  # made where there is no file, a prompt
+                total.update(inspect.getsource(kind).encode())
+    return total.hexdigest()
+
+
 @functools.cache
 def _workers(threads: int) -> ThreadPoolExecutor:
     """Return this process's pool of threads in which torch itself computes with one."""
@@ -146,6 +170,7 @@ class Encoder:
         self.card = card
         self.pool = check_name("pool", pool, POOLS)
         self.weights_sha256 = state_sha256(network)
+        self._network_sha256 = network_sha256(network)
         self._device = device or best_device()
         self._dtype = dtype or best_dtype(self._device)
         self._batch = CUDA_BATCH if self._device.type == "cuda" else card.batch
@@ -298,7 +323,10 @@ class Encoder:
         """Return everything a feature depends on, as plain data."""
         card = asdict(self.card)
         keys = (
+            "name",
+            "revision",
             "architecture",
+            "layers",
             "input_size",
             "input_range",
             "mean",
@@ -310,6 +338,8 @@ class Encoder:
         return {
             "version": FINGERPRINT_VERSION,
             "weights": self.weights_sha256,
+            "network": self._network_sha256,
+            "shape": self.shape,
             "pool": self.pool,
             "compute": f"{self._device.type} {self._dtype}",
             **{key: card[key] for key in keys},

@@ -27,7 +27,14 @@ from torch import nn
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import CLOCK_PERIOD, CLOCK_SIZE
-from surgicai_vision.core.errors import InputError, check_at_least, check_name, check_positive
+from surgicai_vision.core.errors import (
+    InputError,
+    check_at_least,
+    check_at_most,
+    check_finite,
+    check_name,
+    check_positive,
+)
 
 if TYPE_CHECKING:
     from surgicai_vision.training.checkpoint import Checkpoint
@@ -45,6 +52,12 @@ VECTORS: Mapping[str, int] = MappingProxyType(
     }
 )
 """What may be fed beside features: key → length."""
+WIDEST = 65_536
+"""Most units of a hidden layer; the policies that come with the product have 256."""
+MOST_EPOCHS = 1_000_000
+"""Most passes over the training frames."""
+FARTHEST_SHIFT = 1_024
+"""Farthest a feature map is moved [places]; no map is wider."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +119,7 @@ class Recipe:
     map_shift: int = 0
 
     def __post_init__(self) -> None:
+        check_finite(**{key: of for key, of in vars(self).items() if isinstance(of, float)})
         check_name("split", self.split, ("episode", "transition"))
         check_name("schedule", self.schedule, ("constant", "one_cycle"))
         check_name("map_head", self.map_head, ("softmax", "convolutions"))
@@ -114,6 +128,9 @@ class Recipe:
             raise InputError(
                 f"hidden is {self.hidden}; give at least one layer of width 1 or more."
             )
+        check_at_most(WIDEST, **{"the widest layer of hidden": max(self.hidden)})
+        check_at_most(MOST_EPOCHS, epochs=self.epochs)
+        check_at_most(FARTHEST_SHIFT, map_shift=self.map_shift)
         if self.epochs < 1 or self.batch_size < 2:
             raise InputError(
                 f"epochs is {self.epochs}, batch_size {self.batch_size}; at least 1 and 2."

@@ -30,9 +30,11 @@ from numpy.typing import NDArray
 from policies.base import ACTIONS, Inputs, Policy, Recipe, fed_vector
 from policies.layers import FeatureHeads
 from surgicai_vision.core.config import JSON
-from surgicai_vision.core.errors import InputError, check_at_least, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_at_most, check_name
 
 NORMALISATIONS = ("mean_std", "min_max")
+MOST_PLANNED = 1_000
+"""Most actions of a chunk, moments of a history and chunks that are drawn: a whole procedure."""
 SMALLEST_RANGE = 1e-6
 """An action that varies less is constant, and only its offset is removed."""
 
@@ -72,6 +74,7 @@ class ChunkRecipe(Recipe):
         if not 1 <= self.execute <= self.chunk:
             raise InputError(f"execute is {self.execute}; allowed: 1 to chunk, {self.chunk}.")
         check_at_least(1, history=self.history, samples=self.samples)
+        check_at_most(MOST_PLANNED, chunk=self.chunk, history=self.history, samples=self.samples)
         if not 0 <= self.ema < 1:
             raise InputError(f"ema is {self.ema}; allowed: 0 to below 1.")
         if not (self.clip_gradient >= 0 and self.minutes >= 0):

@@ -131,6 +131,9 @@ make_venv() {
         "$uv" venv --quiet --clear --python 3.12 --python-preference only-managed "$venv" ||
             stop "uv could not fetch Python 3.12. Install Python 3.12 or 3.13 and run: PYTHON=/path/to/python make setup"
     fi
+    # For packages of one's own (docs/extending.md); Debian keeps ensurepip in a package of its own.
+    "$venv/bin/python" -m ensurepip --default-pip >/dev/null 2>&1 ||
+        say "$("$venv/bin/python" --version) has no ensurepip: .venv gets no pip"
 }
 
 install_packages() {

@@ -43,4 +43,9 @@ def __getattr__(name: str) -> object:
     return resolve(f"{_PLACES[name]}:{name}")
 
 
+def __dir__() -> list[str]:
+    """List what has been imported and what is on first use."""
+    return sorted({*globals(), *__all__})
+
+
 register_ids()

@@ -75,7 +75,7 @@ def _mb(size: int) -> str:
 
 def _text(manifest: "Manifest | None") -> str:
     if manifest is None:
-        return "unfinished"
+        return "unfinished or damaged"
     shape = " × ".join(map(str, (manifest["length"], *manifest["shape"])))
     dataset = f"dataset {manifest['dataset'][:12]}"
     return ", ".join((manifest["encoder"], manifest["view"], manifest["pool"], shape, dataset))

@@ -42,16 +42,24 @@ class FoundWeights(TypedDict):
     Attributes:
         here: the file is on this machine.
         detail: where it is, or what is missing.
+        broken: the distribution of an encoder that cannot be used, "" of one that can.
     """
 
     here: bool
     detail: str
+    broken: str
 
 
 class Finding(TypedDict, total=False):
-    """What a probe found; each fills its own keys, or `error`."""
+    """What a probe found; each fills its own keys, or `error`.
+
+    Attributes:
+        error: why it found nothing.
+        is_plugin: the error names a part of another distribution.
+    """
 
     error: str
+    is_plugin: bool
     renderer: str
     frames_per_second: float
     devices: list[str]
@@ -185,7 +193,12 @@ def check_gl(finding: Finding) -> Check:
     """Report the GL renderer and its speed."""
     backend = os.environ.get("MUJOCO_GL") or "egl"
     if "error" in finding:
-        advice = "GL works and our scene does not: report it" if "renderer" in finding else GL_LINE
+        if finding.get("is_plugin"):
+            advice = "repair or uninstall the distribution that is named"
+        elif "renderer" in finding:
+            advice = "GL works and our scene does not: report it"
+        else:
+            advice = GL_LINE
         return Check("GL", "fail", f"{backend}: nothing renders ({finding['error']})", advice)
     size = f"{FRAME_SIZE} × {FRAME_SIZE}"
     speed = f"{finding['frames_per_second']:.0f} frames/s of the grasp scene at {size}"
@@ -214,12 +227,14 @@ def check_encoders(finding: Finding) -> Iterator[Check]:
         yield Check("encoders", "fail", finding["error"], "make setup")
         return
     for name, found in finding["encoders"].items():
+        status: Status = "ok" if found["here"] else "warning"
         advice = (
             "" if found["here"] else "needed only for this encoder: a network, or --weights FILE"
         )
-        yield Check(
-            f"encoder {name}", "ok" if found["here"] else "warning", found["detail"], advice
-        )
+        if owner := found["broken"]:
+            status = "fail"
+            advice = "make setup" if owner == DISTRIBUTION else f"repair or uninstall {owner}"
+        yield Check(f"encoder {name}", status, found["detail"], advice)
 
 
 def check_disk(folder: Path) -> Check:
@@ -259,7 +274,7 @@ def finish_probe(process: subprocess.Popen[str]) -> Finding:
 
 def probe_gl() -> Finding:
     """Open a GL context, then render the grasp scene in it and time that."""
-    from surgicai_vision.core.errors import SurgicaiError
+    from surgicai_vision.core.errors import InputError, SurgicaiError
     from surgicai_vision.scene.rendering import renderer_string
 
     try:
@@ -269,7 +284,11 @@ def probe_gl() -> Finding:
     try:
         finding["frames_per_second"] = rendering_speed()
     except Exception as error:  # reported as a line of its own; the context above was made
-        finding["error"] = f"{type(error).__name__}: {error}"
+        # Nothing was put in that could be wrong, so a wrong input is a camera of other people's.
+        finding["is_plugin"] = isinstance(error, InputError)
+        finding["error"] = (
+            str(error) if finding["is_plugin"] else f"{type(error).__name__}: {error}"
+        )
     return finding
 
 
@@ -299,25 +318,31 @@ def probe_gpu() -> Finding:
 
 def probe_encoders() -> Finding:
     """Look for each encoder's weights; the parent has cut off the network."""
-    from surgicai_vision.core.errors import MissingWeights, SurgicaiError
     from surgicai_vision.features import encoders
 
-    found: dict[str, FoundWeights] = {}
-    for name in encoders.encoder_names():
+    return {"encoders": {name: _found_weights(name) for name in encoders.encoder_names()}}
+
+
+def _found_weights(name: str) -> FoundWeights:
+    """Look for one encoder's weights."""
+    from surgicai_vision.core.errors import MissingWeights, SurgicaiError, first_line
+    from surgicai_vision.features import encoders
+
+    try:
         card = encoders.encoder_card(name)
-        unpinned = "" if card.sha256 else " (unpinned: the hub's own hash is taken)"
-        try:
-            path = encoders.find_weights(name, encoders.WeightsSource(accept_licence=True))
-            detail = str(path) if path else f"{card.source} {card.revision}, always here"
-            found[name] = {"here": True, "detail": f"{detail}{unpinned if path else ''}"}
-        except MissingWeights:
-            found[name] = {
-                "here": False,
-                "detail": f"{card.filename} of {card.source} is not here{unpinned}",
-            }
-        except SurgicaiError as error:
-            found[name] = {"here": False, "detail": str(error)}
-    return {"encoders": found}
+    except Exception as error:  # whatever it is, the other encoders are reported
+        owner = encoders.ENCODERS.distribution(name)
+        return {"here": False, "detail": first_line(error), "broken": owner}
+    unpinned = "" if card.sha256 else " (unpinned: the hub's own hash is taken)"
+    try:
+        path = encoders.find_weights(name, encoders.WeightsSource(accept_licence=True))
+    except MissingWeights:
+        detail = f"{card.filename} of {card.source} is not here{unpinned}"
+        return {"here": False, "detail": detail, "broken": ""}
+    except SurgicaiError as error:
+        return {"here": False, "detail": str(error), "broken": ""}
+    detail = f"{path}{unpinned}" if path else f"{card.source} {card.revision}, always here"
+    return {"here": True, "detail": detail, "broken": ""}
 
 
 PROBES: MappingProxyType[str, Callable[[], Finding]] = MappingProxyType(

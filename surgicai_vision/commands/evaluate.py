@@ -11,7 +11,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
-    NOT_NEGATIVE,
+    SEED,
     VIEWS,
     AcceptLicence,
     DatasetFolder,
@@ -79,7 +79,7 @@ class Options:
     policy: PolicyName = field(kw_only=False)
     task: PolicyTask = None
     episodes: Annotated[int, COUNT] = 20
-    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    seed: Annotated[int, SEED] = names.TEST_SEED
     workers: EvaluationWorkers = None
     dataset: DatasetFolder = None
     weights: WeightFiles = ()

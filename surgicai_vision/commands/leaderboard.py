@@ -6,6 +6,7 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
+from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import default_text
 
@@ -38,7 +39,10 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     """Write the page; exit 1 where a row is not taken."""
     from surgicai_vision.report.leaderboard import write_leaderboard
 
-    board = write_leaderboard(options.dir, options.out or options.dir / "leaderboard.html")
+    page = options.out or options.dir / "leaderboard.html"
+    if options.dir.is_dir():  # else it is refused below, and no folder is made of it
+        folders.check_file(page, "--out", (".html",))
+    board = write_leaderboard(options.dir, page)
     for name, reason in board.refused.items():
         console.say(f"not taken: {name}: {reason}")
     console.say(f"{len(board.taken)} rows: {board.page}")

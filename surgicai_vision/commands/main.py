@@ -7,6 +7,7 @@ instant.
 """
 
 import errno
+import io
 import json
 import os
 import signal
@@ -28,14 +29,13 @@ from rich.console import Console
 
 from surgicai_vision.commands import COMMANDS, PROGRAM, register
 from surgicai_vision.commands.options import from_file, split_comma_lists
-from surgicai_vision.core.errors import InputError, SurgicaiError, UnknownName
+from surgicai_vision.core.errors import INTERRUPTED, InputError, SurgicaiError, UnknownName
 from surgicai_vision.core.processes import Terminated, raise_on_terminate
 
 TITLE = (
     "Image-based imitation learning for robotic suturing: "
     "scene → env → demos → dataset → features → policy → evaluation → report"
 )
-INTERRUPTED = "interrupted; run the same command again to continue"
 FULL = (errno.ENOSPC, errno.EDQUOT)
 NO_ROOM = "The disk is full; make room, and run the same command again to continue."
 TERMINATED = 128 + signal.SIGTERM
@@ -70,6 +70,7 @@ def main(arguments: list[str] | None = None) -> int:
             name, "1"
         )  # the bars are ours; nothing of a run is reported to anyone
     raise_on_terminate()
+    _show_what_can_be_shown()
     try:
         return app.meta(sys.argv[1:] if arguments is None else arguments) or 0
     except CycloptsError as error:
@@ -88,7 +89,15 @@ def main(arguments: list[str] | None = None) -> int:
             return _fail(SurgicaiError(NO_ROOM))
         if error.filename is None:
             raise
-        return _fail(SurgicaiError(f"{error.filename}: {error.strerror}."))
+        kind = InputError if error.errno == errno.ENAMETOOLONG else SurgicaiError
+        return _fail(kind(f"{error.filename}: {error.strerror}."))
+
+
+def _show_what_can_be_shown() -> None:
+    """Let output hold `?` for a character that its encoding lacks, where it would be an error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
 
 
 @app.meta.default

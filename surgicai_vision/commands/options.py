@@ -14,6 +14,7 @@ What is one option in several commands is a whole type, with its help and its de
 A value is taken from the command line, else from the `--config` file, else from the dataclass.
 """
 
+import os
 import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,8 +25,8 @@ from cyclopts.argument import Argument, ArgumentCollection
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
-from surgicai_vision.core.config import TaskConfig, convert, from_mapping
-from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.core.config import LARGEST_INTEGER, TaskConfig, convert, from_mapping
+from surgicai_vision.core.errors import InputError, UnknownName, shown
 from surgicai_vision.core.files import read_yaml
 from surgicai_vision.core.tasks import task_names
 from surgicai_vision.features import devices, encoders
@@ -82,6 +83,8 @@ SUBTASK = Parameter(choices=names.SUBTASKS)
 DIRECTORY = Parameter(metavar="DIR")
 COUNT = Parameter(converter=_whole_number, validator=validators.Number(gte=1), metavar="N")
 NOT_NEGATIVE = Parameter(converter=_whole_number, validator=validators.Number(gte=0), metavar="N")
+SEED = within(0, LARGEST_INTEGER)
+"""Seed of a training, or of the first start: no row holds a larger one."""
 FRACTION = Parameter(validator=validators.Number(gte=0, lte=1), metavar="P")
 IMAGE_SIZE = Parameter.combine(within(16, 960), Parameter(metavar="PX"))
 """Height and width [px] that the renderer has room for."""
@@ -232,12 +235,29 @@ def _tokens(argument: Argument, key: str, value: object, path: Path) -> list[Tok
             assert isinstance(listed, tuple)
             texts = [str(part) for part in listed]
         if texts:
-            return [Token(keyword=key, value=text) for text in texts]
+            return [Token(keyword=key, value=_writable(text, where)) for text in texts]
         return [Token(keyword=key, implicit_value=())]
     value = convert(_written_as(hint), value, where)
     if isinstance(value, str):
-        return [Token(keyword=key, value=value)]
+        return [Token(keyword=key, value=_writable(value, where))]
     return [Token(keyword=key, implicit_value=value)]
+
+
+def _writable(text: str, where: str) -> str:
+    """Return a text of a file that a command line, and so the name of a file, can hold.
+
+    Raises:
+        InputError: it holds a NUL, or half of a character (a lone surrogate).
+    """
+    try:
+        encoded = os.fsencode(text)
+    except UnicodeEncodeError:
+        encoded = b"\0"
+    if b"\0" in encoded:
+        raise InputError(
+            f"{where}: {shown(text)} holds a character that no name has; leave it out."
+        )
+    return text
 
 
 def _written_as(hint: type) -> type:

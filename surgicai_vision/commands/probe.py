@@ -11,8 +11,8 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
     DIRECTORY,
     ENCODERS,
-    NOT_NEGATIVE,
     POOL,
+    SEED,
     TASK,
     VIEWS,
     AcceptLicence,
@@ -57,7 +57,7 @@ class Options:
     weights: WeightFiles = ()
     accept_licence: AcceptLicence = False
     pool: Annotated[str, POOL] = "global"
-    seed: Annotated[int, NOT_NEGATIVE] = 0
+    seed: Annotated[int, SEED] = 0
     out: Annotated[
         Path | None, DIRECTORY, default_text("outputs/probes/<task>-<encoders>-<views>")
     ] = None
@@ -66,6 +66,8 @@ class Options:
 @app.default
 def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     """Probe every encoder and view set, keep the rows and print them."""
+    from surgicai_vision.features.probe import needle_pose
+
     weights = encoders.WeightsSource.parse(options.weights, options.accept_licence)
     for encoder in options.encoder:
         encoders.find_weights(encoder, weights)
@@ -75,6 +77,7 @@ def run(options: Options = Options(), *, console: Console) -> dict[str, object]:
     )
     out = options.out or folders.OUTPUTS / "probes" / label
     check_output(out, may_resume=RESULT)
+    needle_pose(dataset)  # before all of it is encoded
     rows = [row for encoder in options.encoder for row in _rows(options, encoder, dataset, console)]
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / RESULT, rows)

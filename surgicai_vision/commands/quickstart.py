@@ -14,7 +14,7 @@ from surgicai_vision.commands.options import (
     DIRECTORY,
     FILE_ONLY,
     FRACTION,
-    NOT_NEGATIVE,
+    SEED,
     TASK,
     VIEWS,
 )
@@ -52,7 +52,7 @@ class Options:
     size: Annotated[int, COUNT, Parameter(metavar="PX")] = Quickstart.size
     frame_stride: Annotated[int, COUNT] = Quickstart.frame_stride
     episodes: Annotated[int, COUNT] = Quickstart.episodes
-    seed: Annotated[int, NOT_NEGATIVE] = Quickstart.seed
+    seed: Annotated[int, SEED] = Quickstart.seed
     workers: Annotated[int, COUNT] = folders.CORES
     out: Annotated[Path, DIRECTORY] = Path("outputs/quickstart")
     policies: Annotated[tuple[PolicyChoice, ...] | None, FILE_ONLY] = None

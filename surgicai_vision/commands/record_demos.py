@@ -14,6 +14,7 @@ from surgicai_vision.commands.options import (
     EXECUTOR,
     FRACTION,
     NOT_NEGATIVE,
+    SEED,
     TASK,
     EnvFields,
     default_text,
@@ -73,7 +74,7 @@ class Options:
     from_: Annotated[Path | None, Parameter(metavar="DEMOS")] = None
     demos_used: Annotated[int | None, COUNT, default_text("1 of dmp, all of multiply")] = None
     source: Annotated[str | None, Parameter(choices=SOURCES), default_text("nearest")] = None
-    seed: Annotated[int, NOT_NEGATIVE] = names.TRAIN_SEED
+    seed: Annotated[int, SEED] = names.TRAIN_SEED
     noise: Annotated[float, FRACTION, Parameter(metavar="SIGMA")] = 0.0
     noise_from: Annotated[
         float | None, FRACTION, Parameter(metavar="SIGMA"), default_text("--noise itself")

@@ -16,7 +16,7 @@ from surgicai_vision.commands.options import (
     EXECUTOR,
     FRACTION,
     IMAGE_SIZE,
-    NOT_NEGATIVE,
+    SEED,
     TASK,
     VIDEO,
     VIEWS,
@@ -69,7 +69,7 @@ class Options:
     ] = ()
     task: Annotated[str | None, TASK, default_text("grasp")] = None
     episodes: Annotated[int | None, COUNT, default_text("50")] = None
-    seed: Annotated[int, NOT_NEGATIVE] = names.TRAIN_SEED
+    seed: Annotated[int, SEED] = names.TRAIN_SEED
     view: Annotated[
         tuple[str, ...], VIEWS, default_text("front,back; of open-h its endoscope and wrists")
     ] = ()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
+from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import NOT_NEGATIVE, default_text
 from surgicai_vision.core.errors import BadFile, SurgicaiError
@@ -39,7 +40,7 @@ class Options:
 @app.default
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Write the page and the tables and print where they are."""
-    from surgicai_vision.report import collect, write_report
+    from surgicai_vision.report import PAGE_FILE, collect, write_report
     from surgicai_vision.report.tables import FOLDER
 
     folder = options.dir
@@ -47,6 +48,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
         raise BadFile(
             f"{folder} is no folder; give one that quickstart, evaluate or sweep has written."
         )
+    folders.check_file(options.out or folder / PAGE_FILE, "--out", (".html",))
     planned = _planned(folder, console)
     found = collect(folder, planned)
     with console.stage("report", "parts") as progress:

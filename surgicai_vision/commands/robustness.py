@@ -13,7 +13,7 @@ from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
     LIST,
-    NOT_NEGATIVE,
+    SEED,
     UNIQUE,
     AcceptLicence,
     DatasetFolder,
@@ -64,7 +64,7 @@ class Options:
     ] = ()
     strength: Annotated[tuple[float, ...], LIST, Parameter(metavar="NUMBER[,NUMBER]")] = STRENGTHS
     episodes: Annotated[int, COUNT] = 20
-    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    seed: Annotated[int, SEED] = names.TEST_SEED
     workers: EvaluationWorkers = None
     dataset: DatasetFolder = None
     weights: WeightFiles = ()

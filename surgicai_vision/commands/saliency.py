@@ -10,7 +10,7 @@ from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.evaluate import open_given
 from surgicai_vision.commands.options import (
-    NOT_NEGATIVE,
+    SEED,
     UNIQUE,
     AcceptLicence,
     EnvFields,
@@ -47,7 +47,7 @@ class Options:
 
     policy: Annotated[str, Parameter(metavar="POLICY")] = field(kw_only=False)
     task: PolicyTask = None
-    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    seed: Annotated[int, SEED] = names.TEST_SEED
     step: Annotated[tuple[int, ...], UNIQUE, Parameter(metavar="N[,N]")] = (0, 20, 40, 60)
     patch: Annotated[int, within(2, 960), Parameter(metavar="PX")] = 32
     weights: WeightFiles = ()

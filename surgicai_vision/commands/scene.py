@@ -12,7 +12,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
     COUNT,
     IMAGE_SIZE,
-    NOT_NEGATIVE,
+    SEED,
     TASK,
     UNIQUE,
     VIEWS,
@@ -73,7 +73,7 @@ class Options:
     """
 
     task: Annotated[str, TASK] = "grasp"
-    seed: Annotated[int, NOT_NEGATIVE] = names.TRAIN_SEED
+    seed: Annotated[int, SEED] = names.TRAIN_SEED
     view: Annotated[tuple[str, ...], VIEWS] = camera_names()
     size: Annotated[int, IMAGE_SIZE] = 336
     quality: Annotated[str, Parameter(choices=QUALITIES)] = "high"

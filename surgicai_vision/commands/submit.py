@@ -6,6 +6,7 @@ from typing import Annotated
 
 from cyclopts import App, Parameter, validators
 
+from surgicai_vision.commands import folders
 from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import default_text
 from surgicai_vision.core.files import check_output
@@ -55,13 +56,21 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     """Check the evaluation as the leaderboard will and write its row."""
     from surgicai_vision.report.leaderboard import Entry, make_row, write_row
 
+    if options.out:
+        _check_out(options.out)
     entry = Entry(
         options.name, options.by, options.link, options.minutes, options.hardware, options.note
     )
     row = make_row(options.evaluation, entry)
     out = options.out or Path(f"{row.run.task}-{row.digest[:12]}.json")
-    check_output(out)
+    _check_out(out)
     write_row(row, out)
     console.say(f"row: {out}")
     console.say("next: send it as docs/submit.md says")
     return {"row": str(out), "digest": row.digest, "successes": sum(row.successes)}
+
+
+def _check_out(out: Path) -> None:
+    """Refuse a row's file that is there already or cannot be written."""
+    check_output(out)
+    folders.check_file(out, "--out", (".json",))

@@ -18,7 +18,7 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.core.config import from_mapping
 from surgicai_vision.core.errors import BadFile, UnknownName
-from surgicai_vision.core.files import configs_folder, read_yaml
+from surgicai_vision.core.files import check_output, configs_folder, read_yaml
 from surgicai_vision.experiments.plan_config import is_plan, read_plan
 from surgicai_vision.experiments.sweep.grid import AXES, Grid
 from surgicai_vision.experiments.sweep.rl_grid import RLGrid
@@ -84,6 +84,7 @@ class Options:
 def run(options: Options, *, console: Console) -> dict[str, object]:
     """Run the sweep, or list its runs."""
     from surgicai_vision.core.executor import RunContext, open_engine
+    from surgicai_vision.evaluation.storage import GRID_FILE
     from surgicai_vision.experiments.sweep.driver import run_sweep
     from surgicai_vision.experiments.sweep.selection import read_choice
 
@@ -100,6 +101,7 @@ def run(options: Options, *, console: Console) -> dict[str, object]:
     choice = read_choice(options.only, grid.runs)
     name = path.stem if grid == whole else f"{path.stem}-tried"
     out = options.out or folders.OUTPUTS / "sweeps" / name
+    check_output(out, may_resume=GRID_FILE)
     context = RunContext(options.workers, open_engine(options.executor), console.stage)
     if options.dry_run:
         return _list(grid, out, choice, options.workers, console)

@@ -12,7 +12,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
-    NOT_NEGATIVE,
+    SEED,
     TASK,
     VIEWS,
     EnvFields,
@@ -77,7 +77,7 @@ class Options:
         default_text(f"{SECONDS:g}, {SECONDS * len(names.SUBTASKS):g} for {names.SUTURE}"),
     ] = None
     episodes: Annotated[int | None, COUNT, default_text("go on until Esc")] = None
-    seed: Annotated[int | None, NOT_NEGATIVE, default_text(str(names.TRAIN_SEED))] = None
+    seed: Annotated[int | None, SEED, default_text(str(names.TRAIN_SEED))] = None
     auto_keep: bool = False
     keep_failures: bool = False
     skip_idle: bool = False

@@ -16,6 +16,7 @@ from surgicai_vision.commands.options import (
     DIRECTORY,
     NOT_NEGATIVE,
     POOL,
+    SEED,
     SUBTASK,
     TASK,
     VIEWS,
@@ -28,7 +29,7 @@ from surgicai_vision.commands.options import (
 )
 from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, read_changes
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, check_at_most
 from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
 from surgicai_vision.features import encoders
 from surgicai_vision.features.devices import find_device
@@ -46,14 +47,15 @@ app = App(
     name="train",
     help_epilogue="""\
 example:
-  surgicai-vision train --encoder random --view back
+  surgicai-vision train --encoder imagenet-lite --view back
 LeRobot's ACT on feature maps, for ten minutes of a core:
-  surgicai-vision train --task handoff --policy act --encoder imagenet-lite-early --pool spatial \
+  surgicai-vision train --task handoff --policy act --encoder imagenet-lite-early --pool spatial \\
     --view front_psm1 --minutes 10
 by reinforcement:
   surgicai-vision train --algo td3-her-bc --env-steps 25000
 a correction of an image policy:
-  surgicai-vision train --algo td3 --residual-on outputs/train/grasp-bc-seed0 --env-steps 20000
+  surgicai-vision train --algo td3 --env-steps 20000 \\
+    --residual-on outputs/train/grasp-imagenet-lite-back-seed0
 a high-level policy over policies of the subtasks:
   surgicai-vision train --task suture --algo ppo --low hierarchical.yaml""",
 )
@@ -153,7 +155,7 @@ class Options:
     progress_from: Annotated[Path | None, DIRECTORY] = None
     save_every: Annotated[int, NOT_NEGATIVE] = 0
     log: Annotated[str, Parameter(choices=LOGS)] = "auto"
-    seed: Annotated[int, NOT_NEGATIVE] = 0
+    seed: Annotated[int, SEED] = 0
     out: Annotated[
         Path | None, DIRECTORY, default_text("outputs/train/<task>-<policy>-seed<seed>")
     ] = None
@@ -276,6 +278,8 @@ def _views(options: Options, encoder: str | None) -> tuple[str, ...]:
 
 IMITATION = ("dataset", "subtask", "view", "start", "epochs", "minutes", "device")
 """Options that only imitation from a dataset reads."""
+LARGEST_REINFORCED_SEED = 2**32 - 1
+"""Largest seed of Stable-Baselines3 and d3rlpy, as of NumPy's old generator."""
 REINFORCEMENT = ("observation", "env_steps", "updates", "validation", "seeds", "decisions", "bound")
 """Options that it does not read, nor `env`; `workers` changes no result."""
 
@@ -355,7 +359,13 @@ def _reinforce(options: Options, algo: str, console: Console) -> dict[str, objec
 
 
 def _checked_folders(options: Options, runs: Sequence[RunConfig]) -> list[Path]:
-    """Return the runs' checkpoint folders; refuse any that cannot be one, before any work."""
+    """Return the runs' checkpoint folders; refuse any that cannot be one, before any work.
+
+    Raises:
+        InputError: a folder that cannot be written, or a seed that the libraries do not take.
+        OutputExists: a folder that holds something else.
+    """
+    check_at_most(LARGEST_REINFORCED_SEED, seed=max(run.seed for run in runs))
     outs = [options.out or folders.train_folder(run.task, run.name, run.seed) for run in runs]
     for out in outs:
         folders.check_folder(out, REQUEST)

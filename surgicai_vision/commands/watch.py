@@ -9,7 +9,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.evaluate import open_given
 from surgicai_vision.commands.options import (
     COUNT,
-    NOT_NEGATIVE,
+    SEED,
     VIEWS,
     AcceptLicence,
     DatasetFolder,
@@ -60,7 +60,7 @@ class Options:
 
     policy: PolicyName = field(kw_only=False)
     task: PolicyTask = None
-    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    seed: Annotated[int, SEED] = names.TEST_SEED
     episodes: Annotated[int | None, COUNT, default_text("go on until Esc")] = None
     go_on: bool = False
     paused: bool = False

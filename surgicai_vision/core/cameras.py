@@ -8,7 +8,7 @@ import zlib
 from typing import TYPE_CHECKING, Final
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_name, shown
 from surgicai_vision.core.plugins import CAMERAS_GROUP, Registry
 
 if TYPE_CHECKING:
@@ -21,10 +21,18 @@ def _target(name: str) -> str:
     return f"surgicai_vision.scene.{module}:{name.upper()}"
 
 
+def _fault(part: object) -> str:
+    """Return what is wrong with what is offered as a camera, "" if nothing."""
+    if not isinstance(part, type) and callable(getattr(part, "add_to", None)):
+        return ""
+    return f"is {shown(part)}; it must be a scene.cameras.CameraPose or a scene.cameras.Crop"
+
+
 CAMERAS: Final = Registry["Camera"](
     "camera",
     CAMERAS_GROUP,
     {name: _target(name) for name in names.CAMERAS},
+    _fault,
 )
 """Camera name → its `scene.cameras.Camera`; a crop is one as well (`scene.cameras.Crop`)."""
 
@@ -34,7 +42,7 @@ def register_camera(name: str, camera: "Camera", distribution: str = "") -> None
 
     Raises:
         NameCollision: the name is taken.
-        InputError: no camera can be called so.
+        InputError: no camera can be called so, or this is none.
     """
     _check_form(name)
     CAMERAS.register(name, camera, distribution)
@@ -77,7 +85,8 @@ def other_cameras() -> tuple[str, ...]:
     """
     others = camera_names()[len(names.CAMERAS) :]
     for name in others:
-        _check_form(name)
+        with CAMERAS.calling(name):
+            _check_form(name)
     return others
 
 

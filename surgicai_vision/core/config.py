@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import yaml
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, UnknownName, check_name, check_positive
+from surgicai_vision.core.errors import (
+    InputError,
+    UnknownName,
+    check_name,
+    check_positive,
+    shown,
+)
 from surgicai_vision.core.tasks import SUBTASK_STEPS, check_task, task_steps
 from surgicai_vision.core.yaml_text import load_yaml
 
@@ -45,6 +51,8 @@ CLOCK_PERIOD = 25
 """Period of the sine and cosine of `clock` [control steps]."""
 CLOCK_SIZE = 3
 """Length of what `clock` returns."""
+LARGEST_INTEGER = 2**63 - 1
+"""Largest integer of a configuration, as a column of a table holds it; its negative the least."""
 LATER: Mapping[str, bool] = types.MappingProxyType({"later": True})
 """Metadata of a field that its dataclass did not have at first (`to_identity`)."""
 
@@ -374,18 +382,22 @@ def convert(hint: object, value: object, where: str) -> object:
         return from_mapping(hint, cast(Mapping[str, object], value), where)
     if origin is tuple:
         if isinstance(value, str) or not isinstance(value, (list, tuple)):
-            raise InputError(f"{where}: expected a list, got {value!r}.")
+            raise InputError(f"{where}: expected a list, got {shown(value)}.")
         return tuple(convert(arguments[0], item, where) for item in value)
     if origin in (dict, Mapping):
         if not isinstance(value, Mapping):
-            raise InputError(f"{where}: expected a table of keys, got {value!r}.")
+            raise InputError(f"{where}: expected a table of keys, got {shown(value)}.")
         return value
+    if isinstance(value, int) and not -LARGEST_INTEGER <= value <= LARGEST_INTEGER:
+        raise InputError(
+            f"{where}: the integer {shown(value)} is too large; give one of at most 18 digits."
+        )
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if isinstance(hint, type) and (
         not isinstance(value, hint) or (hint is int and isinstance(value, bool))
     ):
-        raise InputError(f"{where}: expected {hint.__name__}, got {value!r}.")
+        raise InputError(f"{where}: expected {hint.__name__}, got {shown(value)}.")
     return value
 
 
@@ -428,7 +440,7 @@ def read_changes(texts: Iterable[str]) -> dict[str, JSON]:
         try:
             changes[key] = cast(JSON, load_yaml(value))
         except (yaml.YAMLError, ValueError, RecursionError):  # a date that does not exist, …
-            raise InputError(f"change '{text}': {value!r} is no YAML value.") from None
+            raise InputError(f"change '{key}': {shown(value)} is no YAML value.") from None
     return changes
 
 

@@ -5,7 +5,15 @@ The command line maps them to exit codes: `InputError` (wrong input) ends with 2
 """
 
 import difflib
+import math
+import reprlib
 from collections.abc import Iterable
+from typing import final
+
+INTERRUPTED = "interrupted; run the same command again"
+"""What the command line says after Ctrl-C."""
+SHOWN_BITS = 4096
+"""An integer of more bits is shown by their number: Python refuses to write the longest ones."""
 
 
 class SurgicaiError(Exception):
@@ -56,6 +64,27 @@ class PhysicsError(SurgicaiError):
     """The simulation diverged or was started from an impossible state."""
 
 
+@final
+class _Short(reprlib.Repr):
+    """Shows the beginning of a value, however much it holds."""
+
+    def __init__(self) -> None:
+        super().__init__(maxlevel=2, maxlist=4, maxtuple=4, maxdict=4, maxstring=80, maxother=80)
+
+    def repr_int(self, x: int, level: int) -> str:
+        if x.bit_length() > SHOWN_BITS:
+            return f"<integer of {x.bit_length()} bits>"
+        return super().repr_int(x, level)
+
+
+_SHORT = _Short()
+
+
+def shown(value: object) -> str:
+    """Return a value of a file as messages show it: its beginning, however much it holds."""
+    return _SHORT.repr(value)
+
+
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's text, or its type's name where it has none."""
     return (str(error).splitlines() or [type(error).__name__])[0]
@@ -82,6 +111,35 @@ def check_at_least(least: int, **numbers: float | None) -> None:
     for name, number in numbers.items():
         if number is not None and not number >= least:
             raise InputError(f"{name} is {number}; it must be at least {least}.")
+
+
+def check_at_most(most: int, **numbers: float | None) -> None:
+    """Refuse numbers above `most`; None is no number.
+
+    Args:
+        most: the largest that is allowed.
+        numbers: what each is called, and its value.
+
+    Raises:
+        InputError: a number above, or none at all (NaN).
+    """
+    for name, number in numbers.items():
+        if number is not None and not number <= most:
+            raise InputError(f"{name} is {shown(number)}; it must be at most {most}.")
+
+
+def check_finite(**numbers: float) -> None:
+    """Refuse numbers that are infinite or none at all (NaN).
+
+    Args:
+        numbers: what each is called, and its value.
+
+    Raises:
+        InputError: such a number.
+    """
+    for name, number in numbers.items():
+        if not math.isfinite(number):
+            raise InputError(f"{name} is {number}; give a finite number.")
 
 
 def check_positive(**numbers: float) -> None:

@@ -170,9 +170,23 @@ def check_output(
         path: the folder to be made.
         may_resume: name of a file that marks the folder as one to be continued.
         option: what the folder was given as, for the message.
-        ours: names of files that a killed run may leave without the mark; a folder of these alone,
-            and of their temporary names, is as good as an empty one.
+        ours: names of other files that a killed run may leave without the mark; a folder of these
+            alone, and of temporary names of theirs and of the mark's, is as good as an empty one.
+
+    Raises:
+        OutputExists: it holds other files, or is one itself.
+        InputError: it cannot be written, or its name is none.
     """
+    try:
+        _check_output(path, may_resume, option, (*ours, *([may_resume] if may_resume else [])))
+    except OSError as error:
+        raise InputError(
+            f"{option} {path} cannot be written: {error.strerror}; choose another folder."
+        ) from None
+
+
+def _check_output(path: Path, may_resume: str | None, option: str, ours: Collection[str]) -> None:
+    """Do `check_output`; a system that does not tell raises OSError."""
     if path.exists():
         if not path.is_dir():
             raise OutputExists(f"{option} {path} is a file; give a folder that does not exist yet.")

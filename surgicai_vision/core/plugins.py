@@ -10,7 +10,9 @@ A registry knows its parts from three places, in this order:
        [project.entry-points."surgicai_vision.encoders"]
        my-encoder = "my_package.my_encoder:PLUGIN"
 
-Two parts of one name are refused with an error that names both distributions.
+Two parts of one name are refused with an error that names both distributions. So is a part that is
+no such thing as its kind asks for, and whatever a part's own code raises names it and its
+distribution (`Registry.calling`).
 
     ENCODERS = Registry[Plugin](
         "encoder", ENCODERS_GROUP, {"random": "encoders.random_resnet:RANDOM"}
@@ -21,12 +23,23 @@ Two parts of one name are refused with an error that names both distributions.
 
 import functools
 import importlib
+import inspect
 import sys
-from collections.abc import Callable, Mapping
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
-from typing import Any, Final, cast, final
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final, cast, final
 
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import (
+    InputError,
+    SurgicaiError,
+    check_name,
+    first_line,
+    shown,
+)
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint, EntryPoints
 
 DISTRIBUTION: Final = "surgicai-vision"
 ENCODERS_GROUP: Final = "surgicai_vision.encoders"
@@ -34,6 +47,9 @@ POLICIES_GROUP: Final = "surgicai_vision.policies"
 TASKS_GROUP: Final = "surgicai_vision.tasks"
 CAMERAS_GROUP: Final = "surgicai_vision.cameras"
 ENGINES_GROUP: Final = "surgicai_vision.engines"
+
+type Fault = Callable[[object], str]
+"""What is wrong with a part, as the end of a sentence that begins with its name; "" if nothing."""
 
 
 class NameCollision(InputError):
@@ -46,6 +62,41 @@ class NameCollision(InputError):
         )
 
 
+def instance_of(target: str) -> Fault:
+    """Return the fault of what is no instance of the class "module:Class"."""
+
+    def fault(part: object) -> str:
+        if isinstance(part, resolve(target)):
+            return ""
+        return f"is {shown(part)}; it must be an instance of {_public(target)}"
+
+    return fault
+
+
+def subclass_of(target: str) -> Fault:
+    """Return the fault of what is no class of its own below the class "module:Class"."""
+
+    def fault(part: object) -> str:
+        if not isinstance(part, type) or not issubclass(part, resolve(target)):
+            return f"is {shown(part)}; it must be a subclass of {_public(target)}"
+        if inspect.isabstract(part):
+            missing = ", ".join(sorted(getattr(part, "__abstractmethods__", ())))
+            return f"lacks what {_public(target)} leaves to it: {missing}"
+        return ""
+
+    return fault
+
+
+def _fits(part: object) -> str:
+    """Find no fault in anything."""
+    return ""
+
+
+def _public(target: str) -> str:
+    """Return the name of a class as a page of the reference has it."""
+    return target.replace(":", ".")
+
+
 @final
 class Registry[Part]:
     """Parts of one kind by name.
@@ -54,11 +105,13 @@ class Registry[Part]:
         kind: what a part is, in one word ("encoder"), for messages.
         group: entry-point group in which other distributions offer parts of this kind.
         ours: name → "module:attribute" of the parts of this distribution.
+        fault: what is wrong with a part of another distribution, or one that is registered.
     """
 
-    def __init__(self, kind: str, group: str, ours: Mapping[str, str]):
+    def __init__(self, kind: str, group: str, ours: Mapping[str, str], fault: Fault = _fits):
         self.kind = kind
         self.group = group
+        self._fault = fault
         self._targets: dict[str, tuple[str, Callable[[], object]]] = {
             name: (DISTRIBUTION, functools.partial(resolve, target))
             for name, target in ours.items()
@@ -92,18 +145,17 @@ class Registry[Part]:
         Raises:
             UnknownName: no part is called so.
             NameCollision: two distributions offer one.
-            InputError: another distribution's part cannot be imported.
+            InputError: another distribution's part cannot be imported, or is no such part.
         """
         self.check(name)
         distribution, load = self._targets[name]
-        try:
+        if distribution == DISTRIBUTION:
             return cast(Part, load())
-        except (ImportError, AttributeError) as error:
-            if distribution == DISTRIBUTION:
-                raise
-            raise InputError(
-                f"The {self.kind} '{name}' of '{distribution}' cannot be imported: {error}."
-            ) from error
+        try:
+            part = load()
+        except Exception as error:  # a module of other people's may raise anything
+            raise self.refusal(name, f"cannot be imported: {_reason(error)}") from error
+        return self._checked(name, distribution, part)
 
     def register(self, name: str, part: Part, distribution: str = "") -> None:
         """Offer `part` under `name` in this process.
@@ -115,9 +167,12 @@ class Registry[Part]:
 
         Raises:
             NameCollision: the name is taken.
+            InputError: this is no such part.
         """
         self._search()
-        self._add(name, distribution or f"register_{self.kind}()", lambda: part)
+        owner = distribution or f"register_{self.kind}()"
+        self._checked(name, owner, part)
+        self._add(name, owner, lambda: part)
 
     def unregister(self, name: str) -> None:
         """Forget the part called `name`; for tests of parts that are registered in them."""
@@ -127,6 +182,57 @@ class Registry[Part]:
         """Return the distribution that offers the part called `name`."""
         self.check(name)
         return self._targets[name][0]
+
+    def is_ours(self, name: str) -> bool:
+        """Return True unless another distribution, or a script, offers the part called `name`."""
+        return self.distribution(name) == DISTRIBUTION
+
+    def distribution(self, name: str) -> str:
+        """Return the first distribution that offers `name`, and ours for a name of no table."""
+        return self._targets[name][0] if name in self._targets else DISTRIBUTION
+
+    def refusal(self, name: str, reason: str) -> InputError:
+        """Return the error that says of a part, by name and distribution, why it cannot be used.
+
+        Args:
+            name: of the part.
+            reason: the end of the sentence that begins with it, without a full stop.
+        """
+        return InputError(f"{self._title(name)} {reason.removesuffix('.')}.")
+
+    @contextmanager
+    def calling(self, name: str) -> Iterator[None]:
+        """Let an error of the part's own code, which runs within, say whose it is.
+
+        Errors of this product keep their kind, and the part's name is put before them; any other
+        becomes an `InputError`, with its traceback as a note. Our own parts' errors stay as they
+        are.
+
+        Args:
+            name: of the part.
+        """
+        try:
+            yield
+        except SurgicaiError as error:
+            if not self.is_ours(name):
+                error.args = (f"{self._title(name)}: {error}",)
+            raise
+        except Exception as error:  # code of other people's may raise anything
+            if self.is_ours(name):
+                raise
+            refusal = self.refusal(name, f"failed: {_reason(error)}")
+            refusal.add_note("".join(traceback.format_exception(error)).rstrip())
+            raise refusal from error
+
+    def _checked(self, name: str, owner: str, part: object) -> Part:
+        """Return what is offered as a part, or refuse it."""
+        if fault := self._fault(part):
+            raise InputError(f"{self._title(name, owner)} {fault}.")
+        return cast(Part, part)
+
+    def _title(self, name: str, owner: str = "") -> str:
+        """Return how a message calls a part."""
+        return f"The {self.kind} '{name}' of '{owner or self.distribution(name)}'"
 
     def _search(self) -> None:
         """Read the entry points of the group, once; note names that are taken."""
@@ -146,14 +252,30 @@ class Registry[Part]:
 
 
 @functools.cache
-def _installed(path: tuple[str, ...]) -> EntryPoints:
+def _installed(path: tuple[str, ...]) -> "EntryPoints":
     """Return the entry points of every distribution on `path`, which is `sys.path`."""
+    from importlib.metadata import entry_points  # not above: it is most of what a start takes
+
     return entry_points()
 
 
-def _owner(point: EntryPoint) -> str:
+def _owner(point: "EntryPoint") -> str:
     """Return the name of the distribution of an entry point."""
     return point.dist.name if point.dist is not None else point.module.partition(".")[0]
+
+
+def _reason(error: Exception) -> str:
+    """Return an error of other people's code in a line: its kind, its text and where it arose."""
+    said = first_line(error).removesuffix(".")
+    if isinstance(error, SurgicaiError | ImportError):
+        return said
+    text = (
+        type(error).__name__ if said == type(error).__name__ else f"{type(error).__name__}: {said}"
+    )
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames or "importlib" in frames[-1].filename:
+        return text
+    return f"{text} ({frames[-1].filename}, line {frames[-1].lineno})"
 
 
 def resolve(target: str) -> Any:

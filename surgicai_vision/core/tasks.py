@@ -8,21 +8,45 @@
 
 import importlib.util
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError
-from surgicai_vision.core.plugins import TASKS_GROUP, Registry
+from surgicai_vision.core.errors import InputError, shown
+from surgicai_vision.core.plugins import TASKS_GROUP, Registry, subclass_of
 
 if TYPE_CHECKING:
     from surgicai_vision.envs.subtask import Subtask
 
 SUBTASK_STEPS: Final = 200
 """Control steps a subtask may take (paper, image policies)."""
+NEEDED: Final = ("name", "arm", "tolerances", "demands")
+"""What a task's class has of its own."""
+_is_subtask = subclass_of("surgicai_vision.envs.subtask:Subtask")
+
+
+def _fault(part: object) -> str:
+    """Return what is wrong with what is offered as a task, "" if nothing."""
+    if fault := _is_subtask(part):
+        return fault
+    subtask = cast("type[Subtask]", part)
+    missing = [name for name in NEEDED if not hasattr(subtask, name)]
+    if missing:
+        return f"lacks {' and '.join(missing)}; its class must have them"
+    if subtask.arm not in names.ARMS:
+        return f"moves arm {shown(subtask.arm)}; allowed: {', '.join(names.ARMS)}"
+    for name in ("tolerances", "demands"):
+        presets = getattr(subtask, name)
+        if not isinstance(presets, Mapping) or not presets:
+            return f"has {name} {shown(presets)}; give a value for each preset, as {{'paper': …}}"
+    if undemanded := set(subtask.tolerances) - set(subtask.demands):
+        return f"has no demands for its preset '{min(undemanded)}'"
+    return ""
+
+
 TASKS: Final = Registry["type[Subtask]"](
     "task",
     TASKS_GROUP,
@@ -34,6 +58,7 @@ TASKS: Final = Registry["type[Subtask]"](
         "pullout": "surgicai_vision.envs.pullout:Pullout",
         names.SUTURE: "surgicai_vision.envs.suture:Suture",
     },
+    _fault,
 )
 """Task name → its subclass of `envs.subtask.Subtask`; of `suture`, the env of all five."""
 
@@ -53,7 +78,8 @@ def load_subtask(name: str) -> "type[Subtask]":
 
     Raises:
         UnknownName: no task is called so.
-        InputError: another distribution's task cannot be imported or is called otherwise.
+        InputError: another distribution's task cannot be imported, lacks something or is called
+            otherwise.
     """
     subtask = TASKS.load(name)
     if subtask.name != name:
@@ -86,8 +112,9 @@ def register_task(subtask: "type[Subtask]", distribution: str = "") -> None:
 
     Raises:
         NameCollision: the name is taken.
+        InputError: this is no task, or it lacks something.
     """
-    TASKS.register(subtask.name, subtask, distribution)
+    TASKS.register(getattr(subtask, "name", shown(subtask)), subtask, distribution)
     register_ids()
 
 

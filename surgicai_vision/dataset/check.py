@@ -23,6 +23,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.errors import BadFile, first_line
 from surgicai_vision.core.files import read_json
 from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.core.untrusted import checked
 from surgicai_vision.dataset import schema
 from surgicai_vision.dataset.lerobot_files import EPISODES, INFO
 from surgicai_vision.dataset.reader import RenderedDataset, open_dataset
@@ -128,19 +129,20 @@ def _check_lerobot(
 ) -> None:
     """Check LeRobot's own metadata against the data."""
     try:
-        info = read_json(dataset.path / "meta/info.json")
-        statistics = read_json(dataset.path / "meta/stats.json")
+        info = checked(read_json(dataset.path / "meta/info.json"), dict, "meta/info.json")
+        features = checked(info.get("features"), dict, "meta/info.json: features")
+        statistics = checked(read_json(dataset.path / "meta/stats.json"), dict, "meta/stats.json")
         counts = ["episode_index", "length", "dataset_from_index", "dataset_to_index"]
         files = sorted(dataset.path.glob(EPISODES))
         table = pa.concat_tables(pq.read_table(file, columns=counts) for file in files)
-    except (BadFile, OSError, pa.ArrowException) as error:
+    except (BadFile, OSError, ValueError, pa.ArrowException) as error:
         problems.append(f"LeRobot's metadata cannot be read ({first_line(error)}).")
         return
     bounds = dataset.bounds()
     if (info.get("total_frames"), info.get("total_episodes")) != (dataset.length, len(bounds)):
         problems.append("meta/info.json: its counts are not those of the data.")
     own = schema.columns(dataset.views)
-    missing = [key for key in (*keys, *own) if key not in info.get("features", {})]
+    missing = [key for key in (*keys, *own) if key not in features]
     if missing:
         problems.append(f"meta/info.json: no feature {', '.join(missing)}.")
     expected = [(number, stop - start, start, stop) for number, (start, stop) in enumerate(bounds)]
@@ -163,7 +165,10 @@ def _check_statistics(
     exact = column_statistics(values)
     scale = max(1.0, *(abs(value) for value in (*exact["min"], *exact["max"])))
     for name in ("min", "max", "mean", "std", "count"):
-        given = np.ravel(np.asarray(recorded.get(name, np.nan), dtype=np.float64))
+        try:
+            given = np.ravel(np.asarray(recorded.get(name, np.nan), dtype=np.float64))
+        except (TypeError, ValueError, OverflowError):  # no numbers, or one of hundreds of digits
+            given = np.zeros(0)
         fits = given.shape == np.shape(exact[name])
         if not fits or not np.allclose(given, exact[name], atol=STATISTICS_TOLERANCE * scale):
             problems.append(f"meta/stats.json: {name} of {key} is not that of the data.")

@@ -61,11 +61,16 @@ def decode(content: Buffer | None, where: str) -> NDArray[np.uint8 | np.float32]
         BadFile: not an image; `where` says which.
     """
     data = np.frombuffer(content or b"", np.uint8)
-    frame = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-    if frame is None:
-        raise BadFile(f"{where}: its image cannot be decoded.")
-    if frame.ndim == 2:
-        depth: NDArray[np.float32] = frame[..., None]
-        return depth
-    rgb: NDArray[np.uint8] = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
-    return rgb
+    try:
+        frame = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        if frame is None:
+            raise BadFile(f"{where}: its image cannot be decoded.")
+        if frame.ndim == 2:
+            depth: NDArray[np.float32] = frame[..., None]
+            return depth
+        rgb: NDArray[np.uint8] = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+        return rgb
+    except cv2.error:
+        raise BadFile(
+            f"{where}: its image cannot be decoded (OpenCV refuses its size or its channels)."
+        ) from None

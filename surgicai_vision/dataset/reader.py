@@ -26,12 +26,21 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import camera_names
 from surgicai_vision.core.config import TaskConfig, from_mapping
-from surgicai_vision.core.errors import BadFile, InputError, check_name, first_line
+from surgicai_vision.core.errors import (
+    BadFile,
+    InputError,
+    check_at_least,
+    check_at_most,
+    check_name,
+    first_line,
+)
 from surgicai_vision.core.files import read_json, sha256_file
 from surgicai_vision.dataset import codecs, schema
 from surgicai_vision.dataset.protocol import episode_bounds
 from surgicai_vision.dataset.video import read_frames
 
+DAMAGED = (AttributeError, KeyError, TypeError, ValueError, OverflowError, InputError)
+"""What a value of another type, or out of its range, in the metadata raises."""
 VIDEO_PLACE = ("chunk_index", "file_index", "from_timestamp")
 
 
@@ -89,7 +98,9 @@ class RenderedDataset:
             self.late = max((int(asked.get("late", 0)) for asked in requests), default=0)
             self.has_depth = bool(self.meta["depth"])
             self.has_segmentation = bool(self.meta["segmentation"])
-        except (AttributeError, KeyError, TypeError, ValueError, InputError) as error:
+            check_at_least(1, fps=self.fps, variants=self.variants, image_size=self.image_size)
+            check_at_most(schema.SIZES[1], image_size=self.image_size)
+        except DAMAGED as error:
             raise BadFile(f"{file} is damaged ({error}).") from None
         self._paths = sorted(self.path.glob("data/chunk-*/file-*.parquet"))
         self._files = [_open(path) for path in self._paths]
@@ -221,7 +232,8 @@ class RenderedDataset:
         for file in sorted(self.path.glob("meta/episodes/chunk-*/file-*.parquet")):
             try:
                 columns = ["dataset_from_index", "dataset_to_index", *wanted]
-                rows.extend(_open(file).read(columns).select(columns).to_pylist())
+                found = _open(file).read(columns).select(columns)
+                rows.extend(_checked_places(found, file).to_pylist())
             except (KeyError, pa.ArrowException) as error:
                 raise BadFile(
                     f"{file} does not say where the videos are ({first_line(error)})."
@@ -321,6 +333,16 @@ def _read_meta(path: Path) -> schema.Table:
             "LeRobot's tools read; for this command render the demonstrations without --layout."
         )
     return meta
+
+
+def _checked_places(table: pa.Table, file: Path) -> pa.Table:
+    """Return a table of numbers, whole but for times; `BadFile` where they are none."""
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        values = column.to_numpy()
+        wanted = "iuf" if name.endswith(VIDEO_PLACE[-1]) else "iu"
+        if values.dtype.kind not in wanted or not np.isfinite(values).all():
+            raise BadFile(f"{file}: {name} must hold numbers; render the dataset again.")
+    return table
 
 
 def _open(path: Path) -> pq.ParquetFile:

@@ -36,9 +36,6 @@ from surgicai_vision.dataset.schema import Table
 from surgicai_vision.dataset.writer import SUMMARY_FILE, assemble
 from surgicai_vision.demos.store import Demo, demos_digest, list_demos, read_demo, read_marker
 
-SIZES = (16, 1024)
-"""Smallest and largest image side [px]; MuJoCo's off-screen buffer ends at the latter."""
-
 register_job(
     "render-episode",
     "surgicai_vision.dataset.render_jobs:render_episode",
@@ -176,8 +173,9 @@ def _check_images(views: Sequence[str], size: int, video: str | None) -> None:
         check_camera(view)
     if not views or len(set(views)) != len(views):
         raise InputError(f"views are {', '.join(views) or 'none'}; give at least one, each once.")
-    if not SIZES[0] <= size <= SIZES[1]:
-        raise InputError(f"size is {size}; it must be within {SIZES[0]} and {SIZES[1]} pixels.")
+    smallest, largest = schema.SIZES
+    if not smallest <= size <= largest:
+        raise InputError(f"size is {size}; it must be within {smallest} and {largest} pixels.")
     check_video(video, size)
 
 

@@ -49,6 +49,8 @@ SCALARS: Mapping[str, str] = MappingProxyType(
 COLUMNS = (*VECTORS, *SCALARS)
 """The columns of every dataset that are no images, in the order of the digest."""
 
+SIZES = (16, 1024)
+"""Smallest and largest image side [px]; MuJoCo's off-screen buffer ends at the latter."""
 IMAGE_AXES = ("height", "width", "channels")
 
 

@@ -23,6 +23,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig, digest, from_mapping, to_mapping
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import code_version, read_json, sha256_file, write_bytes, write_json
+from surgicai_vision.core.untrusted import parse_json
 
 FORMAT = "surgicai-vision-demos"
 VERSION = 2
@@ -167,7 +168,9 @@ def read_demo(path: Path) -> Demo:
     """
     try:
         with safe_open(path, framework="numpy") as file:
-            details = json.loads((file.metadata() or {}).get("demo", "null"))
+            details = parse_json(
+                (file.metadata() or {}).get("demo", "null"), f"{path}: its metadata"
+            )
             present = [*ARRAYS, *({EXECUTED} & set(file.keys()))]
             arrays = {name: file.get_tensor(name) for name in present}
         if not isinstance(details, dict) or details.pop("format", None) != FORMAT:

@@ -6,14 +6,15 @@ of `TaskConfig`, except `max_steps`: there the limit is gymnasium's `max_episode
 """
 
 import functools
-from collections.abc import Mapping
+import operator
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import surgicai_vision.scene.mujoco_import  # noqa: F401  # before all that imports MuJoCo
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, SceneConfig, TaskConfig, from_mapping
-from surgicai_vision.core.errors import InputError
-from surgicai_vision.core.tasks import load_subtask
+from surgicai_vision.core.errors import InputError, shown
+from surgicai_vision.core.tasks import TASKS, load_subtask
 from surgicai_vision.envs.base import SuturingEnv
 from surgicai_vision.envs.goal import GoalSuture, GoalSuturingEnv
 from surgicai_vision.envs.grasp import Grasp
@@ -41,7 +42,7 @@ SUBTASKS: dict[str, Subtask] = {
 def make(
     config: TaskConfig = TaskConfig(),
     obs_type: str = "state",
-    cameras: tuple[str, ...] = ("front", "back"),
+    cameras: str | Sequence[str] = ("front", "back"),
     image_size: int | tuple[int, int] = 224,
     depth: bool = False,
     segmentation: bool = False,
@@ -53,10 +54,9 @@ def make(
 
     With `action_mode` "absolute" it is acted on by both arms' set-points (`absolute`).
     """
-    size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
-    if len(size) != 2:
-        raise InputError(f"image_size is {size}; it must be one side or (height, width) [pixel].")
-    view = ObservationConfig(obs_type, tuple(cameras), size, depth, segmentation, action_mode)
+    chosen = (cameras,) if isinstance(cameras, str) else tuple(cameras)
+    size = _sides(image_size)
+    view = ObservationConfig(obs_type, chosen, size, depth, segmentation, action_mode)
     shows_goal = obs_type == "goal"
     if config.task == names.SUTURE:
         procedure = GoalSuture if shows_goal else Suture
@@ -65,10 +65,27 @@ def make(
     return single(config, (_subtask(config.task),), view, render_mode, truncates)
 
 
+def _sides(image_size: object) -> tuple[int, int]:
+    """Return the height and width of an image [pixel] of one side, or of both."""
+    sides = image_size if isinstance(image_size, Iterable) else (image_size, image_size)
+    try:
+        height, width = map(operator.index, sides)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"image_size is {shown(image_size)}; it must be one whole number, or (height, width) "
+            "[pixel]."
+        ) from None
+    return height, width
+
+
 @functools.cache
 def _subtask(task: str) -> Subtask:
     """Return what a task that is one subtask is, of ours or of another distribution."""
-    return SUBTASKS.get(task) or load_subtask(task)()
+    if task in SUBTASKS:
+        return SUBTASKS[task]
+    subtask = load_subtask(task)
+    with TASKS.calling(task):
+        return subtask()
 
 
 def make_task(

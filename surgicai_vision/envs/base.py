@@ -23,7 +23,7 @@
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar
 
 import gymnasium
 import mujoco
@@ -31,10 +31,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from surgicai_vision.core import names
-from surgicai_vision.core.config import SuccessRule, TaskConfig
-from surgicai_vision.core.errors import InputError, PhysicsError, check_name
+from surgicai_vision.core.config import RandomisationConfig, SuccessRule, TaskConfig
+from surgicai_vision.core.errors import InputError, PhysicsError, check_name, shown
 from surgicai_vision.core.lazy import LazyMapping
-from surgicai_vision.core.tasks import task_text
+from surgicai_vision.core.tasks import TASKS, task_text
 from surgicai_vision.envs import absolute, hole_crossing, observation, poses, randomisation
 from surgicai_vision.envs.calibration import Calibration
 from surgicai_vision.envs.camera_rig import Images
@@ -64,6 +64,8 @@ RENDER_CAMERA = "front"
 RENDER_SIZE = (480, 640)
 """Height and width of what `render` returns [px]."""
 RENDER_MODES = ("human", "rgb_array")
+RESET_OPTIONS = ("randomisation",)
+"""Keys of what `reset` takes as `options`."""
 
 Observation = NDArray[np.float32] | Mapping[str, Frame]
 
@@ -141,14 +143,19 @@ class SuturingEnv(gymnasium.Env):
             seed: of all that is drawn.
             options: `randomisation`: axis → numbers in place of those that are drawn, as
                 `info["randomisation"]` reports them; the env must have some randomisation.
+
+        Raises:
+            UnknownName: another option, or no such axis.
+            InputError: numbers that no episode can have, or an env without randomisation.
+            PhysicsError: no start was physical.
         """
+        axes = self.config.randomisation
+        given = _given(options or {}, axes)
         super().reset(seed=seed)
         self._moves += 1
-        given = cast(Mapping[str, Sequence[float]], (options or {}).get("randomisation", {}))
         simulation = self.simulation
         first = self._subtasks[0]
-        axes = self.config.randomisation
-        if axes.on or given:
+        if axes.on:
             # Numbers of their own: a start is the same whatever is randomised, so that evaluations
             # can be paired.
             draws = randomisation.draw(axes, self.np_random.spawn(1)[0])
@@ -157,7 +164,9 @@ class SuturingEnv(gymnasium.Env):
         for _ in range(START_DRAWS):
             simulation.reset()
             simulation.task_state.phase = first.phase
-            if first.start(simulation, self.stitch, self.np_random):
+            with TASKS.calling(self.task):
+                is_physical = first.start(simulation, self.stitch, self.np_random)
+            if is_physical:
                 break
         else:
             raise PhysicsError(
@@ -165,7 +174,8 @@ class SuturingEnv(gymnasium.Env):
             )
         hole_crossing.remember_tip(simulation, simulation.task_state)
         self._remember_tool()
-        info = self.measure()
+        with TASKS.calling(self.task):
+            info = self.measure()
         if axes.on:
             info["randomisation"] = randomisation.report(axes, simulation.draws)
         if self.render_mode == "human":
@@ -588,6 +598,29 @@ class SuturingEnv(gymnasium.Env):
         state = self.simulation.task_state
         state.dwell = state.dwell + 1 if holds else 0
         return state.dwell
+
+
+def _given(
+    options: Mapping[str, object], axes: RandomisationConfig
+) -> Mapping[str, Sequence[float]]:
+    """Return axis → numbers of the options of a reset, or refuse the options.
+
+    The axes and their numbers are looked at where they are put in (`randomisation.with_numbers`).
+    """
+    for key in options:
+        check_name("option of reset", key, RESET_OPTIONS)
+    given = options.get("randomisation") or {}
+    if not isinstance(given, Mapping):
+        raise InputError(
+            f"options['randomisation'] is {shown(given)}; it must be a dict, axis → its numbers."
+        )
+    if given and not axes.on:
+        raise InputError(
+            "options['randomisation'] gives numbers, and this env has no randomisation; make it "
+            f"with one, such as randomisation={{'{next(iter(given))}': …}}."
+        )
+    # The latency is reported as well, and is the env's own.
+    return {axis: of for axis, of in given.items() if axis != "latency" or of != axes.latency}
 
 
 def _refuse_increments(config: TaskConfig) -> None:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.cameras import other_cameras
-from surgicai_vision.core.config import ANY, NEEDLE_ARCS, RandomisationConfig
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.config import ANY, NEEDLE_ARCS, RANDOMISATION_LIMITS, RandomisationConfig
+from surgicai_vision.core.errors import InputError, check_name, shown
 from surgicai_vision.envs import looks
 from surgicai_vision.envs.placement import SLIDE, Placement
 from surgicai_vision.scene import Scene, needle
@@ -101,6 +101,26 @@ _PLACES = {
 SIZE = _EDGES[-1]
 """Numbers of one episode."""
 NOTHING: Draws = (0.0,) * SIZE
+ROUNDING = 1e-6
+"""How far beyond its bounds a number may be, that was stored in less than 64 bits."""
+WHOLE = ("pair", "appearance", "distractors")
+"""Axes whose numbers are whole: choices, counts and seeds."""
+_MOST = {
+    "pair": (4.0,),
+    "needle_arc": (max(TIP_ANGLES.values()) - TIP_ANGLES[NEEDLE_ARCS[0]],),
+    "appearance": (len(names.APPEARANCES), appearance.SEEDS - 1),
+    "appearance_shift": (1.0, len(names.APPEARANCES), appearance.SEEDS - 1),
+    "distractors": (distractors.MOST, appearance.SEEDS - 1),
+}
+"""Axis that has no negative numbers → the largest of each."""
+_BOUNDS = {axis: (np.zeros(len(most)), np.array(most)) for axis, most in _MOST.items()} | {
+    axis: (
+        -RANDOMISATION_LIMITS[axis] * np.array(unit),
+        RANDOMISATION_LIMITS[axis] * np.array(unit),
+    )
+    for axis, unit in UNITS.items()
+}
+"""Axis → the smallest and the largest of each of its numbers."""
 
 
 def draw(config: RandomisationConfig, rng: np.random.Generator) -> Draws:
@@ -126,16 +146,41 @@ def with_numbers(draws: Draws, given: Mapping[str, Sequence[float]]) -> Draws:
 
     Raises:
         UnknownName: no such axis.
-        InputError: not as many numbers as the axis has.
+        InputError: not as many numbers as the axis has, or one beyond the axis's limit.
     """
     values = list(draws)
     for axis, numbers in given.items():
         place = _PLACES[check_name("axis of randomisation", axis, _PLACES)]
-        size = place.stop - place.start
-        if len(numbers) != size:
-            raise InputError(f"randomisation: {axis} has {size} numbers; {len(numbers)} are given.")
-        values[place] = [float(number) for number in numbers]
+        values[place] = _checked(axis, numbers)
     return tuple(values)
+
+
+def _checked(axis: str, numbers: object) -> list[float]:
+    """Return an axis's numbers, or refuse such as no episode can have."""
+    try:
+        given = np.array(numbers, dtype=np.float64)
+    except (TypeError, ValueError):
+        given = np.full(1, np.nan)
+    if given.ndim != 1 or not np.isfinite(given).all():
+        raise InputError(
+            f"randomisation: {axis} is {shown(numbers)}; give a list of {_SIZES[axis]} finite "
+            "numbers."
+        )
+    if len(given) != _SIZES[axis]:
+        raise InputError(
+            f"randomisation: {axis} has {_SIZES[axis]} numbers; {len(given)} are given."
+        )
+    least, most = _BOUNDS[axis]
+    beyond = np.flatnonzero((given < least - ROUNDING) | (given > most + ROUNDING))
+    if len(beyond):
+        at = beyond[0]
+        raise InputError(
+            f"randomisation: {axis} has {given[at]:g}; allowed: {least[at]:g} to {most[at]:g}."
+        )
+    if axis in WHOLE and (given != np.round(given)).any():
+        raise InputError(f"randomisation: {axis} is {shown(numbers)}; give whole numbers.")
+    values: list[float] = given.tolist()
+    return values
 
 
 def report(config: RandomisationConfig, draws: Draws) -> dict[str, Array | int]:

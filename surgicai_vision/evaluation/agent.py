@@ -65,7 +65,7 @@ class Agent(abc.ABC):
     """What acts in the slots of an evaluation.
 
     Attributes:
-        name: how the agent is called in rows and tables.
+        name: how the agent is called in messages; an evaluation names it as its tables do.
         cameras: cameras it needs, empty for none.
         image_size: height and width of their images [px].
         depth: whether it needs their depth too.

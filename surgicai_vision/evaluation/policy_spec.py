@@ -25,7 +25,13 @@ from surgicai_vision.core.config import (
     read_changes,
     to_mapping,
 )
-from surgicai_vision.core.errors import InputError, UnknownName, check_name
+from surgicai_vision.core.errors import (
+    InputError,
+    SurgicaiError,
+    UnknownName,
+    check_name,
+    first_line,
+)
 from surgicai_vision.core.plugins import resolve
 from surgicai_vision.core.tasks import task_text
 from surgicai_vision.evaluation import lerobot_agent
@@ -255,7 +261,7 @@ def make_from_factory(target: str) -> Agent:
     """Call "module:factory" for an agent.
 
     Raises:
-        InputError: there is no such function, or it returns something else.
+        InputError: there is no such function, it fails, or it returns something else.
     """
     module, _, name = target.partition(":")
     if not name or not all(module.split(".")):
@@ -264,13 +270,28 @@ def make_from_factory(target: str) -> Agent:
         factory = resolve(target)
     except (ImportError, AttributeError) as error:
         raise InputError(f"{target} cannot be imported: {error}; give module:factory.") from error
-    agent = factory() if callable(factory) else factory
+    except Exception as error:  # a module of others, whose import may raise anything
+        raise _failed(target, error) from error
+    try:
+        agent = factory() if callable(factory) else factory
+    except SurgicaiError:
+        raise
+    except Exception as error:  # code of others, which may raise anything
+        raise _failed(target, error) from error
     if not isinstance(agent, Agent):
         raise InputError(
             f"{target} gives {type(agent).__name__}; "
             "it must be a function that returns a surgicai_vision.evaluation.agent.Agent."
         )
     return agent
+
+
+def _failed(target: str, error: Exception) -> InputError:
+    """Return the error about a factory, or the import of its module, that raised one."""
+    return InputError(
+        f"{target} fails with {type(error).__name__} ({first_line(error)}); give a function "
+        "that takes no arguments and returns a surgicai_vision.evaluation.agent.Agent."
+    )
 
 
 def _from_folder(

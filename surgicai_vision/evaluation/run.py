@@ -9,7 +9,13 @@ from surgicai_vision.evaluation.films import Filming
 from surgicai_vision.evaluation.policy_spec import PolicySpec
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.rollout import evaluate
-from surgicai_vision.evaluation.storage import MARKER, Row, read_evaluation, write_evaluation
+from surgicai_vision.evaluation.storage import (
+    MARKER,
+    Row,
+    alone_in,
+    read_evaluation,
+    write_evaluation,
+)
 from surgicai_vision.scene import build_scene
 from surgicai_vision.training.run_config import Starts
 
@@ -46,21 +52,25 @@ def evaluate_into(
         workers: processes.
         progress: called as progress(steps done, steps at most).
         filming: which episodes become videos; None films nothing.
+
+    Raises:
+        InputError: another process evaluates into `out`.
     """
-    episodes = evaluate(
-        spec.make_agent,
-        spec.config,
-        seeds,
-        workers=workers,
-        progress=progress,
-        filming=filming,
-        upset=spec.run.upset,
-    )
-    about = {
-        "command": command_line(),
-        "provenance": provenance(),
-        "scene_hash": build_scene(spec.config.scene).hash,
-        **spec.about,
-    }
-    run = dataclasses.replace(spec.run, starts=Starts(int(seeds[0]), len(seeds)))
-    return write_evaluation(out, episodes, run, about)
+    with alone_in(out):
+        episodes = evaluate(
+            spec.make_agent,
+            spec.config,
+            seeds,
+            workers=workers,
+            progress=progress,
+            filming=filming,
+            upset=spec.run.upset,
+        )
+        about = {
+            "command": command_line(),
+            "provenance": provenance(),
+            "scene_hash": build_scene(spec.config.scene).hash,
+            **spec.about,
+        }
+        run = dataclasses.replace(spec.run, starts=Starts(int(seeds[0]), len(seeds)))
+        return write_evaluation(out, episodes, run, about)

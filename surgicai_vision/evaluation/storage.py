@@ -7,19 +7,28 @@ whole procedure `visits.parquet` has one row a visit of a subtask (`envs.visits`
 
 import dataclasses
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
+from filelock import Timeout
 from numpy.typing import NDArray
 
 from surgicai_vision.core import files, names
 from surgicai_vision.core.config import JSON, from_mapping, to_mapping
-from surgicai_vision.core.errors import BadFile, first_line
+from surgicai_vision.core.errors import BadFile, InputError, first_line, shown
+from surgicai_vision.core.untrusted import checked
 from surgicai_vision.envs.visits import LAST, Visit
-from surgicai_vision.evaluation.metrics import as_table, measured_ends, summary
+from surgicai_vision.evaluation.metrics import (
+    KINDS,
+    EpisodeMetrics,
+    as_table,
+    measured_ends,
+    summary,
+)
 from surgicai_vision.evaluation.slot import Episode, Film
 from surgicai_vision.training.run_config import RunConfig
 
@@ -27,7 +36,9 @@ MARKER = "evaluation.json"
 EPISODES = "episodes.parquet"
 FILMS = "films.safetensors"
 VISITS = "visits.parquet"
-OURS = (MARKER, EPISODES, FILMS, VISITS)
+LOCK = "evaluation.lock"
+"""Held while a process evaluates into the folder."""
+OURS = (MARKER, EPISODES, FILMS, VISITS, LOCK)
 """Every file of an evaluation; a killed one leaves some of them without the marker."""
 RUN_FILE = "run.json"
 GRID_FILE = "sweep.json"
@@ -84,7 +95,61 @@ def read_evaluation(folder: Path) -> Evaluation:
         if not isinstance(stored.get(key), dict):
             raise BadFile(f"{path} is damaged: it has no table '{key}'. Evaluate again.")
     run = from_mapping(RunConfig, stored["run"], str(path))
+    _check_summary(stored["summary"], f"{path}: summary")
+    _check_about(stored["about"], f"{path}: about")
     return Evaluation(run, stored["summary"], stored["about"])
+
+
+def _check_summary(summary: Row, where: str) -> None:
+    """Refuse a summary without what reports read of it."""
+    checked(summary.get("successes"), int, f"{where}: successes")
+    for key in ("task", "policy"):
+        checked(summary.get(key), str, f"{where}: {key}")
+
+
+def _check_about(about: Row, where: str) -> None:
+    """Refuse tables and texts of another type; each may be absent or null."""
+    checked(about.get("checkpoint") or {}, dict, f"{where}: checkpoint")
+    if about.get("high_level"):
+        high_level = checked(about["high_level"], dict, f"{where}: high_level")
+        checked(high_level.get("policy_sha256"), str, f"{where}: policy_sha256 of high_level")
+        checked(high_level.get("stage_errors"), dict, f"{where}: stage_errors of high_level")
+    for key in ("command", "scene_hash", "folder"):
+        checked(about.get(key) or "", str, f"{where}: {key}")
+    check_provenance(about.get("provenance") or {}, f"{where}: provenance")
+
+
+def check_provenance(value: object, where: str) -> None:
+    """Refuse what is no table of a machine and its packages (`evaluation.provenance`).
+
+    Raises:
+        BadFile: it is of another type.
+    """
+    table = checked(value, dict, where)
+    checked(table.get("packages") or {}, dict, f"{where}: packages")
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Hold a folder that is evaluated into; it is made, and removed again if nothing came into it.
+
+    Raises:
+        InputError: another process evaluates into it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(files.locked(folder / LOCK, wait=False))
+            except Timeout:
+                raise InputError(
+                    f"Another run is evaluating into {folder}; wait for it, stop it or give "
+                    "another --out."
+                ) from None
+            yield
+    finally:
+        if not any(folder.iterdir()):
+            folder.rmdir()
 
 
 def write_evaluation(
@@ -154,16 +219,47 @@ def read_rows(folder: Path) -> list[Row]:
     Raises:
         BadFile: there is none, or it is damaged.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     path = folder / EPISODES
     if not path.is_file():
         raise BadFile(f"{folder} holds no evaluation ({EPISODES} is missing).")
+    rows = read_parquet(path)
+    if not rows:
+        raise BadFile(f"{path} is damaged (no episodes); evaluate again.")
+    # A column of whole numbers alone comes back as integers, whatever its field is.
+    kinds = {
+        name: int | float if kind is float else kind
+        for name, kind in get_type_hints(EpisodeMetrics).items()
+    }
+    needed = [
+        field
+        for field in dataclasses.fields(EpisodeMetrics)
+        if field.name in rows[0] or field.default is dataclasses.MISSING
+    ]
+    for field in needed:  # those that came later, and have a default, may be absent
+        if not all(isinstance(row.get(field.name), kinds[field.name]) for row in rows):
+            raise BadFile(
+                f"{path} is damaged (column {field.name} is missing or of another type); "
+                "evaluate again."
+            )
+    unknown = {row["failure"] for row in rows} - {"", *KINDS}
+    if unknown:
+        raise BadFile(f"{path} is damaged (failures {shown(sorted(unknown))}); evaluate again.")
+    return rows
+
+
+def read_parquet(path: Path) -> list[Row]:
+    """Return the rows of a table.
+
+    Raises:
+        BadFile: it is damaged.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     try:
         rows: list[Row] = pq.read_table(path).to_pylist()
-    except (pa.ArrowException, OSError) as error:
-        raise BadFile(f"{path} is damaged ({first_line(error)}); evaluate again.") from None
+    except (pa.ArrowException, OSError, ValueError) as error:  # the last of texts that are none
+        raise BadFile(f"{path} is damaged ({first_line(error)}); make it again.") from None
     return rows
 
 

@@ -8,7 +8,8 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import TaskConfig
 from surgicai_vision.core.executor import RunContext
 from surgicai_vision.core.variants import Variants
-from surgicai_vision.dataset.render import render_demos
+from surgicai_vision.dataset.layouts import SURGICAI
+from surgicai_vision.dataset.render import check_request, render_demos
 from surgicai_vision.demos.cut import cut_demos
 from surgicai_vision.demos.disturbance import UNDISTURBED, Disturbance
 from surgicai_vision.demos.record import Learner, record
@@ -18,13 +19,17 @@ from surgicai_vision.experiments.dataset_config import DatasetConfig, Demonstrat
 
 
 def check_dataset(dataset: DatasetConfig) -> None:
-    """Refuse what cannot be recorded, before any work.
+    """Refuse what cannot be recorded or rendered, before any work.
 
     Raises:
-        InputError: upsets in a task that has none.
+        InputError: upsets in a task that has none; a size or frame stride that is not allowed.
+        UnknownName: a view that does not exist.
     """
-    if dataset.demonstrations.upset_fraction:
-        check_upset_task(dataset.demonstrations.task)
+    recorded = dataset.demonstrations
+    if recorded.view:
+        check_request(recorded.view, dataset.size, recorded.frame_stride, None, SURGICAI)
+    if recorded.upset_fraction:
+        check_upset_task(recorded.task)
 
 
 def make_dataset(

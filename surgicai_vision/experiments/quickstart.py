@@ -217,6 +217,7 @@ def _open_state(plan: Quickstart, out: Path) -> Row:
         raise InputError(
             f"--out {out} cannot be written: {error.strerror}; choose another folder."
         ) from None
+    files.remove_partial(out, (RUN_FILE,))
     state = {
         "format": FORMAT,
         "title": f"quickstart, {plan.task}",

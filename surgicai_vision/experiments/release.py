@@ -125,6 +125,7 @@ class _Build:
                 )
             return
         self.out.mkdir(parents=True, exist_ok=True)
+        files.remove_partial(self.out, (PLAN_FILE,))
         files.write_json(path, wanted)
 
     def subtask(self, policy: PlannedPolicy) -> ReleaseCard:

@@ -20,11 +20,17 @@ A process killed at any moment leaves `progress.json` behind its rows, and the n
 there.
 """
 
+import math
+import os
 import shutil
-from collections.abc import Collection, Iterator
+import sys
+import tokenize
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
@@ -33,9 +39,16 @@ from numpy.typing import NDArray
 
 from surgicai_vision import __version__
 from surgicai_vision.core.config import JSON, digest, to_mapping
-from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, UnknownName
+from surgicai_vision.core.errors import (
+    BadFile,
+    InputError,
+    SurgicaiError,
+    UnknownName,
+    first_line,
+)
 from surgicai_vision.core.files import CACHE_VARIABLE, cache_root, locked, read_json, write_json
 from surgicai_vision.core.progress import Progress
+from surgicai_vision.core.untrusted import checked
 
 if TYPE_CHECKING:
     from encoders.base import Encoder
@@ -47,6 +60,8 @@ MANIFEST = "manifest.json"
 PROGRESS = "progress.json"
 ROWS = "features.npy"
 LOCK = "lock"
+NOT_ROWS = (OSError, ValueError, OverflowError, TypeError, tokenize.TokenError)
+"""What numpy raises at a file that holds no rows; the last at the header of one that is torn."""
 
 
 class Manifest(TypedDict):
@@ -65,6 +80,18 @@ class Manifest(TypedDict):
     dim: int
     dtype: str
     code_version: str
+
+
+MANIFEST_KINDS: Mapping[str, type] = MappingProxyType(
+    {
+        **dict.fromkeys(("dataset", "view", "encoder", "encoder_fingerprint", "pool"), str),
+        **dict.fromkeys(("weights_sha256", "dtype"), str),
+        **dict.fromkeys(("length", "dim"), int),
+        "card": dict,
+        "shape": list,
+    }
+)
+"""Key of a manifest → its type."""
 
 
 @dataclass(frozen=True)
@@ -175,12 +202,13 @@ def encode(
 
 def open_entry(folder: Path, length: int | None = None, encoded: int = 0) -> Features:
     """Open a complete entry; `BadFile` where it is damaged."""
-    manifest: Manifest = read_json(folder / MANIFEST)
     try:
-        rows = np.load(folder / ROWS, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError) as error:
+        manifest = _read_manifest(folder)
+        rows = np.lib.format.open_memmap(folder / ROWS, mode="r")
+    except (BadFile, *NOT_ROWS) as error:
+        told = first_line(error).rstrip(".")
         raise BadFile(
-            f"The cache entry {folder} is damaged ({error}); delete that folder."
+            f"The cache entry {folder} is damaged ({told}); delete that folder."
         ) from None
     wanted = (manifest["length"] if length is None else length, manifest["dim"])
     if rows.shape != wanted or rows.dtype != np.float16:
@@ -188,6 +216,18 @@ def open_entry(folder: Path, length: int | None = None, encoded: int = 0) -> Fea
             f"The cache entry {folder} holds {rows.shape}, expected {wanted}; delete that folder."
         )
     return Features(folder, manifest, rows, encoded)
+
+
+def _read_manifest(folder: Path) -> Manifest:
+    """Return the manifest of an entry; `BadFile` where it is not one of ours."""
+    stored = checked(read_json(folder / MANIFEST), dict, MANIFEST)
+    for key, kind in MANIFEST_KINDS.items():
+        checked(stored.get(key), kind, f"{MANIFEST}: {key}")
+    sides = [checked(side, int, f"{MANIFEST}: shape") for side in stored["shape"]]
+    if stored["length"] < 1 or min(sides, default=0) < 1 or math.prod(sides) != stored["dim"]:
+        raise BadFile(f"{MANIFEST}: its length, shape and dim are those of no features")
+    manifest: Manifest = stored  # type: ignore[assignment]  # what is read of it was checked
+    return manifest
 
 
 def _manifest(dataset: "Dataset", view: str, encoder: "Encoder") -> Manifest:
@@ -237,17 +277,45 @@ def _fill(
 def _allocated(
     folder: Path, shape: tuple[int, int]
 ) -> "tuple[np.memmap[tuple[int, int], np.dtype[np.float16]], int]":
-    """Open the rows for writing; return them with the number of rows already there."""
+    """Open the rows for writing; return them with the number of rows already there.
+
+    Raises:
+        OSError: the disk has no room for all of them.
+    """
     path = folder / ROWS
+    rows, done = _begun(folder, shape)
+    if rows is None:
+        (folder / PROGRESS).unlink(missing_ok=True)
+        rows = np.lib.format.open_memmap(path, mode="w+", dtype=np.float16, shape=shape)
+    _take_blocks(path)
+    return rows, done
+
+
+def _begun(
+    folder: Path, shape: tuple[int, int]
+) -> "tuple[np.memmap[tuple[int, int], np.dtype[np.float16]] | None, int]":
+    """Return the rows that a killed process left, and how many; None of none, or torn ones."""
     try:
-        rows = np.lib.format.open_memmap(path, mode="r+")
+        rows = np.lib.format.open_memmap(folder / ROWS, mode="r+")
         done = int(read_json(folder / PROGRESS)["rows"])
-        if rows.shape == shape and rows.dtype == np.float16 and 0 <= done <= shape[0]:
-            return rows, done
-    except (OSError, ValueError, KeyError, TypeError, BadFile):
-        pass  # nothing there yet, or torn: start over
-    (folder / PROGRESS).unlink(missing_ok=True)
-    return np.lib.format.open_memmap(path, mode="w+", dtype=np.float16, shape=shape), 0
+    except (BadFile, KeyError, *NOT_ROWS):
+        return None, 0
+    fits = rows.shape == shape and rows.dtype == np.float16 and 0 <= done <= shape[0]
+    return (rows, done) if fits else (None, 0)
+
+
+def _take_blocks(path: Path) -> None:
+    """Have every block of a file that was made at its full size.
+
+    A block that a memory map touches and a full disk cannot give ends the process by SIGBUS, with
+    no word. macOS has no such call.
+
+    Raises:
+        OSError: the disk has no room for it.
+    """
+    if sys.platform != "darwin":
+        with open(path, "rb+") as file:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
 
 
 def _chunks(dataset: "Dataset", view: str, start: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -275,7 +343,7 @@ class CacheEntry:
     Attributes:
         folder: where it lies.
         size: what it takes on the disk [bytes].
-        manifest: what it holds; None where it is unfinished.
+        manifest: what it holds; None where it is unfinished or damaged.
     """
 
     folder: Path
@@ -284,18 +352,31 @@ class CacheEntry:
 
 
 def list_cache(root: Path | None = None) -> list[CacheEntry]:
-    """List every entry, unfinished ones included."""
+    """List every entry, unfinished and damaged ones included; what is no folder is none."""
     folder = (root or default_cache_root()) / "features"
-    entries = []
-    for entry in sorted(folder.iterdir()) if folder.is_dir() else []:
-        size = sum(file.stat().st_blocks * 512 for file in entry.iterdir())
-        manifest = read_json(entry / MANIFEST) if (entry / MANIFEST).exists() else None
-        entries.append(CacheEntry(entry, size, manifest))
-    return entries
+    found = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [CacheEntry(each, _size(each), _known(each)) for each in found if each.is_dir()]
+
+
+def _size(entry: Path) -> int:
+    """Return what the files of an entry take on the disk [bytes]."""
+    size = 0
+    for file in entry.iterdir():
+        with suppress(FileNotFoundError):  # a process that was writing here has ended
+            size += file.stat().st_blocks * 512
+    return size
+
+
+def _known(entry: Path) -> Manifest | None:
+    """Return the manifest of an entry; None where there is none, or no whole one."""
+    try:
+        return _read_manifest(entry)
+    except BadFile:
+        return None
 
 
 def prune_cache(root: Path | None = None, keep_datasets: Collection[str] = ()) -> list[CacheEntry]:
-    """Delete unfinished entries and those of other datasets; return them.
+    """Delete unfinished and damaged entries and those of other datasets; return them.
 
     An entry that a process is writing now is left alone.
 

@@ -10,15 +10,32 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 from encoders.weights import find
-from surgicai_vision.core.errors import InputError, check_name
-from surgicai_vision.core.plugins import ENCODERS_GROUP, Registry, resolve
+from surgicai_vision.core.errors import InputError, check_name, shown
+from surgicai_vision.core.plugins import ENCODERS_GROUP, Registry, instance_of, resolve
 from surgicai_vision.features.devices import AUTO, find_device
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from encoders.base import Encoder, EncoderCard, Plugin
+
+_is_plugin = instance_of("encoders.card:Plugin")
+_is_card = instance_of("encoders.card:EncoderCard")
+
+
+def _fault(part: object) -> str:
+    """Return what is wrong with what is offered as an encoder, "" if nothing."""
+    if fault := _is_plugin(part):
+        return fault
+    plugin = cast("Plugin", part)
+    if fault := _is_card(plugin.card):
+        return f"has a card that {fault}"
+    build: object = plugin.build
+    return "" if callable(build) else f"has a build that is {shown(build)}; it must be a function"
+
 
 ENCODERS: Final = Registry["Plugin"](
     "encoder",
@@ -39,6 +56,7 @@ ENCODERS: Final = Registry["Plugin"](
         "siglip2": "encoders.timm_models:SIGLIP2",
         "vc1": "encoders.vc1:VC1",
     },
+    _fault,
 )
 """Encoder name → its `encoders.base.Plugin`."""
 
@@ -63,6 +81,7 @@ def register_encoder(name: str, plugin: "Plugin", distribution: str = "") -> Non
 
     Raises:
         NameCollision: the name is taken.
+        InputError: this is no plug-in of an encoder.
     """
     ENCODERS.register(name, plugin, distribution)
 
@@ -177,7 +196,8 @@ def load_encoder(
 
     Raises:
         UnknownName: a name or pool that does not exist.
-        InputError: a device that is not there.
+        InputError: a device that is not there, or an encoder of another distribution that fails,
+            builds something else or gives features of another length than its card says.
         MissingWeights: the weights are found nowhere; raised within seconds and before any work.
         BadFile: a weights file that is missing, damaged or of another architecture.
     """
@@ -185,10 +205,30 @@ def load_encoder(
     path = find_weights(name, weights)
     check_name("pool", pool, POOLS)
     where = find_device(device)
-    card, network = plugin.build(plugin.card, path)
     make = resolve("encoders.base:open_encoder")  # imports torch
-    encoder: Encoder = make(card, network, pool, where)
+    with ENCODERS.calling(name):
+        built: object = plugin.build(plugin.card, path)
+    card, network = _built(name, built)
+    with ENCODERS.calling(name):  # it is asked for a first feature
+        encoder: Encoder = make(card, network, pool, where)
+    if pool == "global" and encoder.shape != (card.dim,):
+        raise ENCODERS.refusal(
+            name,
+            f"gives features of shape {encoder.shape}, and its card says dim {card.dim}; its "
+            "author must correct one of them",
+        )
     return encoder
+
+
+def _built(name: str, built: object) -> "tuple[EncoderCard, nn.Module]":
+    """Return the card and the network that an encoder's `build` has answered, or refuse them."""
+    wrong = "builds {}; its build must return its card and a torch.nn.Module"
+    if not isinstance(built, tuple) or len(built) != 2:
+        raise ENCODERS.refusal(name, wrong.format(shown(built)))
+    card, network = built
+    if _is_card(card) or not isinstance(network, resolve("torch.nn:Module")):
+        raise ENCODERS.refusal(name, wrong.format(shown(built)))
+    return card, network
 
 
 def find_weights(name: str, weights: WeightsSource = ANYWHERE) -> Path | None:

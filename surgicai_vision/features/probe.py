@@ -104,7 +104,7 @@ def probe(
         InputError: fewer than `FEWEST` episodes, a pose that is not finite, or features of another
             dataset.
     """
-    pose = _pose(dataset)
+    pose = needle_pose(dataset)
     if not features and not proprioception:
         raise InputError("A probe needs the features of at least one view, or proprioception.")
     for entry in features:
@@ -166,8 +166,13 @@ def spread(episode_index: NDArray[np.int64], frames: int) -> NDArray[np.int64]:
     return np.concatenate(chosen)
 
 
-def _pose(dataset: Dataset) -> Array:
-    """Return the needle's pose, (N, 7); refuse a dataset that cannot be probed."""
+def needle_pose(dataset: Dataset) -> Array:
+    """Return the needle's pose, (N, 7); refuse a dataset that cannot be probed.
+
+    Raises:
+        UnknownName: a dataset without the needle's pose.
+        InputError: fewer than `FEWEST` episodes, or a pose that is not finite.
+    """
     columns = dataset.columns()
     if names.NEEDLE_POSE not in columns:
         raise UnknownName("column", names.NEEDLE_POSE, columns)

@@ -28,7 +28,7 @@ from pathlib import Path
 
 from surgicai_vision.core import percentages
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
-from surgicai_vision.core.errors import BadFile, InputError
+from surgicai_vision.core.errors import BadFile, InputError, check_finite
 from surgicai_vision.core.files import write_bytes, write_json
 from surgicai_vision.core.names import TEST_SEED
 from surgicai_vision.core.tasks import task_names
@@ -76,6 +76,8 @@ class Entry:
             raise InputError(f"link is {self.link}; it must begin with https://.")
         if self.minutes is not None and not self.minutes >= 0:
             raise InputError(f"minutes is {self.minutes}; it must be at least 0.")
+        if self.minutes is not None:
+            check_finite(minutes=self.minutes)
         for words in (self.name, self.by, self.link, self.hardware, self.note):
             if len(words) > 300:
                 raise InputError(f"'{words[:40]}…' has {len(words)} characters; 300 at most.")
@@ -110,6 +112,10 @@ class Row:
     steps: tuple[int, ...]
     digest: str = ""
     format: int = FORMAT
+
+    def __post_init__(self) -> None:
+        if not all(isinstance(version, str | None) for version in self.versions.values()):
+            raise InputError("versions must be texts: package → its version.")
 
     @property
     def condition(self) -> str:
@@ -171,11 +177,14 @@ def read_row(path: Path) -> Row:
         BadFile: it is no row, or too large to be one.
     """
     try:
+        if not path.is_file():
+            raise BadFile(f"{path} is no file.")
         if path.stat().st_size > LARGEST:
             raise BadFile(f"{path} is larger than {LARGEST} bytes; a row has some kilobytes.")
         table = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(table, dict) or table.get("format") != FORMAT:
             raise BadFile(f"{path} is no row of format {FORMAT}.")
+        json.dumps(table, ensure_ascii=False).encode()  # a ValueError where no page can show it
         return from_mapping(Row, table, str(path))
     except (OSError, ValueError, TypeError, RecursionError, InputError) as error:
         told = " ".join(str(error).split())[:200]
@@ -238,22 +247,27 @@ def write_leaderboard(folder: Path, out: Path) -> Board:
     taken: dict[str, Row] = {}
     refused: dict[str, str] = {}
     for path in sorted(folder.rglob("*.json")):
-        name = str(path.relative_to(folder))
+        name = _printable(str(path.relative_to(folder)))
         try:
             row = read_row(path)
-        except BadFile as error:
-            refused[name] = str(error)
+            wrong = problem(row)
+        except InputError as error:
+            refused[name] = _printable(str(error))
             continue
-        wrong = problem(row)
         if not wrong and row.digest in taken:
             wrong = "the same row is there already."
         if wrong:
-            refused[name] = wrong
+            refused[name] = _printable(wrong)
         else:
             taken[row.digest] = row
     rows = tuple(taken.values())
     write_bytes(out, _page(rows, refused).encode())
     return Board(out, rows, refused)
+
+
+def _printable(text: str) -> str:
+    """Return a text with the bytes of a file's name that are no UTF-8 written as escapes."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def write_row(row: Row, out: Path) -> None:

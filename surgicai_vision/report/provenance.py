@@ -67,8 +67,16 @@ def _cell(item: Group, result: Result) -> dict[str, str | int]:
         "weights": _hash(checkpoint.get("weights_sha256")),
         "sha256": _hash(checkpoint.get("policy_sha256")),
         "dataset": _hash(checkpoint.get("dataset") or result.about.get("dataset")),
-        "command": " ".join(shlex.split(command)) if command else text.ABSENT,
+        "command": _one_line(command) if command else text.ABSENT,
     }
+
+
+def _one_line(command: str) -> str:
+    """Return a command without the quotes of a shell; one that no shell reads as it stands."""
+    try:
+        return " ".join(shlex.split(command))
+    except ValueError:
+        return command
 
 
 def _hash(value: object) -> str:
@@ -99,7 +107,7 @@ def _versions(made: dict[str, Any]) -> str:
 
 def _machine(made: dict[str, Any]) -> str:
     return (
-        f"{made['processor']}, {made['cores']} cores, {made['system']}"
+        f"{made['processor']}, {made.get('cores')} cores, {made.get('system')}"
         if made.get("processor")
         else ""
     )

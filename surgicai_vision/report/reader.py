@@ -8,17 +8,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 from surgicai_vision.core import files
 from surgicai_vision.core.config import TaskConfig, from_mapping
 from surgicai_vision.core.errors import BadFile
+from surgicai_vision.core.untrusted import checked, finite_number
 from surgicai_vision.evaluation.storage import (
     FAILED_FILE,
     GRID_FILE,
     RUN_FILE,
+    check_provenance,
     find_evaluations,
     read_evaluation,
+    read_parquet,
     read_rows,
     read_versioned,
 )
@@ -30,6 +34,21 @@ __all__ = ["REFERENCES", "Collected", "Missing", "PlannedRun", "Result", "collec
 WORK = "work"
 """Folder of a sweep in which its jobs are at work."""
 PROBES = ("probes.parquet", "probe.json")
+RUN_KINDS: Mapping[str, type] = MappingProxyType(
+    {
+        **dict.fromkeys(("title", "command", "data", "headline", "lead"), str),
+        **dict.fromkeys(("seconds", "provenance", "video"), dict),
+        **dict.fromkeys(("problems", "skipped"), list),
+    }
+)
+"""Key of `run.json` that the page shows → its type."""
+PROBE_TEXTS = ("task", "encoder", "pool")
+PROBE_NUMBERS = tuple(
+    f"{error}{part}"
+    for error in ("tip_mm", "angle_deg")
+    for part in ("", "_low", "_high", "_chance")
+)
+"""Columns of a probe that hold text, and those that hold a number; each may be absent."""
 
 FAILED, NOT_RUN, PENDING, TO_DO = "failed", "not run", "pending", "to do"
 
@@ -147,7 +166,7 @@ def collect(folder: Path, planned: Sequence[PlannedRun] = ()) -> Collected:
         BadFile: neither an evaluation nor a run that failed or was not run, or results of another
             version.
     """
-    run = read_versioned(folder / RUN_FILE) if (folder / RUN_FILE).exists() else {}
+    run = _read_run(folder / RUN_FILE) if (folder / RUN_FILE).exists() else {}
     results = read_results(folder, empty=True)
     missing = _missing(folder, run, planned, results)
     if not results and not missing:
@@ -156,6 +175,25 @@ def collect(folder: Path, planned: Sequence[PlannedRun] = ()) -> Collected:
             f"run `surgicai-vision evaluate POLICY --out {folder}` first."
         )
     return Collected(folder, results, missing, run, read_probes(folder))
+
+
+def _read_run(path: Path) -> dict[str, Any]:
+    """Return what `run.json` holds, without what is null.
+
+    Raises:
+        BadFile: another version wrote it, or what the page shows is of another type.
+    """
+    run = {key: value for key, value in read_versioned(path).items() if value is not None}
+    for key in RUN_KINDS.keys() & run.keys():
+        checked(run[key], RUN_KINDS[key], f"{path}: {key}")
+    for stage, seconds in run.get("seconds", {}).items():
+        finite_number(seconds, f"{path}: seconds of {stage}")
+    for key, value in run.get("video", {}).items():
+        checked(value, str, f"{path}: {key} of video")
+    check_provenance(run.get("provenance", {}), f"{path}: provenance")
+    if "headline" in run:
+        checked(run.get("lead"), str, f"{path}: lead")
+    return run
 
 
 def read_results(folder: Path, empty: bool = False) -> list[Result]:
@@ -220,17 +258,35 @@ def _told_apart(results: Sequence[Result], folder: Path) -> list[Result]:
 
 
 def read_probes(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of every probe below `folder`."""
-    import pyarrow.parquet as pq
+    """Return the rows of every probe below `folder`.
 
+    Raises:
+        BadFile: a file that is damaged, or holds no probes.
+    """
     rows: list[dict[str, Any]] = []
     for path in sorted(folder.rglob(PROBES[0])):
-        rows += pq.read_table(path).to_pylist()
+        rows += [_checked_probe(row, path) for row in read_parquet(path)]
     if not rows:
         for path in sorted(folder.rglob(PROBES[1])):
             stored = files.read_json(path)
-            rows += stored.get("rows", []) if isinstance(stored, dict) else stored
+            found = stored.get("rows", []) if isinstance(stored, dict) else stored
+            rows += [_checked_probe(row, path) for row in checked(found, list, f"{path}: rows")]
     return rows
+
+
+def _checked_probe(row: object, path: Path) -> dict[str, Any]:
+    """Return a row of a file of probes if what the page shows of it is of its type."""
+    probe = checked(row, dict, f"{path}: a row")
+    for key in PROBE_TEXTS:
+        checked(probe.get(key) or "", str, f"{path}: {key}")
+    for key in PROBE_NUMBERS:
+        value = probe.get(key)
+        if value is not None and value == value:  # an error that is unknown is null or NaN
+            finite_number(value, f"{path}: {key}")
+    views = probe.get("view") or ()
+    for view in [views] if isinstance(views, str) else checked(views, list, f"{path}: view"):
+        checked(view, str, f"{path}: view")
+    return probe
 
 
 def _missing(
@@ -251,17 +307,23 @@ def _missing(
 
     for path in sorted(folder.rglob(FAILED_FILE)):
         failed = read_versioned(path)
-        run = from_mapping(RunConfig, failed["run"], str(path))
+        run = _run_of(failed, path)
         add(run, FAILED, _last_line(str(failed.get("error", ""))), path.parent.name)
     for skipped in stored.get("skipped", []):
-        run = from_mapping(RunConfig, skipped["run"], str(folder / RUN_FILE))
-        add(run, NOT_RUN, str(skipped["reason"]), str(skipped["key"]))
+        run = _run_of(skipped, folder / RUN_FILE)
+        add(run, NOT_RUN, str(skipped.get("reason", "")), str(skipped.get("key", "")))
     for item in planned:
         if item.state == TO_DO:
             add(item.run, PENDING, item.reason or "the sweep has not come to it yet", item.key)
         elif item.state == NOT_RUN:
             add(item.run, NOT_RUN, item.reason, item.key)
     return sorted(found.values(), key=lambda item: (*order(item.condition), item.seed))
+
+
+def _run_of(row: object, path: Path) -> RunConfig:
+    """Return the run that failed or was not run, as a file's row tells it."""
+    stored = checked(row, dict, f"{path}: a run")
+    return from_mapping(RunConfig, checked(stored.get("run"), dict, f"{path}: run"), str(path))
 
 
 def _last_line(text: str) -> str:

@@ -12,6 +12,8 @@ from typing import Any, Final
 
 EMBEDDED: Final = 5_000_000
 """Bytes up to which a video is embedded; a larger one stays beside the page."""
+PARTS: Final = frozenset({"file", "poster", "strip", "title", "text"})
+"""Keys of a run's video."""
 KINDS: Final = {".mp4": "video/mp4", ".jpg": "image/jpeg"}
 
 
@@ -24,7 +26,7 @@ def opening_video(folder: Path, page: Path, run: Mapping[str, Any]) -> dict[str,
         run: what `run.json` holds.
     """
     told = run.get("video")
-    if not told or not (folder / told["file"]).is_file():
+    if not told or not told.keys() >= PARTS or not (folder / told["file"]).is_file():
         return None
     files = {key: _address(folder / told[key], page) for key in ("file", "poster", "strip")}
     return {**files, "title": told["title"], "text": told["text"]}

@@ -11,7 +11,6 @@ What is sent has its own stamp. What is received is as old as its arrival here, 
 and by as much as its stamp lags behind the least late message of the last minutes.
 """
 
-import json
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -19,7 +18,8 @@ from dataclasses import dataclass
 from typing import final
 
 from surgicai_vision.core.config import JSON
-from surgicai_vision.core.errors import InputError, SurgicaiError
+from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError
+from surgicai_vision.core.untrusted import parse_json
 from surgicai_vision.robot import topics
 from surgicai_vision.robot.messages import Header, Message, String, StringStamped
 from surgicai_vision.robot.simulated import PSM_NAMES
@@ -223,12 +223,18 @@ class Client:
         self.send(topics.ENTER.name, StringStamped(Header(self.stamp()), subtask))
 
     def judgement(self) -> Mapping[str, JSON]:
-        """Return how a served simulation judges the episode; nothing at a robot."""
+        """Return how a served simulation judges the episode.
+
+        Nothing at a robot, and where what was heard is no judgement.
+        """
         heard = self.newest(topics.JUDGEMENT.name)
         if heard is None or not isinstance(heard.message, StringStamped):
             return {}
-        judged: dict[str, JSON] = json.loads(heard.message.text)
-        return judged
+        try:
+            judged = parse_json(heard.message.text, topics.JUDGEMENT.name)
+        except BadFile:  # somebody else's, or torn on its way
+            return {}
+        return judged if isinstance(judged, dict) else {}
 
     def _ask(self, topic: Topic, text: str, stamp: int) -> int:
         request = StringStamped(Header(stamp), text)

@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TextIO, cast, final
+from typing import TextIO, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,12 +199,13 @@ class Driver:
                     due += drawn_to_images(due - (begun - image_age))
                 self._sleep_until(due)
         judged = self._client.judgement()
+        progress = judged.get("progress")
         return DrivenEpisode(
             seed,
             steps,
             held,
-            bool(judged["is_success"]) if judged else None,
-            cast(int, judged["progress"]) if judged else None,
+            bool(judged.get("is_success")) if judged else None,
+            progress if isinstance(progress, int) else None,
             ended,
             tuple(latencies),
             tuple(image_latencies),
@@ -230,9 +231,9 @@ class Driver:
             if state in STOPS:
                 return f"{arm.upper()} is {state}: the robot was stopped"
         judged = self._client.judgement()
-        if judged and judged["physics_error"]:
+        if judged.get("physics_error"):
             return "the physics diverged"
-        return "the judge sees success" if judged and judged["is_success"] else ""
+        return "the judge sees success" if judged.get("is_success") else ""
 
     def _sleep_until(self, due: float) -> None:
         """Take what comes until the next control step is due."""

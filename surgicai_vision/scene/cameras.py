@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgicai_vision.core.cameras import CAMERAS
-from surgicai_vision.core.errors import InputError, UnknownName
+from surgicai_vision.core.errors import InputError, UnknownName, shown
 from surgicai_vision.core.names import PSM1, PSM2
 from surgicai_vision.scene.kinematics import INSTRUMENTS
 from surgicai_vision.scene.rotations import matrix_to_quaternion
@@ -60,6 +60,20 @@ class Window(NamedTuple):
     width: int
 
 
+PARALLEL = 1e-6
+"""Sine of the angle below which two vectors have one direction."""
+
+
+def _check_vector(name: str, values: object) -> None:
+    """Refuse what is no vector of three finite numbers."""
+    try:
+        vector = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InputError(f"{name} is {shown(values)}; give three finite numbers.")
+
+
 @dataclass(frozen=True)
 class CameraPose:
     """A camera in the frame of the body that carries it.
@@ -67,9 +81,12 @@ class CameraPose:
     Attributes:
         position: the optical centre [m].
         direction: of view; need not be a unit vector.
-        up: any vector in the upper half of the image.
-        fovy: vertical field of view [rad].
+        up: any vector in the upper half of the image, not along `direction`.
+        fovy: vertical field of view [rad], between 0 and π.
         body: name of the body that carries it; the world by default.
+
+    Raises:
+        InputError: what no camera can have.
     """
 
     position: Vector
@@ -77,6 +94,22 @@ class CameraPose:
     up: Vector
     fovy: float
     body: str = "world"
+
+    def __post_init__(self) -> None:
+        for name in ("position", "direction", "up"):
+            _check_vector(name, getattr(self, name))
+        fovy: object = self.fovy
+        if not isinstance(fovy, int | float | np.floating) or not 0.0 < fovy < math.pi:
+            raise InputError(
+                f"fovy is {shown(fovy)}; give the vertical field of view in radians, between "
+                "0 and pi (math.radians(45) of 45 degrees)."
+            )
+        across = np.linalg.norm(np.cross(self.direction, self.up))
+        if not across > PARALLEL * np.linalg.norm(self.direction) * np.linalg.norm(self.up):
+            raise InputError(
+                f"direction is {self.direction} and up is {self.up}; neither may be zero, and up "
+                "must not lie along direction."
+            )
 
     def add_to(self, spec: mujoco.MjSpec, name: str, instrument: str) -> None:
         """Add the camera to its body; its pose does not depend on `instrument`."""
@@ -254,9 +287,15 @@ def wrist_camera(arm: str, instrument: str) -> CameraPose:
 
 
 def add_cameras(spec: mujoco.MjSpec, names: Iterable[str], instrument: str) -> None:
-    """Add the cameras called `names` to a scene with both arms."""
+    """Add the cameras called `names` to a scene with both arms.
+
+    Raises:
+        InputError: a camera of another distribution that is none, or cannot be added.
+    """
     for name in names:
-        CAMERAS.load(name).add_to(spec, name, instrument)
+        camera = CAMERAS.load(name)
+        with CAMERAS.calling(name):
+            camera.add_to(spec, name, instrument)
 
 
 def intrinsics(

@@ -9,11 +9,12 @@ import atexit
 import importlib
 import os
 import platform
+import warnings
 from collections.abc import Callable
 from types import MappingProxyType
 from typing import Protocol, cast
 
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError
 
 BACKENDS = MappingProxyType(
     {"egl": "mujoco.egl", "osmesa": "mujoco.osmesa", "glfw": "mujoco.glfw", "cgl": "mujoco.cgl"}
@@ -44,17 +45,25 @@ def make_current() -> None:
     global _context
     if _context is None:
         os.environ["LP_NUM_THREADS"] = "0"
+        warnings.filterwarnings("ignore", module="glfw")  # what it warns of ends in `no_image`
         _context = _new_context()
         atexit.register(_close)  # after the backend's own handler, hence run before it
     _context.make_current()
 
 
 def renderer_string() -> str:
-    """Return what draws the images, as OpenGL names it: "llvmpipe (LLVM 15.0.6, 256 bits)"."""
+    """Return what draws the images, as OpenGL names it: "llvmpipe (LLVM 15.0.6, 256 bits)".
+
+    Raises:
+        InputError: no OpenGL on this machine; says what to install.
+    """
     make_current()
     from OpenGL import GL  # only now: the backend's module has told PyOpenGL its platform
 
-    return str(GL.glGetString(GL.GL_RENDERER).decode())
+    name = GL.glGetString(GL.GL_RENDERER)
+    if name is None:  # a backend of windows, where none can be opened
+        raise no_image("it opens no window; is $DISPLAY set?")
+    return str(name.decode())
 
 
 def before_closing(closer: Callable[[], None]) -> None:
@@ -63,19 +72,31 @@ def before_closing(closer: Callable[[], None]) -> None:
 
 
 def _new_context() -> _Context:
-    """Return a context of the backend that $MUJOCO_GL names; on Linux EGL where it names none."""
-    default = {"Linux": "egl", "Darwin": "cgl"}.get(platform.system(), "glfw")
-    backend = os.environ.get("MUJOCO_GL", "").lower().strip() or default
-    module = BACKENDS[check_name("MUJOCO_GL backend", backend, BACKENDS)]
+    """Return a context of the backend that $MUJOCO_GL names."""
+    backend = _backend()
+    if backend not in BACKENDS:
+        raise no_image("$MUJOCO_GL names no backend")
     try:
-        return cast(_Context, importlib.import_module(module).GLContext(64, 64))
+        module = importlib.import_module(BACKENDS[backend])
+        return cast(_Context, module.GLContext(64, 64))
     except (ImportError, AttributeError, OSError, RuntimeError) as error:
-        raise InputError(
-            f"No image can be drawn: '{backend}' gives no OpenGL ({_reason(error)}). On Debian or "
-            "Ubuntu run: sudo apt-get install --yes --no-install-recommends libegl1 libgl1 (Mesa; "
-            "`make setup` does it too). $MUJOCO_GL takes another of: "
-            f"{', '.join(BACKENDS)}. Recording and the expert's evaluations need no images."
-        ) from error
+        raise no_image(_reason(error)) from error
+
+
+def _backend() -> str:
+    """Return what $MUJOCO_GL names; on Linux EGL where it names nothing."""
+    default = {"Linux": "egl", "Darwin": "cgl"}.get(platform.system(), "glfw")
+    return os.environ.get("MUJOCO_GL", "").lower().strip() or default
+
+
+def no_image(reason: str) -> InputError:
+    """Return the error about a machine that draws no image, with the reason and what to do."""
+    return InputError(
+        f"No image can be drawn: '{_backend()}' gives no OpenGL ({reason}). On Debian or "
+        "Ubuntu run: sudo apt-get install --yes --no-install-recommends libegl1 libgl1 (Mesa; "
+        "`make setup` does it too). $MUJOCO_GL takes another of: "
+        f"{', '.join(BACKENDS)}. Recording and the expert's evaluations need no images."
+    )
 
 
 def _reason(error: Exception) -> str:
@@ -94,7 +115,7 @@ def check_opengl() -> None:
     Raises:
         InputError: no OpenGL on this machine; says what to install.
     """
-    make_current()
+    renderer_string()
 
 
 def _close() -> None:

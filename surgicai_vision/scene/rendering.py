@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_name, first_line
 from surgicai_vision.core.names import DEPTH, MODALITIES, PARTS, RGB, SEGMENTATION
 from surgicai_vision.scene import opengl
 from surgicai_vision.scene.cameras import Window, camera_id, crop_of
@@ -198,6 +198,14 @@ class FrameRenderer:
         return view
 
 
+def _context(model: mujoco.MjModel) -> mujoco.MjrContext:
+    """Return MuJoCo's objects on the GPU; refuse where the current context draws nothing."""
+    try:
+        return mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+    except mujoco.FatalError as error:
+        raise opengl.no_image(first_line(error).rstrip(".")) from error
+
+
 class _Target:
     """One model's GPU objects at one size and quality."""
 
@@ -209,7 +217,7 @@ class _Target:
         self.users = 0
         self.lost = False
         with _visual_settings(model, quality, height, width):
-            self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            self.context = _context(model)
         self.context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self.scene = mujoco.MjvScene(model=model, maxgeom=model.ngeom + 100)
         self.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = quality.shadow > 0

@@ -35,6 +35,8 @@ CARD = "checkpoint.json"
 REQUEST = "training.json"
 """Marks the folder of a training that was begun; written first."""
 WEIGHTS = "policy.safetensors"
+PREPROCESSING = ("input_size", "input_range", "mean", "std", "interpolation", "channel_order")
+"""Entries of a card that change what the network sees."""
 
 
 @dataclass(frozen=True)
@@ -198,6 +200,13 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         checkpoint = replace(from_mapping(Checkpoint, plain, str(folder / CARD)), folder=folder)
     except (InputError, TypeError) as error:
         raise BadFile(f"{folder / CARD} is damaged ({error}); train again.") from None
+    encoder = checkpoint.encoder
+    lacking = [key for key in PREPROCESSING if encoder and key not in encoder.card]
+    if lacking:
+        raise BadFile(
+            f"{folder / CARD} is damaged (the card of its encoder has no {', '.join(lacking)}); "
+            "train again."
+        )
     read_tensors(checkpoint)
     return checkpoint
 
@@ -219,10 +228,6 @@ def read_tensors(checkpoint: Checkpoint) -> "dict[str, torch.Tensor]":
         return load(content)
     except SafetensorError as error:
         raise BadFile(f"{path} is not a safetensors file ({error}); train again.") from None
-
-
-PREPROCESSING = ("input_size", "input_range", "mean", "std", "interpolation", "channel_order")
-"""Entries of a card that change what the network sees."""
 
 
 def check_encoder(checkpoint: Checkpoint, encoder: "Encoder | None") -> None:

@@ -8,11 +8,12 @@
     …
     remove_state(out)                  # the checkpoint is written
 
-A state is plain data and tensors; it is read as such and runs no code.
+A state is plain data and tensors; it is read as such and runs no code. Its file begins with the
+sha256 of what follows: one that was damaged, or that something else wrote, is no whole state.
 """
 
+import hashlib
 import io
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,17 @@ from typing import Any
 import torch
 
 from surgicai_vision.core.errors import OutputExists
-from surgicai_vision.core.files import check_output, read_json, write_bytes, write_json
+from surgicai_vision.core.files import (
+    check_output,
+    read_json,
+    remove_partial,
+    write_bytes,
+    write_json,
+)
 from surgicai_vision.training.checkpoint import CARD, REQUEST, Checkpoint, read_checkpoint
 
 STATE = "training_state.pt"
+DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def begin(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
@@ -47,6 +55,8 @@ def begin(out: Path, request: Mapping[str, object]) -> Checkpoint | None:
     if (out / CARD).exists():
         return read_checkpoint(out)
     out.mkdir(parents=True, exist_ok=True)
+    if not (out / REQUEST).exists():
+        remove_partial(out, (REQUEST,))
     write_json(out / REQUEST, request)
     return None
 
@@ -55,15 +65,20 @@ def write_state(out: Path, state: Mapping[str, Any]) -> None:
     """Write what a training goes on from, whole."""
     content = io.BytesIO()
     torch.save(dict(state), content)
-    write_bytes(out / STATE, content.getvalue())
+    written = content.getvalue()
+    write_bytes(out / STATE, hashlib.sha256(written).digest() + written)
 
 
 def read_state(out: Path) -> dict[str, Any] | None:
     """Return what a training goes on from, on the CPU; None where there is no whole state."""
     try:
-        state: dict[str, Any] = torch.load(out / STATE, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
+        content = (out / STATE).read_bytes()
+    except OSError:
         return None
+    digest, written = content[:DIGEST_BYTES], content[DIGEST_BYTES:]
+    if hashlib.sha256(written).digest() != digest:
+        return None
+    state: dict[str, Any] = torch.load(io.BytesIO(written), map_location="cpu", weights_only=True)
     return state
 
 

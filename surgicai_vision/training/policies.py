@@ -6,15 +6,18 @@
 * `load_encoder_of(checkpoint, …)`: the encoder a policy was trained on, verified.
 """
 
+import dataclasses
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
+from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, from_mapping
-from surgicai_vision.core.errors import BadFile, InputError, check_name
+from surgicai_vision.core.errors import BadFile, InputError, check_name, shown
 from surgicai_vision.core.files import configs_folder, read_yaml
-from surgicai_vision.core.plugins import POLICIES_GROUP, Registry
+from surgicai_vision.core.plugins import POLICIES_GROUP, Registry, instance_of, resolve
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training import released
 from surgicai_vision.training.checkpoint import (
@@ -29,6 +32,26 @@ if TYPE_CHECKING:
     from encoders.base import Encoder
     from policies.base import Plugin, Policy, Recipe
 
+_is_plugin = instance_of("policies.base:Plugin")
+_is_policy = instance_of("policies.base:Policy")
+
+
+def _fault(part: object) -> str:
+    """Return what is wrong with what is offered as a policy, "" if nothing."""
+    if fault := _is_plugin(part):
+        return fault
+    plugin = cast("Plugin", part)
+    recipe: object = plugin.recipe
+    if not isinstance(recipe, type) or not dataclasses.is_dataclass(recipe):
+        return f"has a recipe that is {shown(recipe)}; it must be a frozen dataclass"
+    given = {field.name for field in dataclasses.fields(recipe)}
+    asked = {field.name for field in dataclasses.fields(resolve("policies.base:Recipe"))}
+    if missing := sorted(asked - given):
+        return f"has a recipe without {', '.join(missing)}; derive it from policies.base.Recipe"
+    make: object = plugin.make
+    return "" if callable(make) else f"has a make that is {shown(make)}; it must be a function"
+
+
 POLICIES: Final = Registry["Plugin"](
     "policy",
     POLICIES_GROUP,
@@ -42,8 +65,11 @@ POLICIES: Final = Registry["Plugin"](
         "diffusion": "policies.lerobot:DIFFUSION",
         "vqbet": "policies.lerobot:VQBET",
     },
+    _fault,
 )
 """Policy name → its `policies.base.Plugin`."""
+ROWS: Final = 2
+"""Observations of which a policy of another distribution is asked for actions when it is made."""
 UNCHANGED: Final[Mapping[str, JSON]] = MappingProxyType({})
 """No change: a recipe as it stands, a policy that acts by its own."""
 
@@ -53,6 +79,7 @@ def register_policy(name: str, plugin: "Plugin", distribution: str = "") -> None
 
     Raises:
         NameCollision: the name is taken.
+        InputError: this is no plug-in of a policy.
     """
     POLICIES.register(name, plugin, distribution)
 
@@ -63,8 +90,50 @@ def policy_names() -> tuple[str, ...]:
 
 
 def policy_plugin(name: str) -> "Plugin":
-    """Import the policy plug-in of `name`; `UnknownName` lists what exists."""
-    return POLICIES.load(name)
+    """Import the policy plug-in of `name`; `UnknownName` lists what exists.
+
+    What another distribution's makes is looked at: it is a `Policy` and gives an action's values.
+    """
+    plugin = POLICIES.load(name)
+    if POLICIES.is_ours(name):
+        return plugin
+    return dataclasses.replace(plugin, make=functools.partial(_made, name, plugin))
+
+
+def _made(
+    name: str, plugin: "Plugin", recipe: "Recipe", visual: tuple[tuple[int, ...], ...]
+) -> "Policy":
+    """Make a policy of another distribution.
+
+    Raises:
+        InputError: its code fails, or what it makes is no policy of actions.
+    """
+    with POLICIES.calling(name):
+        policy = plugin.make(recipe, visual)
+    if fault := _is_policy(policy):
+        raise POLICIES.refusal(name, f"makes what {fault}")
+    if plugin.target == names.ACTION and policy.history == 1:
+        with POLICIES.calling(name):
+            shape = _answer_shape(policy)
+        if shape != (ROWS, len(names.ACTION_NAMES)):
+            raise POLICIES.refusal(
+                name,
+                f"gives answers of shape {shape} for {ROWS} observations; an action has "
+                f"{len(names.ACTION_NAMES)} values, so it must be "
+                f"({ROWS}, {len(names.ACTION_NAMES)})",
+            )
+    return policy
+
+
+def _answer_shape(policy: "Policy") -> tuple[int, ...]:
+    """Return the shape of a policy's answers to `ROWS` observations; nothing is drawn or kept."""
+    import torch  # the policy has imported it
+
+    was_training = policy.training
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        shape = tuple(policy.eval()(torch.zeros(ROWS, policy.inputs.dim)).shape)
+    policy.train(was_training)
+    return shape
 
 
 def recipe_names() -> tuple[str, ...]:

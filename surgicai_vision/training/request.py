@@ -16,7 +16,7 @@ from policies.base import Plugin, Policy, Recipe
 from surgicai_vision import __version__
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, digest, to_mapping
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, first_line
 from surgicai_vision.dataset.protocol import Dataset
 from surgicai_vision.features.cache import Features
 from surgicai_vision.training.checkpoint import Checkpoint
@@ -61,8 +61,18 @@ class TrainingRequest:
         return {key: column(self.dataset, key) for key in keys}
 
     def untrained(self) -> Policy:
-        """Return the policy as it is before training."""
-        return self.policy.make(self.recipe, tuple(entry.shape for entry in self.features))
+        """Return the policy as it is before training.
+
+        Raises:
+            InputError: the recipe's network is one that this machine has no room for.
+        """
+        try:
+            return self.policy.make(self.recipe, tuple(entry.shape for entry in self.features))
+        except (RuntimeError, MemoryError) as error:  # torch has no error of its own for that
+            raise InputError(
+                f"Policy '{self.policy.name}' cannot be built by its recipe "
+                f"({first_line(error)}); choose smaller layers."
+            ) from None
 
 
 def check_request(request: TrainingRequest) -> None:

@@ -14,7 +14,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.banks import bank_of
 from surgicai_vision.core.cameras import check_view
 from surgicai_vision.core.config import JSON, LATER, TaskConfig, read_changes
-from surgicai_vision.core.errors import InputError, check_name
+from surgicai_vision.core.errors import InputError, check_at_least, check_name
 from surgicai_vision.core.variants import Variants
 
 OWN = "own"
@@ -151,8 +151,11 @@ class RunConfig:
     condition: str = ""
 
     def __post_init__(self) -> None:
+        check_at_least(0, seed=self.seed)
         for view in self.views:
             check_view(view)
+        if len(set(self.views)) != len(self.views):
+            raise InputError(f"Views {', '.join(self.views)} are given; give each view once.")
         if self.encoder is not None and not self.views:
             raise InputError(
                 f"Encoder '{self.encoder}' is given without views; give both or neither."

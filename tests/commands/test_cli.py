@@ -1,6 +1,7 @@
 """The command line: help, wrong input in one line, options from files, exit codes."""
 
 import dataclasses
+import io
 import json
 import os
 import subprocess
@@ -176,6 +177,15 @@ def test_version(capsys):
         (["sweep", "smok"], "Did you mean 'smoke'?"),
         (["scene", "--sheet", "sheet.bmp"], "'.bmp'"),
         (["quickstart", "--config", "missing.yaml"], "missing.yaml"),
+        (["train", "--seed", str(2**63)], f"for --seed. Must be <= {2**63 - 1}"),
+        (["train", "--encoder", "none", "--algo", "td3", "--seed", str(2**32)], "at most"),
+        (["evaluate", "zero", "--out", "x" * 300], "File name too long"),
+        (["sweep", "smoke", "--out", "x" * 300], "File name too long"),
+        (["leaderboard", ".", "--out", "x" * 300 + ".html"], "File name too long"),
+        (["leaderboard", ".", "--out", "/proc/page.html"], "cannot be written"),
+        (["leaderboard", ".", "--out", "page.txt"], "allowed: .html"),
+        (["report", ".", "--out", "/proc/page.html"], "cannot be written"),
+        (["submit", ".", "--name", "a", "--by", "b", "--out", "/proc/row.json"], "--out"),
     ],
 )
 def test_wrong_input_is_one_line(arguments, said, capsys):
@@ -290,6 +300,9 @@ def test_comma_lists_and_repetition_give_the_same(tmp_path):
         ("episodes: -1", InputError, "Must be >= 1"),
         ("depth: 1", InputError, "expected bool"),
         ("folder: [a]", InputError, "expected str"),
+        ('folder: "a\\0b"', InputError, "a character that no name has"),
+        ('folder: "\\ud800"', InputError, "a character that no name has"),
+        (f"noise: {'9' * 400}", InputError, "is too large"),
         ("view: [bakc]", InputError, "Did you mean 'back'"),
         ("view: back,back", InputError, "twice"),
         ("view: {back: 1}", InputError, "expected a list"),
@@ -357,6 +370,28 @@ def test_interruption_says_how_to_continue(monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "open_given", interrupted)
     assert main(["evaluate", "zero"]) == 1
     assert INTERRUPTED in capsys.readouterr().err
+
+
+def test_interruption_while_the_program_starts_is_one_line():
+    code = (
+        "import signal, sys\n"
+        "from surgicai_vision.__main__ import main\n"
+        "class Interrupted:\n"
+        "    def find_spec(name, path, target=None):\n"
+        "        signal.raise_signal(signal.SIGINT)\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "sys.meta_path.insert(0, Interrupted)\n"
+        "main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (1, f"surgicai-vision: {INTERRUPTED}\n")
+
+
+def test_output_holds_what_its_encoding_can(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, "latin-1", write_through=True))
+    assert main(["--help"]) == 0
+    assert b"scene ? env ? demos" in written.getvalue()
 
 
 def test_evaluate_prints_one_json_object_last(capsys, tmp_path):

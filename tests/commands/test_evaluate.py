@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from surgicai_vision.commands import folders
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import files
-from surgicai_vision.evaluation import occlusion, storage
+from surgicai_vision.evaluation import occlusion, run, storage
 from surgicai_vision.evaluation.agents import ZeroAgent
 from surgicai_vision.evaluation.policy_spec import PolicySpec, open_policy
 from surgicai_vision.training.run_config import RunConfig
@@ -46,6 +46,18 @@ def test_evaluations_of_two_envs_are_kept_side_by_side(tmp_path, monkeypatch, ca
         assert main(["evaluate", "zero", *arguments]) == 0
         made.add(json.loads(capsys.readouterr().out.splitlines()[-1])["out"])
     assert len(made) == 2 and len(storage.find_evaluations(tmp_path)) == 2
+
+
+def test_a_second_evaluation_into_a_folder_is_refused_before_its_rollouts(
+    tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    command = ["evaluate", "zero", "--episodes", "1", "--workers", "1", "--out", str(out)]
+    monkeypatch.setattr(run, "evaluate", lambda *_, **__: pytest.fail("it was rolled out"))
+    with storage.alone_in(out):
+        assert main(command) == 2
+        assert "Another run is evaluating into" in capsys.readouterr().err
+    assert not out.exists(), "nothing came into it"
 
 
 @pytest.mark.parametrize("killed_at", [storage.EPISODES, storage.FILMS, storage.MARKER])

@@ -4,12 +4,20 @@ import math
 
 import pytest
 
-from surgicai_vision.core.errors import InputError, check_at_least, check_positive
+from surgicai_vision.core.errors import (
+    InputError,
+    check_at_least,
+    check_at_most,
+    check_finite,
+    check_positive,
+)
 
 
 def test_numbers_at_the_limit_and_no_number_pass():
     check_at_least(1, episodes=1, size=224, epochs=None)
     check_at_least(0, **{"condition dark: episodes": 0})
+    check_at_most(1, share=1.0, episodes=None)
+    check_finite(noise=1e300)
     check_positive(learning_rate=1e-9)
 
 
@@ -19,3 +27,11 @@ def test_the_number_that_is_wrong_is_named(number):
         check_at_least(1, episodes=2, size=number)
     with pytest.raises(InputError, match=f"^size is {number}; it must be above 0.$"):
         check_positive(episodes=2, size=number)
+
+
+@pytest.mark.parametrize("number", [math.inf, math.nan])
+def test_a_number_that_is_not_finite_is_named(number):
+    with pytest.raises(InputError, match=f"^noise is {number}; give a finite number.$"):
+        check_finite(size=1.0, noise=number)
+    with pytest.raises(InputError, match=f"^noise is {number}; it must be at most 9.$"):
+        check_at_most(9, size=1, noise=number)

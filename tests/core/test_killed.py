@@ -128,8 +128,7 @@ def test_nothing_outlives_a_killed_command(tmp_path, given, verb):
         assert not alive, f"{verb} leaves processes after {signal.Signals(number).name}"
         if number == signal.SIGTERM and verb in VERBS:
             assert (
-                said.splitlines()[-1]
-                == "surgicai-vision: interrupted; run the same command again to continue"
+                said.splitlines()[-1] == "surgicai-vision: interrupted; run the same command again"
             )
             assert started.returncode == 128 + signal.SIGTERM
             assert "Traceback" not in said

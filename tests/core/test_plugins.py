@@ -1,11 +1,25 @@
 """Plug-ins: our parts, registered ones, those of other distributions, and collisions of names."""
 
+import dataclasses
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
+from policies.bc import BC
+from surgicai_vision import (
+    register_camera,
+    register_encoder,
+    register_engine,
+    register_policy,
+    register_task,
+)
 from surgicai_vision.core.errors import InputError, UnknownName
-from surgicai_vision.core.plugins import NameCollision, Registry
+from surgicai_vision.core.plugins import NameCollision, Registry, instance_of
+from surgicai_vision.envs.subtask import Subtask
+from surgicai_vision.scene.cameras import CameraPose
 
 GROUP = "surgicai_vision.numbers"
 
@@ -67,7 +81,92 @@ def test_a_collision_names_both_distributions(site: Path) -> None:
             look_up("pi")
 
 
-def test_a_part_that_cannot_be_imported_is_told_with_its_distribution(site: Path) -> None:
-    install(site, "their-numbers", "gone = no_such_module:x")
-    with pytest.raises(InputError, match=r"'gone' of 'their-numbers'.*no_such_module"):
-        numbers().load("gone")
+@pytest.mark.parametrize(
+    ("target", "code", "reason"),
+    [
+        ("no_such_module:x", "", "cannot be imported: No module named 'no_such_module'"),
+        ("their_module:x", "", "cannot be imported: AttributeError: .*'x'"),
+        ("their_module:x", "1 / 0", r"cannot be imported: ZeroDivisionError: .*line 1\)"),
+        ("their_module:x", "x = 'seven'", "is 'seven'; it must be an instance of numbers.Number"),
+    ],
+)
+def test_a_part_that_cannot_be_used_is_told_with_its_distribution(
+    site: Path, monkeypatch: pytest.MonkeyPatch, target: str, code: str, reason: str
+) -> None:
+    monkeypatch.delitem(sys.modules, "their_module", raising=False)
+    (site / "their_module.py").write_text(code)
+    install(site, "their-numbers", f"gone = {target}")
+    registry = Registry[float]("number", GROUP, {}, instance_of("numbers:Number"))
+    with pytest.raises(InputError, match=f"The number 'gone' of 'their-numbers' {reason}"):
+        registry.load("gone")
+
+
+@pytest.mark.parametrize(
+    ("raised", "kind", "message"),
+    [
+        (TypeError("no"), InputError, r"The number 'mine' of 'me' failed: TypeError: no \("),
+        (UnknownName("key", "a", "b"), UnknownName, r"The number 'mine' of 'me': Unknown key 'a'"),
+    ],
+)
+def test_an_error_of_a_parts_code_says_whose_it_is(
+    raised: Exception, kind: type[Exception], message: str
+) -> None:
+    registry = numbers()
+    registry.register("mine", 1.0, distribution="me")
+    with pytest.raises(kind, match=message), registry.calling("mine"):
+        raise raised
+    with pytest.raises(ZeroDivisionError), registry.calling("pi"):
+        raise ZeroDivisionError
+
+
+PARTS: dict[str, tuple[Callable[[], object], str]] = {
+    "encoder": (lambda: register_encoder("x", cast(Any, min)), "must be an instance of encoders"),
+    "policy": (lambda: register_policy("x", cast(Any, min)), "must be an instance of policies"),
+    "recipe": (
+        lambda: register_policy("x", dataclasses.replace(BC, recipe=cast(Any, dict))),
+        "has a recipe that is <class 'dict'>; it must be a frozen dataclass",
+    ),
+    "fields": (
+        lambda: register_policy("x", dataclasses.replace(BC, recipe=cast(Any, Point))),
+        "has a recipe without batch_norm,",
+    ),
+    "task": (lambda: register_task(cast(Any, int)), "must be a subclass of .*Subtask"),
+    "methods": (
+        lambda: register_task(cast(Any, Abstract)),
+        "lacks what .* leaves to it: start, target",
+    ),
+    "tolerances": (lambda: register_task(Intolerant), "lacks tolerances and demands"),
+    "camera": (lambda: register_camera("x", cast(Any, {})), "must be a scene.cameras.CameraPose"),
+    "class": (lambda: register_camera("x", cast(Any, CameraPose)), "is <class"),
+    "engine": (lambda: register_engine(cast(Any, int)), "must be a subclass of .*Engine"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """A dataclass that is no recipe."""
+
+
+class Abstract(Subtask):
+    """A task without its methods."""
+
+    name = "x"
+
+
+class Intolerant(Abstract):
+    """A task without tolerances."""
+
+    arm = "psm1"
+
+    def start(self, *_: object) -> bool:
+        return True
+
+    def target(self, *_: object) -> Any:
+        return None
+
+
+@pytest.mark.parametrize("kind", PARTS)
+def test_what_is_no_part_is_refused_where_it_is_registered(kind: str) -> None:
+    register, message = PARTS[kind]
+    with pytest.raises(InputError, match=rf"^The \w+ '.*' of '.*' .*{message}"):
+        register()

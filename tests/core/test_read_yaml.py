@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from policies.base import Recipe
 from surgicai_vision.commands.sweep import read_experiment
-from surgicai_vision.core.config import read_changes
+from surgicai_vision.core.config import TaskConfig, from_mapping, read_changes
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.core.files import read_yaml
 from surgicai_vision.evaluation.hierarchical_config import read_hierarchical
@@ -23,7 +24,16 @@ WRONG = {
     "bytes": (b"\xff\xfe\x00", "not valid YAML"),
     "no such day": (b"a: 2026-02-31", "refused: ValueError"),
     "deep": (b"a: " + b"[" * 5000, "refused: RecursionError"),
+    "key twice": (b"a: 1\nb: {c: 1, 'c': 2}", "not valid YAML.*'c' stands twice"),
+    "key twice beside a merge": (b"a: &a {c: 1}\nb: {<<: *a, c: 2, c: 3}", "'c' stands twice"),
+    "alias of itself": (b"a: &a [*a]", "a value that it is a part of"),
+    "aliases of aliases": (
+        b"a: &a0 [1, 1]\n"
+        + b"".join(b"b%d: &a%d [*a%d, *a%d]\n" % (n + 1, n + 1, n, n) for n in range(60)),
+        "aliases stand for more than",
+    ),
 }
+BIG = "9" * 400
 READERS: dict[str, Callable[[Path], object]] = {
     "table": read_yaml,
     "recipe": lambda path: load_recipe("bc", path),
@@ -44,6 +54,42 @@ def test_every_reader_refuses_what_is_no_table(read, tmp_path):
     for missing in (tmp_path / "missing.yaml", tmp_path):
         with pytest.raises(BadFile, match=f"Cannot read {missing}"):
             read_yaml(missing)
+
+
+def test_aliases_and_merges_keep_their_meaning(tmp_path):
+    path = tmp_path / "given.yaml"
+    path.write_text("a: &a {b: 1, c: 2}\nd: {<<: *a, c: 3}\ne: {c: 4, <<: [*a, *a]}\nf: [*a, *a]")
+    table = {"b": 1, "c": 2}
+    merged = {"d": {**table, "c": 3}, "e": {**table, "c": 4}}
+    assert read_yaml(path) == {"a": table, **merged, "f": [table, table]}
+
+
+@pytest.mark.parametrize(
+    ("cls", "table"),
+    [
+        (TaskConfig, "randomisation: {light: %s}"),
+        (TaskConfig, "scene: {thread: %s}"),
+        (TaskConfig, "task: %s"),
+        (Recipe, "learning_rate: %s"),
+        (Recipe, "hidden: [%s]"),
+    ],
+)
+def test_a_number_that_no_float_holds_is_refused(cls, table, tmp_path):
+    path = tmp_path / "given.yaml"
+    for number in (BIG, f"-{BIG}", f"0x{'f' * 9000}"):
+        path.write_text(table % number)
+        with pytest.raises(InputError, match="is too large") as caught:
+            from_mapping(cls, read_yaml(path), str(path))
+        assert len(str(caught.value)) < len(str(path)) + 200
+
+
+@pytest.mark.parametrize("value", [[["x"] * 9] * 9, {"a": {"b": list(range(99))}}, "x" * 999])
+def test_a_message_shows_the_beginning_of_a_value(value):
+    for cls, key in ((TaskConfig, "max_steps"), (Recipe, "learning_rate"), (Recipe, "hidden")):
+        table = {key: value if key != "hidden" or isinstance(value, str) else [value]}
+        with pytest.raises(InputError, match="expected") as caught:
+            from_mapping(cls, table)
+        assert len(str(caught.value)) < 250
 
 
 def test_an_empty_file_is_a_table_only_where_it_may_be(tmp_path):

@@ -95,7 +95,19 @@ def test_a_task_under_another_name_is_refused(monkeypatch: pytest.MonkeyPatch) -
         tasks.TASKS.unregister("elsewhere")
 
 
+def test_a_task_that_fails_at_its_start_is_named(
+    hover: type[Subtask], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = envs.make(TaskConfig("hover_near"))
+    for method in ("start", "target"):
+        with monkeypatch.context() as patch:
+            patch.setattr(hover, method, lambda *_: 1 / 0)
+            with pytest.raises(InputError, match=r"The task 'hover_near' of .*ZeroDivisionError"):
+                env.reset(seed=0)
+
+
 def test_public_names_are_there_and_others_are_not() -> None:
+    assert set(surgicai_vision.__all__) <= set(dir(surgicai_vision))
     for name in surgicai_vision.__all__:
         assert callable(getattr(surgicai_vision, name))
     with pytest.raises(AttributeError, match="register_robot"):

@@ -2,8 +2,10 @@
 
 import json
 import re
+import struct
 import subprocess
 import sys
+import zlib
 
 import numpy as np
 import pyarrow as pa
@@ -378,7 +380,12 @@ def test_a_dataset_knows_how_late_its_demonstrators_noticed_a_loss(tmp_path, fak
 
 
 @pytest.mark.parametrize(
-    "spoil", ["no meta", "not json", "key gone", "short data", "data gone", "not parquet"]
+    "spoil",
+    [
+        *("no meta", "not json", "key gone", "short data", "data gone", "not parquet"),
+        *({"image_size": 10**9}, {"image_size": 1e999}, {"fps": 0}, {"variants": 0}),
+    ],
+    ids=str,
 )
 def test_damaged_dataset_is_a_bad_file(tmp_path, fake, demos, spoil):
     render(demos, tmp_path / "set", depth=False)
@@ -391,6 +398,8 @@ def test_damaged_dataset_is_a_bad_file(tmp_path, fake, demos, spoil):
         meta.unlink()
     elif spoil == "not json":
         meta.write_text("{")
+    elif isinstance(spoil, dict):
+        meta.write_text(json.dumps({**content, **spoil}))
     elif spoil == "key gone":
         del content["views"]
         meta.write_text(json.dumps(content))
@@ -504,6 +513,47 @@ def test_a_good_dataset_has_no_problems(tmp_path, fake, demos):
         3,
         summary.digest,
     )
+
+
+def huge_png():
+    """A PNG whose header promises 60000 × 60000 pixels."""
+
+    def chunk(kind, content):
+        checksum = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
+
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    parts = (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"0")), chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def test_an_image_beyond_the_decoders_limit_is_a_bad_file():
+    with pytest.raises(BadFile, match="x: its image cannot be decoded"):
+        codecs.decode(huge_png(), "x")
+
+
+BAD_STATISTICS = {
+    "text": {"mean": "x"},
+    "table": {"std": {"a": 1}},
+    "huge": {"max": [10**400]},
+}
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("info", []),
+        ("info", {"features": None}),
+        ("stats", [1]),
+        *(("stats", {names.ACTION: wrong}) for wrong in BAD_STATISTICS.values()),
+    ],
+)
+def test_check_reports_metadata_of_other_types(tmp_path, fake, demos, file, content):
+    render(demos, tmp_path / "set", depth=False)
+    (tmp_path / f"set/meta/{file}.json").write_text(json.dumps(content))
+    problems = check_dataset(tmp_path / "set").problems
+    assert any(re.search(f"meta/{file}.json", problem) for problem in problems), problems
+    assert not any("\n" in problem for problem in problems)
 
 
 @pytest.mark.parametrize("name", DAMAGE)

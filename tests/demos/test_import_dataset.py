@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,16 @@ from surgicai_vision.envs import poses
 
 AS_RECORDED = BagConfig(drop_pauses=False)
 Rows = dict[str, list[Any]]
+STILL: Rows = {
+    names.STATE: [[0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0, 0.0] * 2] * 60,
+    "instruction.text": ["Needle Throw"] * 60,
+    "phase": [1] * 60,
+    "episode_index": [0] * 60,
+    "frame_index": list(range(60)),
+    "timestamp": [frame / names.FPS for frame in range(60)],
+    "task_index": [0] * 60,
+}
+"""Arms that stand still."""
 
 
 @pytest.fixture(scope="module")
@@ -219,6 +229,59 @@ def test_damaged_numbers_are_refused(
 ) -> None:
     path = write_dataset(tmp_path / "dataset", [spoil(rows_of(demos[0], 0))])
     with pytest.raises(BadFile, match=message):
+        import_dataset(path, task="place", out=tmp_path / "out")
+
+
+def other(key: str, value: object) -> Callable[[Rows], Rows]:
+    """Return what puts the same value into every frame of a column."""
+    return lambda rows: {**rows, key: [value] * len(rows["timestamp"])}
+
+
+def first(key: str, value: object) -> Callable[[Rows], Rows]:
+    """Return what puts a value into the first frame of a column."""
+    return lambda rows: {**rows, key: [value, *rows[key][1:]]}
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        *(other("frame_index", value) for value in ("x", [1], None)),
+        *(other("timestamp", value) for value in ("x", [1.0], None, 1e300)),
+        *(other("episode_index", value) for value in ("x", [1], None, float("nan"), 0.5)),
+        *(first(key, None) for key in ("phase", "frame_index", "timestamp", "episode_index")),
+        lambda rows: {**rows, "frame_index": [list(range(i % 3)) for i in rows["frame_index"]]},
+        other(names.STATE, 3),
+    ],
+)
+def test_columns_of_other_types_are_bad_files(tmp_path: Path, spoil: Any) -> None:
+    path = write_dataset(tmp_path / "dataset", [spoil(STILL)])
+    with pytest.raises(BadFile):
+        import_dataset(path, task="place", out=tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        (names.INFO_FILE, lambda info: json.dumps({**info, "fps": 10**400})),
+        (names.INFO_FILE, lambda info: json.dumps({**info, "total_frames": float("inf")})),
+        (names.INFO_FILE, lambda info: json.dumps({**info, "features": []})),
+        ("meta/tasks.jsonl", lambda _: '{"task_index": 1e400, "task": ""}'),
+        ("meta/tasks.jsonl", lambda _: "[" * 100_000),
+        ("meta/tasks.jsonl", lambda _: "3"),
+    ],
+)
+def test_metadata_of_other_types_is_a_bad_file(tmp_path: Path, file: str, text: Any) -> None:
+    path = write_dataset(tmp_path / "dataset", [STILL], "v2.1")
+    info = json.loads((path / names.INFO_FILE).read_text())
+    (path / file).write_text(text(info))
+    with pytest.raises(BadFile):
+        import_dataset(path, task="place", out=tmp_path / "out")
+
+
+@pytest.mark.parametrize("phase", ["throwing", [1]])
+def test_a_column_phase_of_somebody_elses_says_nothing(tmp_path: Path, phase: object) -> None:
+    path = write_dataset(tmp_path / "dataset", [other("phase", phase)(STILL)])
+    with pytest.raises(InputError, match="Needle Throw"):  # what `instruction.text` says
         import_dataset(path, task="place", out=tmp_path / "out")
 
 

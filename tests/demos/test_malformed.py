@@ -299,6 +299,7 @@ def demonstrations():
         ),
         "other metadata": tensors({**table, "__metadata__": {"demo": "3"}}, body),
         "metadata no json": tensors({**table, "__metadata__": {"demo": "{"}}, body),
+        "metadata nested": tensors({**table, "__metadata__": {"demo": "[" * 100_000}}, body),
         "no action": tensors({key: row for key, row in table.items() if key != "action"}, body),
         "dtype": tensors(tensor(dtype="I64"), body),
         "unknown dtype": tensors(tensor(dtype="PICKLE"), body),

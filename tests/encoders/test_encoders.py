@@ -2,7 +2,8 @@
 
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from photographs import hopper
+from torch import nn
 
 from encoders.base import Encoder, read_torch
 from encoders.card import EncoderCard
@@ -220,6 +222,41 @@ def test_maps_and_tokens_average_to_the_global_feature(pool: str, shape: tuple[i
     whole = load_encoder("random")
     np.testing.assert_allclose(mean, whole(hopper())[0], rtol=0.02, atol=0.05)
     assert whole.fingerprint != encoder.fingerprint
+
+
+class Shrunk(nn.Module):
+    """An encoder without weights."""
+
+    def __init__(self, pool: nn.Module, calls: Callable[[torch.Tensor], torch.Tensor] = torch.relu):
+        super().__init__()
+        self.pool, self.calls = pool, calls
+
+    def extra_repr(self) -> str:
+        """Print a function, whose address is another in every process."""
+        return repr(self.calls)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        """Return (B, 3) means."""
+        return self.pool(images).mean((2, 3))
+
+
+class Doubled(Shrunk):
+    """The same layers, other code."""
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        """Return (B, 3) means, doubled."""
+        return 2 * self.pool(images).mean((2, 3))
+
+
+def test_a_network_that_computes_something_else_has_another_fingerprint() -> None:
+    """Without weights of its own nothing else would tell it from the one before."""
+    card = replace(IMAGENET_LITE_EARLY.card, name="own", architecture="mine", dim=3, input_size=32)
+    other = (card, Shrunk(nn.MaxPool2d(8))), (card, Doubled(nn.AvgPool2d(8)))
+    renamed = replace(card, revision="2"), Shrunk(nn.AvgPool2d(8))
+    one, again = (Encoder(card, Shrunk(nn.AvgPool2d(8), lambda x: x)) for _ in range(2))
+    assert one.fingerprint == again.fingerprint
+    prints = {Encoder(*made).fingerprint for made in (*other, renamed)}
+    assert len(prints | {Encoder(card, Shrunk(nn.AvgPool2d(8))).fingerprint}) == 4
 
 
 def test_early_features_are_the_whole_networks_on_the_way() -> None:

@@ -227,6 +227,9 @@ def test_actions_beyond_the_box_are_clipped():
         ({"scene": {"layouts": "simple"}}, ("layout", "thread", "hole_pair")),
         ({"image_size": 8}, ("16", "960")),
         ({"image_size": (224,)}, ("height, width",)),
+        ({"image_size": "big"}, ("'big'", "height, width")),
+        ({"image_size": 224.0}, ("224.0", "height, width")),
+        ({"cameras": "frnt"}, ("'frnt'", "'front'")),
         ({"render_mode": "ansi"}, ("human", "rgb_array")),
     ],
 )
@@ -235,3 +238,7 @@ def test_wrong_arguments_are_refused_with_what_exists(argument, allowed):
         envs.make_task(**({"task": "grasp"} | argument))
     assert isinstance(refusal.value, InputError)
     assert all(name in str(refusal.value) for name in allowed)
+
+
+def test_one_camera_may_be_named_alone():
+    assert envs.make_task("grasp", cameras="back").view.cameras == ("back",)

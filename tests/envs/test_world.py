@@ -330,15 +330,39 @@ def test_the_expert_sews_in_the_corners(arc, sign):
         assert played(env)["is_success"]
 
 
-def test_given_numbers_are_refused_where_they_are_not_an_axis():
-    env = made()
-    with pytest.raises(InputError, match="phantom_shift has 2 numbers; 1 are given"):
-        env.reset(seed=0, options={"randomisation": {"phantom_shift": [0.001]}})
-    with pytest.raises(InputError, match="phantom_turn"):
-        env.reset(seed=0, options={"randomisation": {"phantom_tun": [0.1]}})
-    plain = envs.make(TaskConfig())
-    with pytest.raises(InputError, match="randomisation"):
-        plain.reset(seed=0, options={"randomisation": {"phantom_turn": [0.1]}})
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"foo": 1}, "Unknown option of reset 'foo'"),
+        ({"randomization": {}}, "Did you mean 'randomisation'"),
+        ({"randomisation": [1.0]}, "must be a dict"),
+        ({"randomisation": {"phantom_shift": [0.001]}}, "phantom_shift has 2 numbers; 1 are given"),
+        ({"randomisation": {"phantom_shift": 0.001}}, "phantom_shift is 0.001; give a list of 2"),
+        ({"randomisation": {"phantom_turn": ["left"]}}, "phantom_turn is .* finite numbers"),
+        ({"randomisation": {"phantom_turn": [math.nan]}}, "phantom_turn is .* finite numbers"),
+        ({"randomisation": {"phantom_turn": [-0.3]}}, "phantom_turn has -0.3; allowed: -0.26"),
+        ({"randomisation": {"phantom_tun": [0.1]}}, "Did you mean 'phantom_turn'"),
+        ({"randomisation": {"pair": [5.0]}}, "pair has 5; allowed: 0 to 4"),
+        ({"randomisation": {"pair": [1.5]}}, "pair is .* whole numbers"),
+        ({"randomisation": {"appearance": [99.0, 0.0]}}, "appearance has 99; allowed: 0 to"),
+    ],
+)
+def test_options_that_no_reset_can_have_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        made().reset(seed=0, options=options)
+
+
+def test_numbers_for_an_env_without_randomisation_are_refused():
+    with pytest.raises(InputError, match=r"this env has no randomisation; .*phantom_turn"):
+        envs.make(TaskConfig()).reset(options={"randomisation": {"phantom_turn": [0.1]}})
+
+
+def test_what_was_reported_may_be_given_again():
+    env = made(latency=2)
+    _, info = env.reset(seed=3)
+    _, again = env.reset(seed=4, options={"randomisation": info["randomisation"]})
+    for axis, numbers in info["randomisation"].items():
+        np.testing.assert_array_equal(again["randomisation"][axis], numbers)
 
 
 def test_the_limits_of_the_axes_are_those_of_the_world():

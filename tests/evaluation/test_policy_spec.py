@@ -36,6 +36,11 @@ def not_an_agent():
     return 3
 
 
+def interrupted():
+    """Raise what is no error of ours."""
+    raise StopIteration
+
+
 def test_a_baseline_acts_in_the_task_and_env_asked_for() -> None:
     spec = open_policy("zero", task="place", env={"max_steps": 7})
     assert (spec.name, spec.config) == ("zero", TaskConfig("place", max_steps=7))
@@ -94,6 +99,9 @@ def test_a_factory_elsewhere_makes_the_agent(tmp_path: Path) -> None:
     [
         (f"{__name__}:not_an_agent", "gives int"),
         (f"{__name__}:nothing", "cannot be imported"),
+        ("json:loads", "fails with TypeError .*takes no arguments"),
+        (f"{__name__}:interrupted", "fails with StopIteration"),
+        ("this_module_fails:make", "fails with ZeroDivisionError"),
         ("no_such_module:make", "cannot be imported"),
         (":x", "names no function"),
         ("json:", "names no function"),
@@ -104,7 +112,11 @@ def test_a_factory_elsewhere_makes_the_agent(tmp_path: Path) -> None:
         ("some/where", "not a checkpoint"),
     ],
 )
-def test_what_is_no_policy_is_refused(given: str, told: str) -> None:
+def test_what_is_no_policy_is_refused(
+    given: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "this_module_fails.py").write_text("1 / 0")
+    monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(InputError, match=told):
         open_policy(given)
 
@@ -140,7 +152,7 @@ def test_a_seed_that_no_row_holds_is_refused_before_any_work(tmp_path, more, cap
     command = [verb, "zero", "--seed", "99999999999999999999", "--out", str(out), *options]
     assert main(command) == 2
     told = capsys.readouterr().err.strip().splitlines()
-    assert len(told) == 1 and "allowed: 0 to 9223372036854775807" in told[0]
+    assert len(told) == 1 and "Must be <= 9223372036854775807" in told[0]
     assert not out.exists()
 
 

@@ -29,6 +29,7 @@ from surgicai_vision.dataset import open_dataset
 from surgicai_vision.dataset.codecs import DEPTH_FAR, DEPTH_NEAR, grey
 from surgicai_vision.dataset.subset import first_episodes, with_frame_stride
 from surgicai_vision.evaluation.storage import FORMAT, GRID_FILE, read_evaluation
+from surgicai_vision.experiments.sweep import driver
 from surgicai_vision.experiments.sweep.driver import run_sweep
 from surgicai_vision.experiments.sweep.estimate import estimate
 from surgicai_vision.experiments.sweep.grid import Grid, parts_of
@@ -382,8 +383,13 @@ def test_a_grid_is_read_with_single_values(tmp_path):
         ("source: dmp", UnknownName),
         ("noise: 2", InputError),
         ("post_success_steps: -1", InputError),
+        ("seed: [-1]", InputError),
+        (f"seed: [{10**400}]", InputError),
+        (f"size: {10**400}", InputError),
+        ("view: [[front, front]]", InputError),
     ):
-        path.write_text(f"task: grasp\nencoder: random\nview: [front]\n{line}\n")
+        view = "" if "view:" in line else "view: [front]\n"
+        path.write_text(f"task: grasp\nencoder: random\n{view}{line}\n")
         with pytest.raises(error):
             read_grid(path)
 
@@ -424,6 +430,18 @@ def test_the_estimate_is_by_what_finished_runs_took(quiet, tmp_path):
     to_do = [done, *(replace(state, state="to do", key=done.key) for state in left)]
     taken = json.loads((out / "runs" / done.key / "result.json").read_text())["seconds"]
     assert estimate(to_do, out, 2) == pytest.approx(3 * sum(taken.values()) / 2)
+
+
+@pytest.mark.parametrize("size", [7, 2000])
+def test_a_size_that_is_not_rendered_is_refused_when_it_is_planned(size, tmp_path):
+    with pytest.raises(InputError, match=f"size is {size}"):
+        plan(replace(BLIND, size=size), tmp_path)
+
+
+def test_a_sweep_that_was_killed_at_its_first_write_is_begun_again(tmp_path):
+    (tmp_path / f"{files.TEMPORARY}0-{GRID_FILE}").write_text("{")
+    driver._open(BLIND, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [GRID_FILE]
 
 
 def test_a_misspelt_recipe_is_refused_before_any_work(tmp_path):
@@ -479,6 +497,6 @@ def test_keys_count_every_module_of_core_that_can_change_a_run():
     )
     loaded = {module for package, module in loaded_parts(modules, 2) if package == "core"}
     harmless = {"errors", "executor", "files", "lazy", "plugins", "processes", "progress"}
-    harmless |= {"banks", "yaml_text"}  # what they give is in the arguments of a job
+    harmless |= {"banks", "untrusted", "yaml_text"}  # what they give is in the arguments of a job
     assert loaded - {path.stem for path in files.SHARED} - harmless == set()
     assert all(path.is_file() for path in files.SHARED)

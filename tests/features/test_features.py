@@ -1,16 +1,23 @@
 """The feature cache: encode once, resume, never meet an old entry."""
 
+import errno
+import json
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from fake_dataset import FakeData
+from tiny_encoder import TINY
 
 from encoders.random_resnet import CARD
 from surgicai_vision.core.errors import BadFile, InputError, SurgicaiError, UnknownName
+from surgicai_vision.core.files import write_json
 from surgicai_vision.features import cache as module
-from surgicai_vision.features.cache import encode, list_cache, prune_cache
+from surgicai_vision.features import encoders
+from surgicai_vision.features.cache import encode, entry_key, list_cache, prune_cache
 
 
 @dataclass
@@ -128,6 +135,52 @@ def test_a_damaged_entry_is_named(tmp_path: Path) -> None:
         encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
 
 
+@pytest.mark.parametrize("killed", [False, True])
+def test_every_block_is_taken_before_a_row_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed: bool
+) -> None:
+    long = FakeDataset(length=20_000)
+    monkeypatch.setattr(module, "CHUNK", 10_000)
+    if killed:  # by a release that took none: the rows are a hole
+        folder = tmp_path / "features" / entry_key(long, "front", FakeEncoder())
+        folder.mkdir(parents=True)
+        np.lib.format.open_memmap(folder / "features.npy", "w+", np.float16, (20_000, 3))
+        write_json(folder / "progress.json", {"rows": 0})
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "no space")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "posix_fallocate", full)
+        encoder = FakeEncoder()
+        with pytest.raises(OSError, match="no space"):
+            encode(long, "front", encoder, tmp_path)
+        assert encoder.seen == 0
+    with pytest.raises(KeyboardInterrupt):
+        encode(long, "front", FakeEncoder(fail_after=0), tmp_path)
+    (path,) = tmp_path.rglob("features.npy")
+    assert path.stat().st_blocks * 512 >= path.stat().st_size > 2 * 3 * 20_000
+    np.testing.assert_array_equal(
+        encode(long, "front", FakeEncoder(), tmp_path).rows[:250], expected(250)
+    )
+
+
+@pytest.mark.parametrize(
+    "manifest", ["{", "{}", "[]", "[" * 100_000, {"shape": "x"}, {"length": 2.0}, {"dim": 10**400}]
+)
+def test_a_damaged_manifest_is_listed_and_pruned(tmp_path: Path, manifest: object) -> None:
+    entry = encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
+    text = json.dumps({**entry.manifest, **manifest}) if isinstance(manifest, dict) else manifest
+    (entry.folder / "manifest.json").write_text(str(text))
+    stray = entry.folder.parent / "notes.txt"
+    stray.write_text("mine")
+    with pytest.raises(BadFile, match="delete that folder"):
+        encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
+    assert [found.manifest for found in list_cache(tmp_path)] == [None]
+    assert len(prune_cache(tmp_path, keep_datasets={"data"})) == 1
+    assert list(entry.folder.parent.iterdir()) == [stray]
+
+
 def test_list_and_prune(tmp_path: Path) -> None:
     assert list_cache(tmp_path / "none") == []
     encode(FakeDataset(), "front", FakeEncoder(), tmp_path)
@@ -148,3 +201,21 @@ def test_cache_root_follows_the_environment(
     assert module.default_cache_root() == tmp_path
     monkeypatch.delenv("SURGICAI_VISION_CACHE")
     assert module.default_cache_root() == Path.home() / ".cache" / "surgicai-vision"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"build": lambda *_: 1 / 0}, "failed: ZeroDivisionError"),
+        ({"build": lambda *_: None}, "builds None; its build must return"),
+        ({"build": lambda card, _: (card, card)}, "builds .*must return its card and a torch"),
+        ({"card": replace(TINY.card, dim=48)}, r"gives features of shape \(8,\), .*dim 48"),
+    ],
+)
+def test_an_encoder_that_cannot_be_used_is_named(change: dict[str, Any], message: str) -> None:
+    encoders.register_encoder("odd", replace(TINY, **change), "theirs")
+    try:
+        with pytest.raises(InputError, match=rf"^The encoder 'odd' of 'theirs' {message}"):
+            encoders.load_encoder("odd", device="cpu")
+    finally:
+        encoders.ENCODERS.unregister("odd")

@@ -154,6 +154,18 @@ def test_what_cannot_be_probed_is_refused() -> None:
         probe(broken, [entry])
 
 
+def test_verb_refuses_what_cannot_be_probed_before_it_encodes(
+    tiny_encoder: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def open_dataset(*_: object) -> Dataset:
+        return Dataset(poses(4, 6), 4)
+
+    monkeypatch.setenv("SURGICAI_VISION_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(folders, "open_dataset", open_dataset)
+    assert main(["probe", "--encoder", "tiny", "--out", str(tmp_path / "out")]) == 2
+    assert not list(tmp_path.iterdir())
+
+
 def test_verb_writes_a_row_a_view_set(
     tiny_encoder: None,
     tmp_path: Path,

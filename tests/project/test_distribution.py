@@ -46,6 +46,26 @@ def test_doctor_finds_a_foreign_owner(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "policies" not in check.detail
 
 
+def test_doctor_names_what_is_broken_and_reports_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    from surgicai_vision.features import encoders
+
+    def card(name: str) -> object:
+        if name == "random":
+            raise RuntimeError("no luck")
+        return real(name)
+
+    real = encoders.encoder_card
+    monkeypatch.setattr(encoders, "encoder_card", card)
+    monkeypatch.setattr(encoders, "encoder_names", lambda: ("random", "random-conv"))
+    monkeypatch.setattr(encoders.ENCODERS, "distribution", lambda _: "theirs")
+    broken, other = doctor_checks.check_encoders(doctor_checks.probe_encoders())
+    assert (broken.status, broken.detail) == ("fail", "no luck")
+    assert broken.advice == "repair or uninstall theirs"
+    assert other.status == "ok"
+    finding: doctor_checks.Finding = {"renderer": "llvmpipe", "error": "x", "is_plugin": True}
+    assert "uninstall" in doctor_checks.check_gl(finding).advice
+
+
 def locked_packages(lock: Path) -> dict[str, str]:
     """Pinned line → the text of its hashes."""
     blocks = re.split(r"(?m)^(?=\S)", lock.read_text())

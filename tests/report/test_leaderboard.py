@@ -1,9 +1,11 @@
 """The leaderboard: a row is taken only where its digest, its starts and its scene check out."""
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from sweep_results import episode
 
 from surgicai_vision.commands.main import main
 from surgicai_vision.core import names
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import TaskConfig, digest
 from surgicai_vision.core.errors import BadFile, InputError
 from surgicai_vision.evaluation.hierarchical_config import MAX_STEPS
 from surgicai_vision.evaluation.robustness.axes import ALL, AXES, shifted_config
@@ -145,6 +147,33 @@ def test_the_page_pairs_rows_and_escapes_what_it_is_given(row: Row, tmp_path: Pa
 def test_what_is_said_of_a_row_is_checked(wrong: dict[str, object]) -> None:
     with pytest.raises(InputError):
         replace(ENTRY, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil"),
+    [
+        ("minutes", lambda table: table["entry"].update(minutes=10**400)),
+        ("endless", lambda table: table["entry"].update(minutes=float("inf"))),
+        ("surrogate", lambda table: table["entry"].update(note="\ud800")),
+        ("key", lambda table: table.update({"\ud800": 1})),
+        ("nested", lambda table: table.update(versions={"a": json.loads("[" * 900 + "]" * 900)})),
+        (os.fsdecode(b"\xff"), lambda table: table["run"].update(upset=True)),
+        (os.fsdecode(b"\xfe"), lambda table: table.clear()),
+    ],
+)
+def test_a_hostile_row_leaves_the_others_their_place(
+    name: str, spoil: Callable[[dict[str, Any]], None], row: Row, tmp_path: Path
+) -> None:
+    write_row(row, tmp_path / "whole.json")
+    table = json.loads((tmp_path / "whole.json").read_text())
+    spoil(table)
+    table["digest"] = digest({**table, "digest": ""})
+    (tmp_path / f"{name}.json").write_text(json.dumps(table))
+    board = write_leaderboard(tmp_path, tmp_path / "page.html")
+    assert board.taken == (row,) and len(board.refused) == 1
+    told = "".join(*board.refused.items())
+    assert told.encode().decode() == told and "\n" not in told
+    assert next(iter(board.refused)) in board.page.read_text(encoding="utf-8")
 
 
 def test_a_large_file_is_not_read(tmp_path: Path) -> None:

@@ -1,11 +1,13 @@
 """The report: every number and image is there, and the page stands alone."""
 
 import contextlib
+import json
 import re
 import shutil
 from html.parser import HTMLParser
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from surgicai_vision import report
@@ -255,6 +257,62 @@ def test_a_broken_off_evaluation_is_no_result(results, painted):
         (folder / "evaluation.json").unlink()
     with pytest.raises(BadFile, match="holds no evaluation"):
         report.write_report(results)
+
+
+def test_a_damaged_neighbour_is_a_bad_file(results, tmp_path):
+    """Each is refused by name; a traceback would be of another type."""
+    marker = next(results.rglob("evaluation.json"))
+    run = {"format": FORMAT}
+    about = {**files.read_json(marker)["about"]}
+    damaged = {
+        "probes.parquet": [b"no parquet"],
+        "probe.json": [b'{"rows": 3}', b"3", b"null", b"[3]", b'[{"view": [1]}]'],
+        "x/failed.json": [{**run}, {**run, "run": 3}],
+        "run.json": [
+            {**run, **wrong}
+            for wrong in (
+                {"skipped": 3},
+                {"skipped": [3]},
+                {"skipped": [{}]},
+                {"problems": 3},
+                {"seconds": {"demos": "x"}},
+                {"headline": "x"},
+                {"provenance": "x"},
+            )
+        ],
+        str(marker.relative_to(results)): [
+            {**files.read_json(marker), "about": {**about, **wrong}}
+            for wrong in ({"checkpoint": "x"}, {"provenance": "x"}, {"high_level": {"a": 1}})
+        ],
+    }
+    for name, contents in damaged.items():
+        path = results / name
+        path.parent.mkdir(exist_ok=True)
+        whole = path.read_bytes() if path.exists() else None
+        for content in contents:
+            path.write_bytes(
+                content if isinstance(content, bytes) else json.dumps(content).encode()
+            )
+            with pytest.raises(BadFile, match=path.name):
+                report.write_report(results)
+        path.unlink() if whole is None else path.write_bytes(whole)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content.replace(b"missed", b"miss\xffd"),
+        lambda content: content.replace(b"missed", b"nissed"),
+        lambda content: content.replace(b"success", b"\xffuccess"),
+        lambda content: content.replace(b"success", b"puccess"),
+    ],
+)
+def test_a_flipped_byte_in_the_episodes_is_a_bad_file(results, change):
+    path = next(results.rglob("episodes.parquet"))
+    pq.write_table(pq.read_table(path), path, compression="none", use_dictionary=False)
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(BadFile, match=r"episodes\.parquet is damaged"):
+        read_rows(path.parent)
 
 
 def test_depth_and_parts_are_coloured():

@@ -391,3 +391,12 @@ def test_a_lag_is_what_is_later_than_usual_whatever_the_senders_clock():
     message = JointState(Header(int((12.0 + offset - 0.303) * SECOND)), (), ())
     assert lag.of(message, 12.0) == pytest.approx(0.3, abs=1e-3)
     assert lag.of(JointState(Header(), (), ()), 12.0) == 0.0
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", "3", "", "[" * 100_000, "{}", '{"progress": "x"}'])
+def test_what_is_no_judgement_is_none(text):
+    transport = MemoryTransport()
+    client = Client(transport, ClientConfig(is_simulated=True))
+    transport.publisher(topics.JUDGEMENT)(StringStamped(Header(START), text))
+    client.update()
+    assert client.judgement() == ({"progress": "x"} if "progress" in text else {})

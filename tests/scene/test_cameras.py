@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -172,3 +173,31 @@ def test_a_registered_camera_is_a_view_until_it_is_taken_out(side: str) -> None:
     for name in ("side view", "side_depth"):
         with pytest.raises(InputError, match=f"called '{name}'"):
             cameras.register_camera(name, stand("back"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fovy": 45}, "fovy is 45; .*in radians"),
+        ({"fovy": 0.0}, "fovy is 0.0; .*in radians"),
+        ({"fovy": "wide"}, "fovy is 'wide'; .*in radians"),
+        ({"up": (0.0, 0.0, 2.0)}, "up must not lie along direction"),
+        ({"direction": (0.0, 0.0, 0.0)}, "neither may be zero"),
+        ({"position": (0.0, math.nan, 1.0)}, "position is .*three finite numbers"),
+        ({"up": (0.0, 1.0)}, "up is .*three finite numbers"),
+    ],
+)
+def test_what_no_camera_can_have_is_refused(change, message):
+    pose = CameraPose((0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 0.8)
+    with pytest.raises(InputError, match=message):
+        replace(pose, **change)
+
+
+def test_a_camera_that_cannot_be_added_is_named() -> None:
+    pose = CameraPose((0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 0.8, "tripod")
+    cameras.register_camera("aside", pose, "theirs")
+    try:
+        with pytest.raises(InputError, match=r"^The camera 'aside' of 'theirs'.*'tripod'"):
+            build_scene()
+    finally:
+        cameras.CAMERAS.unregister("aside")

@@ -38,6 +38,34 @@ def test_work_that_ends_in_images_is_refused_at_once(verb: str, tmp_path: Path) 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("backend", "draws"),
+    [
+        ("bogus", "check_opengl()"),
+        ("glfw", "check_opengl()"),
+        ("glfw", "FrameRenderer(build_scene().model, 64, 64)"),
+    ],
+)
+def test_a_backend_that_draws_nothing_is_refused_in_one_line(backend: str, draws: str) -> None:
+    program = (
+        "from surgicai_vision.core.errors import InputError\n"
+        "from surgicai_vision.scene import build_scene\n"
+        "from surgicai_vision.scene.opengl import check_opengl\n"
+        "from surgicai_vision.scene.rendering import FrameRenderer\n"
+        f"try: {draws}\nexcept InputError as error: print(error)"
+    )
+    ours = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**ours, "DISPLAY": "", "WAYLAND_DISPLAY": "", "MUJOCO_GL": backend},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.startswith(f"No image can be drawn: '{backend}'"), done.stderr
+    assert done.stderr == ""
+
+
 @pytest.mark.skipif(bool(ctypes.util.find_library("OSMesa")), reason="OSMesa is on this machine")
 def test_what_draws_nothing_runs_without_the_library_that_is_named(tmp_path: Path) -> None:
     options = ("--task", "handoff", "--episodes", "1", "--out", "demos")

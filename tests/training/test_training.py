@@ -1,6 +1,8 @@
 """Training: from the cache to a checkpoint that is read back or refused."""
 
+import io
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,23 +12,26 @@ import pytest
 import torch
 from fake_dataset import DIM, FakeDataset, features_of
 
-from policies.base import Plugin, Recipe
+from policies.base import Plugin, Policy, Recipe
 from policies.bc import BC
 from policies.chunks import ChunkRecipe
 from policies.layers import MapConvolutions, SpatialSoftmax
 from surgicai_vision.core import names
 from surgicai_vision.core.config import RandomisationConfig, TaskConfig
 from surgicai_vision.core.errors import BadFile, InputError, OutputExists, UnknownName
+from surgicai_vision.core.files import TEMPORARY
 from surgicai_vision.training import policies
 from surgicai_vision.training.checkpoint import (
     CARD,
+    REQUEST,
     WEIGHTS,
     check_encoder,
     check_task,
     read_checkpoint,
+    write_checkpoint,
 )
 from surgicai_vision.training.data import split
-from surgicai_vision.training.folder import read_state, write_state
+from surgicai_vision.training.folder import STATE, read_state, write_state
 from surgicai_vision.training.policies import (
     load_policy,
     load_recipe,
@@ -73,6 +78,36 @@ def test_recipes_refuse_unknown_keys_and_values(tmp_path: Path) -> None:
     (tmp_path / "bad.yaml").write_text("[")
     with pytest.raises(BadFile):
         load_recipe("bc", tmp_path / "bad.yaml")
+
+
+@pytest.mark.parametrize(
+    ("policy", "change", "told"),
+    [
+        ("bc", {"proprioception_noise": math.inf}, "proprioception_noise is inf"),
+        ("bc", {"learning_rate": math.inf}, "learning_rate is inf"),
+        ("bc", {"weight_decay": math.nan}, "weight_decay is nan"),
+        ("bc", {"hidden": [8, 99_999_999_999]}, "at most 65536"),
+        ("bc", {"epochs": 10**400}, "is too large"),
+        ("bc", {"epochs": 10**9}, "at most 1000000"),
+        ("bc", {"map_shift": 10**9}, "at most 1024"),
+        ("act", {"minutes": math.inf}, "minutes is inf"),
+        ("act", {"chunk": 10**9}, "at most 1000"),
+    ],
+)
+def test_recipes_refuse_numbers_that_no_training_has(
+    policy: str, change: dict[str, Any], told: str
+) -> None:
+    with pytest.raises(InputError, match=told):
+        load_recipe(policy, "paper" if policy == "bc" else policy, change)
+
+
+def test_a_network_that_memory_has_no_room_for_is_refused(tmp_path: Path) -> None:
+    def full(recipe: Recipe, visual: object) -> Policy:
+        raise RuntimeError("[enforce fail] not enough memory\nat …")
+
+    with pytest.raises(InputError, match=r"cannot be built .*not enough memory\)"):
+        train(FakeDataset(), [], replace(BC, make=full), QUICK, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_network_is_three_layers_each_preceded_by_batch_norm() -> None:
@@ -187,6 +222,35 @@ def test_a_training_that_was_begun_on_a_gpu_goes_on_without_one(tmp_path: Path) 
     write_state(tmp_path, {**state, "random": {**state["random"], "cuda": torch.zeros(16)}})
     checkpoint = train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path)
     assert checkpoint.epoch == QUICK.epochs
+
+
+def test_a_damaged_state_is_begun_again(tmp_path: Path) -> None:
+    write_state(tmp_path, {"policy": {"weight": torch.arange(6.0)}, "losses": [0.5]})
+    whole = (tmp_path / STATE).read_bytes()
+    assert read_state(tmp_path) is not None
+    other = io.BytesIO()
+    torch.save([1, 2, 3], other)
+    flipped = [
+        whole[:at] + bytes([whole[at] ^ 1 << at % 8]) + whole[at + 1 :]
+        for at in range(0, len(whole), 7)
+    ]
+    for content in (b"", whole[:9], whole[:-1], whole + b"x", other.getvalue(), *flipped):
+        (tmp_path / STATE).write_bytes(content)
+        assert read_state(tmp_path) is None
+
+    dataset = FakeDataset()
+    train(dataset, [], BC, QUICK, out=tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, [], BC, QUICK, out=tmp_path / "broken", progress=stop)
+    (tmp_path / "broken" / STATE).write_bytes(other.getvalue())
+    train(dataset, [], BC, QUICK, out=tmp_path / "broken")
+    assert tensors_of(tmp_path / "whole") == tensors_of(tmp_path / "broken")
+
+
+def test_a_training_that_was_killed_at_its_first_write_is_begun_again(tmp_path: Path) -> None:
+    (tmp_path / f"{TEMPORARY}0-{REQUEST}").write_text("{")
+    train(FakeDataset(), [], BC, QUICK, out=tmp_path)
+    assert not list(tmp_path.glob(f"{TEMPORARY}*"))
 
 
 def test_training_again_does_nothing_and_another_request_is_refused(tmp_path: Path) -> None:
@@ -347,6 +411,12 @@ def test_tampered_checkpoints_are_refused(tmp_path: Path) -> None:
         load_policy(folder)
     with pytest.raises(BadFile, match="not a checkpoint"):
         load_policy(tmp_path)
+    seeing = train(dataset, [features_of(dataset)], BC, QUICK, out=tmp_path / "seeing")
+    assert seeing.encoder is not None
+    card_alone = replace(seeing, encoder=replace(seeing.encoder, card={"mean": 0}))
+    write_checkpoint(tmp_path / "seeing", card_alone, load_policy(tmp_path / "seeing").state_dict())
+    with pytest.raises(BadFile, match="card of its encoder has no input_size, input_range, std, "):
+        read_checkpoint(tmp_path / "seeing")
 
 
 def test_another_encoder_or_task_is_refused(tmp_path: Path) -> None:
@@ -356,3 +426,28 @@ def test_another_encoder_or_task_is_refused(tmp_path: Path) -> None:
         check_encoder(checkpoint, None)
     with pytest.raises(InputError, match="not 'place'"):
         check_task(checkpoint, "place")
+
+
+def odd_policy(recipe: Recipe, visual: tuple[tuple[int, ...], ...]) -> Policy:
+    """A policy that gives two values too few."""
+    policy = BC.make(recipe, visual)
+    forward = policy.forward
+    policy.forward = lambda observed: forward(observed)[:, :5]  # type: ignore[method-assign]
+    return policy
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda *_: 1 / 0, "failed: ZeroDivisionError"),
+        (lambda *_: None, "makes what is None; it must be an instance"),
+        (odd_policy, r"answers of shape \(2, 5\).*must be \(2, 7\)"),
+    ],
+)
+def test_a_policy_that_cannot_be_used_is_named(make: Any, message: str) -> None:
+    policies.register_policy("odd", replace(BC, make=make), "theirs")
+    try:
+        with pytest.raises(InputError, match=rf"^The policy 'odd' of 'theirs' .*{message}"):
+            policies.policy_plugin("odd").make(QUICK, ())
+    finally:
+        policies.POLICIES.unregister("odd")

@@ -39,8 +39,8 @@ class Options:
     workers: Annotated[int, COUNT] = folders.CORES
     out: Annotated[
         Path | None,
-        Parameter(metavar="DIR2"),
-        default_text("DIR with the views and the codec in its name"),
+        Parameter(metavar="DIR"),
+        default_text("DATASET with the views and the codec in its name"),
     ] = None
 
 

@@ -11,7 +11,7 @@ from surgicai_vision.commands.console import Console
 from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
-    NOT_NEGATIVE,
+    SEED,
     UNIQUE,
     AcceptLicence,
     EnvFields,
@@ -54,7 +54,7 @@ class Options:
     confidence: Annotated[tuple[float, ...], UNIQUE, Parameter(metavar="P[,P]")] = CONFIDENCES
     patience: Annotated[tuple[int, ...], UNIQUE, Parameter(metavar="N[,N]")] = PATIENCES
     episodes: Annotated[int, COUNT] = 20
-    seed: Annotated[int, NOT_NEGATIVE] = names.VALIDATION_SEED
+    seed: Annotated[int, SEED] = names.VALIDATION_SEED
     workers: EvaluationWorkers = None
     weights: WeightFiles = ()
     accept_licence: AcceptLicence = False

@@ -15,7 +15,7 @@ from surgicai_vision.commands.options import (
     COUNT,
     DIRECTORY,
     FILE_ONLY,
-    NOT_NEGATIVE,
+    SEED,
     AcceptLicence,
     EnvFields,
     PolicyTask,
@@ -95,7 +95,7 @@ class Options:
         default_text("key, at a served simulation none"),
     ] = None
     episodes: Annotated[int, COUNT] = 1
-    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    seed: Annotated[int, SEED] = names.TEST_SEED
     seconds: Annotated[
         float | None, Parameter(validator=validators.Number(gt=0)), default_text("the task's own")
     ] = None

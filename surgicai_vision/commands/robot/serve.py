@@ -14,7 +14,7 @@ from surgicai_vision.commands.options import (
     DIRECTORY,
     FILE_ONLY,
     IMAGE_SIZE,
-    NOT_NEGATIVE,
+    SEED,
     TASK,
     VIEWS,
     EnvFields,
@@ -69,7 +69,7 @@ class Options:
     """
 
     task: Annotated[str, TASK] = names.SUTURE
-    seed: Annotated[int, NOT_NEGATIVE] = names.TEST_SEED
+    seed: Annotated[int, SEED] = names.TEST_SEED
     clock: Annotated[str, Parameter(choices=("real", "stepped"))] = "real"
     view: Annotated[tuple[str, ...], VIEWS] = ()
     size: Annotated[int, IMAGE_SIZE] = 224

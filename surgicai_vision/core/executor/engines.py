@@ -8,9 +8,9 @@ import dataclasses
 from typing import Final
 
 from surgicai_vision.core.config import from_mapping, read_changes
-from surgicai_vision.core.errors import InputError
+from surgicai_vision.core.errors import InputError, shown
 from surgicai_vision.core.executor.engine import Engine
-from surgicai_vision.core.plugins import ENGINES_GROUP, Registry
+from surgicai_vision.core.plugins import ENGINES_GROUP, Registry, subclass_of
 
 ENGINES: Final = Registry[type[Engine]](
     "executor",
@@ -20,6 +20,7 @@ ENGINES: Final = Registry[type[Engine]](
         "ray": "surgicai_vision.core.executor.ray:RayEngine",
         "slurm": "surgicai_vision.core.executor.slurm:SlurmEngine",
     },
+    subclass_of("surgicai_vision.core.executor.engine:Engine"),
 )
 
 
@@ -28,8 +29,11 @@ def register_engine(engine: type[Engine]) -> None:
 
     Raises:
         NameCollision: the name is taken.
+        InputError: this is no engine.
     """
-    ENGINES.register(engine.name, engine, engine.__module__.partition(".")[0])
+    name = getattr(engine, "name", shown(engine))
+    owner = getattr(engine, "__module__", "").partition(".")[0]
+    ENGINES.register(name, engine, owner or "register_engine()")
 
 
 def open_engine(text: str) -> Engine:

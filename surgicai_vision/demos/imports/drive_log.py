@@ -14,7 +14,6 @@ Nothing in the file runs, and nothing but numbers is read from it.
 import dataclasses
 import hashlib
 import itertools
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
@@ -25,13 +24,17 @@ from numpy.typing import NDArray
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, to_mapping
 from surgicai_vision.core.errors import BadFile, first_line
-from surgicai_vision.core.files import check_output
 from surgicai_vision.core.progress import Progress, silent
+from surgicai_vision.core.untrusted import checked, parse_json
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
-from surgicai_vision.demos.imports.rosbag.importer import BagSummary, base_config, write_tracks
+from surgicai_vision.demos.imports.rosbag.importer import (
+    BagSummary,
+    base_config,
+    check_folders,
+    write_tracks,
+)
 from surgicai_vision.demos.imports.rosbag.resample import Arrays
 from surgicai_vision.demos.imports.rosbag.tracks import SegmentTrack, tracks_of
-from surgicai_vision.demos.store import MARKER
 from surgicai_vision.scene.rotations import matrix_to_quaternion_flat, rpy_to_matrix
 
 DEMONSTRATOR = "drive"
@@ -90,8 +93,7 @@ def import_drive_log(
         OutputExists: `out` holds something else.
     """
     base = base_config(task, env)
-    if task:
-        check_output(out, may_resume=MARKER)
+    check_folders(out, task)
     config = dataclasses.replace(config, jaw_scale=1.0)
     steps = list(_steps(path))
     tracks: list[SegmentTrack] = []
@@ -121,7 +123,9 @@ def _steps(path: Path) -> Iterator[_Step]:
     run = 0
     for number, line in enumerate(lines, 1):
         try:
-            row = cast(dict[str, JSON], json.loads(line))
+            row = checked(
+                parse_json(line, f"{path}, line {number}"), dict, f"{path}, line {number}"
+            )
             if "policy" in row:  # the first line of a run says what it is about
                 run += 1
                 continue

@@ -13,8 +13,9 @@ subtasks, freed of pauses and replayed. Poses and labels are taken; images are t
 * Frame: the endoscope's view, `ECM_view`, as a dVRK reports `measured_cp`. Where theirs stands
   otherwise than ours (`envs.absolute.T_WORLD_VIEW`), give its pose in each arm's base as
   `bag: {frames: {psm1: […], psm2: […]}}`; the jaw is the angle between the fingers.
-* Labels: our column `phase`, else `instruction.text` frame by frame, else the task. Our own
-  sentences are known; `bag: {labels: {"needle pickup": grasp}}` says what others mean.
+* Labels: our column `phase`, of whole numbers, else `instruction.text` frame by frame, else the
+  task. Our own sentences are known; `bag: {labels: {"needle pickup": grasp}}` says what others
+  mean.
 * Needle: our column `needle_pose`; without it the needle is where the task's definition puts it, as
   in a bag without one.
 
@@ -23,7 +24,6 @@ Nothing in the files runs. Columns that are not named here are never read, so ne
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -35,14 +35,19 @@ from numpy.typing import NDArray
 
 from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, to_mapping
-from surgicai_vision.core.errors import BadFile, InputError, first_line
-from surgicai_vision.core.files import check_output, read_json
+from surgicai_vision.core.errors import BadFile, InputError, first_line, shown
+from surgicai_vision.core.files import read_json
 from surgicai_vision.core.progress import Progress, silent
 from surgicai_vision.core.runs import runs_of
+from surgicai_vision.core.untrusted import checked, finite_number, parse_json
 from surgicai_vision.demos.imports.rosbag.config import BagConfig
-from surgicai_vision.demos.imports.rosbag.importer import BagSummary, base_config, write_tracks
+from surgicai_vision.demos.imports.rosbag.importer import (
+    BagSummary,
+    base_config,
+    check_folders,
+    write_tracks,
+)
 from surgicai_vision.demos.imports.rosbag.tracks import SegmentTrack, tracks_of
-from surgicai_vision.demos.store import MARKER
 from surgicai_vision.envs import poses
 from surgicai_vision.envs.absolute import ARM_SIZE, SIZE, T_BASE_VIEW
 from surgicai_vision.scene.rotations import matrix_to_quaternion_flat
@@ -62,6 +67,14 @@ JITTER_S = 1e-3
 """Times this near to the frame rate's are taken as those: they are stored as float32 [s]."""
 MAX_FRAMES = 5_000_000
 """Frames of a dataset, at most."""
+FPS = (0.1, 10_000.0)
+"""Fewest and most frames a second."""
+MAX_SECONDS = 1e7
+"""Largest time of a frame [s]: four months."""
+LARGEST_WHOLE = 2**53
+"""Whole numbers up to this are exact as float64."""
+UNREADABLE = (OSError, KeyError, TypeError, ValueError, OverflowError, pa.ArrowException)
+"""What pyarrow raises at a damaged file, and Python at values of another type in it."""
 ELEMENTS: Sequence[tuple[str, ...]] = (
     (
         *(f"_pose.position.{axis}" for axis in "xyz"),
@@ -108,8 +121,7 @@ def import_dataset(
         OutputExists: `out` holds something else.
     """
     base = base_config(task, env)
-    if task:
-        check_output(out, may_resume=MARKER)
+    check_folders(out, task)
     config = _in_view(config)
     report = progress or silent
     files = DatasetFiles(path)
@@ -166,20 +178,16 @@ class DatasetFiles:
 
     def __init__(self, path: Path):
         self._path = path
-        info = read_json(path / names.INFO_FILE)
-        try:
-            version = str(info["codebase_version"])
-            self._fps = float(info["fps"])
-            features = dict(info["features"])
-            self.frames = int(info.get("total_frames", 0))
-        except (KeyError, TypeError, ValueError) as error:
+        file = path / names.INFO_FILE
+        info = checked(read_json(file), dict, str(file))
+        version = info.get("codebase_version")
+        self._fps = finite_number(info.get("fps"), f"{file}: fps")
+        features = checked(info.get("features"), dict, f"{file}: features")
+        self.frames = int(finite_number(info.get("total_frames", 0), f"{file}: total_frames"))
+        if version not in VERSIONS or not FPS[0] <= self._fps <= FPS[1]:
             raise BadFile(
-                f"{path / names.INFO_FILE} is not that of a LeRobot dataset ({first_line(error)})."
-            ) from None
-        if version not in VERSIONS or not self._fps > 0:
-            raise BadFile(
-                f"{path / names.INFO_FILE}: version {version!r}, {self._fps:g} fps; read are "
-                f"{', '.join(VERSIONS)}."
+                f"{file}: version {shown(version)}, {self._fps:g} fps; read are "
+                f"{', '.join(VERSIONS)} of {FPS[0]:g} to {FPS[1]:g} fps."
             )
         self._index = _elements(path, features)
         self._columns = [names.STATE, "episode_index", "frame_index", "timestamp"]
@@ -194,16 +202,16 @@ class DatasetFiles:
         for file in sorted(self._path.glob(DATA)):
             try:
                 table = pq.read_table(file, columns=self._columns)
-                numbers = table.column("episode_index").to_numpy()
-            except (OSError, KeyError, pa.ArrowException) as error:
+            except UNREADABLE as error:
                 raise BadFile(f"{file} cannot be read ({first_line(error)}).") from None
+            numbers = _whole(table, "episode_index", str(file))
             total += len(table)
             if total > MAX_FRAMES:
                 raise BadFile(f"{self._path} holds over {MAX_FRAMES} frames.")
             for start, stop in runs_of(numbers):
                 part = table.slice(start, stop - start)
                 if waiting is not None and _number(waiting) == _number(part):
-                    waiting = pa.concat_tables([waiting, part])
+                    waiting = _joined(waiting, part, str(file))
                     continue
                 if waiting is not None:
                     yield _number(waiting), self._arrays(waiting, tasks)
@@ -219,12 +227,13 @@ class DatasetFiles:
             if v3.is_file():
                 rows = pq.read_table(v3).to_pylist()
             elif v2.is_file():
-                rows = [json.loads(line) for line in v2.read_text("utf-8").splitlines() if line]
+                lines = v2.read_text("utf-8").splitlines()
+                rows = [parse_json(line, str(v2)) for line in lines if line]
             else:
                 return {}
             texts = [str(row.get("task", row.get("__index_level_0__", ""))) for row in rows]
             return {int(row["task_index"]): text for row, text in zip(rows, texts, strict=True)}
-        except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+        except (AttributeError, *UNREADABLE) as error:
             raise BadFile(
                 f"{self._path}: its tasks cannot be read ({first_line(error)})."
             ) from None
@@ -237,7 +246,7 @@ class DatasetFiles:
             raise BadFile(
                 f"{where}: {names.STATE} has {state.shape[1]} elements, fewer than named."
             )
-        time = self._times(table)
+        time = self._times(table, where)
         arrays: Arrays = {"topics": np.array([names.STATE], dtype=str)}
 
         def add(role: str, values: NDArray[np.generic], kind: str, frame: str = "") -> None:
@@ -255,15 +264,17 @@ class DatasetFiles:
             needle = _matrix(table, names.NEEDLE_POSE, where)
             if needle.shape[1] == 7:
                 add("needle", _pose(needle, where, "the needle"), POSE, "world")
-        labels = _labels(table, tasks)
+        labels = _labels(table, tasks, where)
         if labels is not None:
             add("label", labels, "std_msgs/String")
         return arrays
 
-    def _times(self, table: pa.Table) -> NDArray[np.int64]:
+    def _times(self, table: pa.Table, where: str) -> NDArray[np.int64]:
         """Return each frame's time [ns], the frame rate's where they are as even as float32."""
-        even = table.column("frame_index").to_numpy().astype(np.float64) / self._fps
-        stored = table.column("timestamp").to_numpy().astype(np.float64)
+        even = _whole(table, "frame_index", where) / self._fps
+        stored = _numbers(table, "timestamp", where)
+        if max(np.abs(even).max(), np.abs(stored).max()) > MAX_SECONDS:
+            raise BadFile(f"{where}: a frame's time is beyond {MAX_SECONDS:g} s.")
         is_even = bool((np.abs(stored - stored[0] - (even - even[0])) < JITTER_S).all())
         seconds = even - even[0] if is_even else stored - stored[0]
         times: NDArray[np.int64] = np.round(seconds * 1e9).astype(np.int64)
@@ -272,6 +283,45 @@ class DatasetFiles:
 
 def _number(table: pa.Table) -> int:
     return int(table.column("episode_index")[0].as_py())
+
+
+def _joined(first: pa.Table, second: pa.Table, where: str) -> pa.Table:
+    """Return the frames of both; those of one episode may stand in two files."""
+    try:
+        return pa.concat_tables([first, second])
+    except pa.ArrowException as error:
+        raise BadFile(
+            f"{where}: its columns are not those of the file before it ({first_line(error)})."
+        ) from None
+
+
+def _numbers(table: pa.Table, key: str, where: str) -> NDArray[np.float64]:
+    """Return a column of a number a frame as (N,), all of them finite.
+
+    Raises:
+        BadFile: there is no such column, or it holds anything else.
+    """
+    if key not in table.column_names:
+        raise BadFile(f"{where}: it has no column {key}.")
+    column = table.column(key)
+    kind = column.type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)) or column.null_count:
+        raise BadFile(
+            f"{where}: {key} must hold a number in every frame; it is of type {shown(str(kind))} "
+            f"and has {column.null_count} empty frames."
+        )
+    values: NDArray[np.float64] = column.to_numpy().astype(np.float64)
+    if not np.isfinite(values).all():
+        raise BadFile(f"{where}: {key} must hold finite numbers.")
+    return values
+
+
+def _whole(table: pa.Table, key: str, where: str) -> NDArray[np.int64]:
+    """Return a column of a whole number a frame as (N,); `BadFile` as `_numbers`."""
+    values = _numbers(table, key, where)
+    if (np.abs(values) > LARGEST_WHOLE).any() or (values != np.floor(values)).any():
+        raise BadFile(f"{where}: {key} must hold whole numbers of up to 15 digits.")
+    return values.astype(np.int64)
 
 
 def _elements(path: Path, features: Mapping[str, JSON]) -> dict[str, list[int]]:
@@ -302,7 +352,7 @@ def _matrix(table: pa.Table, key: str, where: str) -> NDArray[np.float64]:
     """Return a column of lists as (N, n)."""
     try:
         values = np.array(table.column(key).to_pylist(), dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except UNREADABLE as error:
         raise BadFile(f"{where}: {key} holds no numbers ({first_line(error)}).") from None
     if values.ndim != 2 or not np.isfinite(values).all():
         raise BadFile(f"{where}: {key} must hold rows of finite numbers.")
@@ -317,15 +367,20 @@ def _pose(values: NDArray[np.float64], where: str, what: str) -> NDArray[np.floa
     return np.hstack([values[:, :3], values[:, 3:] / length])
 
 
-def _labels(table: pa.Table, tasks: Mapping[int, str]) -> NDArray[np.str_] | None:
-    """Return what each frame shows: its phase, its instruction or its task; None of nothing."""
+def _labels(table: pa.Table, tasks: Mapping[int, str], where: str) -> NDArray[np.str_] | None:
+    """Return what each frame shows: its phase, its instruction or its task; None of nothing.
+
+    A column `phase` of another type than ours is somebody else's and says nothing to us.
+    """
     there = table.column_names
-    if names.PHASE in there:
-        phases = table.column(names.PHASE).to_numpy()
+    if names.PHASE in there and pa.types.is_integer(table.schema.field(names.PHASE).type):
+        phases = _whole(table, names.PHASE, where)
         if (phases >= 0).all():
             return np.array(phases, dtype=str)
     if TEXT in there:
-        return np.array(table.column(TEXT).to_pylist(), dtype=str)
+        texts = [str(text) for text in table.column(TEXT).to_pylist()]
+        return np.array(texts, dtype=str)
     if "task_index" in there and tasks:
-        return np.array([tasks.get(int(row), "") for row in table.column("task_index").to_numpy()])
+        numbers = _whole(table, "task_index", where).tolist()
+        return np.array([tasks.get(number, "") for number in numbers])
     return None

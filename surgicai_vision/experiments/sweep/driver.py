@@ -16,7 +16,6 @@ from surgicai_vision.core.config import digest, to_mapping
 from surgicai_vision.core.errors import InputError, OutputExists, SurgicaiError
 from surgicai_vision.core.executor import Job, RunContext, claim
 from surgicai_vision.core.executor import run as run_jobs
-from surgicai_vision.envs.upset import check_upset_task
 from surgicai_vision.evaluation.provenance import command_line, provenance
 from surgicai_vision.evaluation.storage import (
     FAILED_FILE,
@@ -29,7 +28,7 @@ from surgicai_vision.evaluation.storage import (
     read_rows,
 )
 from surgicai_vision.experiments.dagger import learner_of
-from surgicai_vision.experiments.prepare import check_dataset, make_dataset
+from surgicai_vision.experiments.prepare import make_dataset
 from surgicai_vision.experiments.sweep.experiment import Experiment, Training
 from surgicai_vision.experiments.sweep.plan import (
     CACHED,
@@ -88,11 +87,6 @@ def run_sweep(
         UnknownName: a recipe that does not exist; before any work.
     """
     plan(experiment, out, choice)  # refuses what cannot be done before anything is written
-    for dataset in experiment.datasets.values():
-        check_dataset(dataset)
-    for run in experiment.runs:
-        if run.upset:
-            check_upset_task(run.task)
     _open(experiment, out)
     with claim(out / WORK):
         _extend(experiment, out)
@@ -145,6 +139,7 @@ def _open(experiment: Experiment, out: Path) -> None:
         raise InputError(
             f"--out {out} cannot be written: {error.strerror}; choose another folder."
         ) from None
+    files.remove_partial(out, (GRID_FILE,))
     _store_table(experiment, out)
 
 

@@ -12,8 +12,10 @@ from surgicai_vision.core.errors import BadFile, InputError, MissingWeights
 from surgicai_vision.core.executor import Job, register_job
 from surgicai_vision.core.files import read_json
 from surgicai_vision.demos.store import demos_digest, list_demos
+from surgicai_vision.envs.upset import check_upset_task
 from surgicai_vision.evaluation.storage import GRID_FILE, RESULT_FILE, read_versioned
 from surgicai_vision.experiments.plan_config import plan_of
+from surgicai_vision.experiments.prepare import check_dataset
 from surgicai_vision.experiments.sweep.experiment import Experiment, Training
 from surgicai_vision.experiments.sweep.grid import Grid
 from surgicai_vision.experiments.sweep.lerobot import OPTIONS
@@ -140,11 +142,17 @@ def plan(experiment: Experiment, out: Path, choice: Choice = EVERYTHING) -> list
 
     Raises:
         UnknownName: a recipe, or a change of one, that does not exist.
-        InputError: a recipe that is fed progress, which no sweep says, or a policy that chooses
-            subtasks where one that acts is needed.
+        InputError: a recipe that is fed progress, which no sweep says, a policy that chooses
+            subtasks where one that acts is needed, a dataset that cannot be recorded or rendered,
+            or upsets in a task that has none.
     """
     if any(run.algo for run in experiment.runs):
         check_extra("A sweep over algorithms", *LIBRARIES)
+    for dataset in experiment.datasets.values():
+        check_dataset(dataset)
+    for run in experiment.runs:
+        if run.upset:
+            check_upset_task(run.task)
     for run in experiment.runs:
         if experiment.needs(run):
             continue

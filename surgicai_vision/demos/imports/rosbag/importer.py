@@ -103,8 +103,7 @@ def import_bags(
         OutputExists: `out` holds something else.
     """
     base = base_config(task, env)
-    if task:
-        check_output(out, may_resume=MARKER)
+    check_folders(out, task)
     # Read the bags, split into tracks.
     report = progress or silent
     tracks: list[SegmentTrack] = []
@@ -127,6 +126,21 @@ def base_config(task: str | None, env: Mapping[str, object] | None) -> TaskConfi
     return from_mapping(
         TaskConfig, {**(env or {}), "task": check_name("subtask", task or "grasp", names.SUBTASKS)}
     )
+
+
+def check_folders(out: Path, task: str | None) -> None:
+    """Refuse, before anything is read, folders that an import cannot write.
+
+    Args:
+        out: as given to the import.
+        task: the subtask that is wanted, into `out`; None: any, into `out`/<task>.
+
+    Raises:
+        OutputExists: one holds something else than demonstrations.
+        InputError: one cannot be written.
+    """
+    for folder in [out] if task else [out / name for name in names.SUBTASKS]:
+        check_output(folder, may_resume=MARKER)
 
 
 def write_tracks(
