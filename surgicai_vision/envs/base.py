@@ -20,6 +20,7 @@
   worth 0 would teach to drop it.
 """
 
+import difflib
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
@@ -145,7 +146,7 @@ class SuturingEnv(gymnasium.Env):
                 `info["randomisation"]` reports them; the env must have some randomisation.
 
         Raises:
-            UnknownName: another option, or no such axis.
+            UnknownName: `randomisation` misspelt, or no such axis; other keys are for others.
             InputError: numbers that no episode can have, or an env without randomisation.
             PhysicsError: no start was physical.
         """
@@ -608,7 +609,9 @@ def _given(
     The axes and their numbers are looked at where they are put in (`randomisation.with_numbers`).
     """
     for key in options:
-        check_name("option of reset", key, RESET_OPTIONS)
+        # Programs that drive envs add keys of their own, as LeRobot does; ours misspelt is refused.
+        if difflib.get_close_matches(str(key), RESET_OPTIONS, n=1):
+            check_name("option of reset", key, RESET_OPTIONS)
     given = options.get("randomisation") or {}
     if not isinstance(given, Mapping):
         raise InputError(

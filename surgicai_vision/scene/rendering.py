@@ -12,6 +12,7 @@ people look at.
 
 import contextlib
 import os
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -182,7 +183,8 @@ class FrameRenderer:
         self.close()
 
     def __del__(self) -> None:
-        self.close()
+        if not sys.is_finalizing():  # then what it would call may be gone, and all is freed anyway
+            self.close()
 
     def _view(self, camera: str) -> mujoco.MjvCamera:
         """Return MuJoCo's handle of a camera and keep it."""

@@ -333,7 +333,6 @@ def test_the_expert_sews_in_the_corners(arc, sign):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"foo": 1}, "Unknown option of reset 'foo'"),
         ({"randomization": {}}, "Did you mean 'randomisation'"),
         ({"randomisation": [1.0]}, "must be a dict"),
         ({"randomisation": {"phantom_shift": [0.001]}}, "phantom_shift has 2 numbers; 1 are given"),

@@ -125,7 +125,8 @@ def test_successes_are_those_of_this_policy(
     tmp_path: Path, policy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained = read_checkpoint(policy)
-    summary = {"successes": 1, "episodes": 2, "ci95": [0.01, 0.99]}
+    counts = {"successes": 1, "episodes": 2, "ci95": [0.01, 0.99]}
+    summary = {"task": "grasp", "policy": "mine", **counts}
     about = {"checkpoint": {"policy_sha256": trained.policy_sha256}}
     stored = {"format": FORMAT, "run": to_mapping(trained.run), "summary": summary, "about": about}
     marker = tmp_path / "evaluation.json"
