@@ -11,15 +11,15 @@ import os
 import shutil
 import uuid
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
 from surgicai_vision import __version__
-from surgicai_vision.core.errors import BadFile, InputError, OutputExists
+from surgicai_vision.core.errors import BadFile, InputError, OutputExists, SurgicaiError
 from surgicai_vision.core.yaml_text import load_yaml
 
 CACHE_VARIABLE = "SURGICAI_VISION_CACHE"
@@ -119,17 +119,26 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
+def locked(
+    path: Path, *, wait: bool = True, refusal: SurgicaiError | None = None
+) -> Iterator[None]:
     """Hold the lock file `path`, which is removed at the end; a killed holder frees it.
 
     Args:
         path: the lock file; its folder exists.
         wait: wait for another holder.
+        refusal: raised where somebody holds it, which then is not waited for.
 
     Raises:
-        filelock.Timeout: somebody holds it, and `wait` is false.
+        filelock.Timeout: somebody holds it, `wait` is false, and there is no `refusal`.
     """
-    with FileLock(path, blocking=wait):
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(FileLock(path, blocking=wait and refusal is None))
+        except Timeout:
+            if refusal is None:
+                raise
+            raise refusal from None
         try:
             yield
         finally:

@@ -87,6 +87,12 @@ def subclass_of(target: str) -> Fault:
     return fault
 
 
+def uncallable(part: object, name: str) -> str:
+    """Return the fault of a part whose attribute `name` is no function; "" of one that is."""
+    value: object = getattr(part, name)
+    return "" if callable(value) else f"has a {name} that is {shown(value)}; it must be a function"
+
+
 def _fits(part: object) -> str:
     """Find no fault in anything."""
     return ""

@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Final, cast
 
 from surgicai_vision.core import names
-from surgicai_vision.core.errors import InputError, shown
+from surgicai_vision.core.errors import shown
 from surgicai_vision.core.plugins import TASKS_GROUP, Registry, subclass_of
 
 if TYPE_CHECKING:
@@ -83,9 +83,10 @@ def load_subtask(name: str) -> "type[Subtask]":
     """
     subtask = TASKS.load(name)
     if subtask.name != name:
-        raise InputError(
-            f"The task '{name}' of '{TASKS.owner(name)}' calls itself '{subtask.name}'; "
-            "its author must give the entry point and the class one name."
+        raise TASKS.refusal(
+            name,
+            f"calls itself '{subtask.name}'; its author must give the entry point and the class "
+            "one name",
         )
     return subtask
 

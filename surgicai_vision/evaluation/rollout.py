@@ -14,7 +14,7 @@ import os
 from collections.abc import Callable, Sequence
 
 from surgicai_vision.core import processes
-from surgicai_vision.core.config import TaskConfig
+from surgicai_vision.core.config import LARGEST_INTEGER, TaskConfig
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.progress import Progress
 from surgicai_vision.envs.upset import check_upset_task
@@ -24,8 +24,6 @@ from surgicai_vision.evaluation.slot import Episode, Slot
 
 BATCH = 8
 """Slots of a process: what an encoder computes at once (`encoders.base`)."""
-LARGEST_SEED = 2**63 - 1
-"""Largest seed of a start: what a column of whole numbers holds."""
 
 
 def check_seeds(seeds: Sequence[int]) -> None:
@@ -36,9 +34,9 @@ def check_seeds(seeds: Sequence[int]) -> None:
     """
     # A range is ordered, and may be far too long to be counted.
     ends = (seeds[0], seeds[-1]) if isinstance(seeds, range) and seeds else seeds
-    if any(not 0 <= seed <= LARGEST_SEED for seed in ends):
+    if any(not 0 <= seed <= LARGEST_INTEGER for seed in ends):
         raise InputError(
-            f"Start seeds reach from {min(ends)} to {max(ends)}; allowed: 0 to {LARGEST_SEED}. "
+            f"Start seeds reach from {min(ends)} to {max(ends)}; allowed: 0 to {LARGEST_INTEGER}. "
             "Give another --seed, or fewer episodes."
         )
     if not seeds or len(set(seeds)) != len(seeds):

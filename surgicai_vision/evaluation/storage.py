@@ -8,13 +8,12 @@ whole procedure `visits.parquet` has one row a visit of a subtask (`envs.visits`
 import dataclasses
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
 import numpy as np
-from filelock import Timeout
 from numpy.typing import NDArray
 
 from surgicai_vision.core import files, names
@@ -136,16 +135,12 @@ def alone_in(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another process evaluates into it.
     """
+    refusal = InputError(
+        f"Another run is evaluating into {folder}; wait for it, stop it or give another --out."
+    )
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with ExitStack() as stack:
-            try:
-                stack.enter_context(files.locked(folder / LOCK, wait=False))
-            except Timeout:
-                raise InputError(
-                    f"Another run is evaluating into {folder}; wait for it, stop it or give "
-                    "another --out."
-                ) from None
+        with files.locked(folder / LOCK, refusal=refusal):
             yield
     finally:
         if not any(folder.iterdir()):

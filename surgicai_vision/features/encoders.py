@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, cast
 
 from encoders.weights import find
 from surgicai_vision.core.errors import InputError, check_name, shown
-from surgicai_vision.core.plugins import ENCODERS_GROUP, Registry, instance_of, resolve
+from surgicai_vision.core.plugins import ENCODERS_GROUP, Registry, instance_of, resolve, uncallable
 from surgicai_vision.features.devices import AUTO, find_device
 
 if TYPE_CHECKING:
@@ -33,8 +33,7 @@ def _fault(part: object) -> str:
     plugin = cast("Plugin", part)
     if fault := _is_card(plugin.card):
         return f"has a card that {fault}"
-    build: object = plugin.build
-    return "" if callable(build) else f"has a build that is {shown(build)}; it must be a function"
+    return uncallable(plugin, "build")
 
 
 ENCODERS: Final = Registry["Plugin"](

@@ -28,7 +28,7 @@ from pathlib import Path
 
 from surgicai_vision.core import percentages
 from surgicai_vision.core.config import JSON, TaskConfig, digest, from_mapping, to_mapping
-from surgicai_vision.core.errors import BadFile, InputError, check_finite
+from surgicai_vision.core.errors import BadFile, InputError, check_at_least, check_finite
 from surgicai_vision.core.files import write_bytes, write_json
 from surgicai_vision.core.names import TEST_SEED
 from surgicai_vision.core.tasks import task_names
@@ -74,9 +74,8 @@ class Entry:
             raise InputError("A row needs a name and who measured it; give --name and --by.")
         if self.link and not self.link.startswith("https://"):
             raise InputError(f"link is {self.link}; it must begin with https://.")
-        if self.minutes is not None and not self.minutes >= 0:
-            raise InputError(f"minutes is {self.minutes}; it must be at least 0.")
         if self.minutes is not None:
+            check_at_least(0, minutes=self.minutes)
             check_finite(minutes=self.minutes)
         for words in (self.name, self.by, self.link, self.hardware, self.note):
             if len(words) > 300:

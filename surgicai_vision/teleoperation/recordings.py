@@ -7,11 +7,9 @@ the same numbers.
 """
 
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-
-from filelock import Timeout
 
 from surgicai_vision.core import names
 from surgicai_vision.core.banks import check_training_starts
@@ -102,13 +100,10 @@ def open_recordings(
     check_training_starts(seed or names.TRAIN_SEED, 1)
     check_output(folder, may_resume=MARKER)
     folder.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(locked(folder.with_name(f".{folder.name}.lock"), wait=False))
-        except Timeout:
-            raise SurgicaiError(
-                f"--out {folder}: another session is recording there; give another folder."
-            ) from None
+    refusal = SurgicaiError(
+        f"--out {folder}: another session is recording there; give another folder."
+    )
+    with locked(folder.with_name(f".{folder.name}.lock"), refusal=refusal):
         for leftover in folder.glob(f"{TEMPORARY}*"):
             leftover.unlink(missing_ok=True)
         try:

@@ -17,7 +17,7 @@ from surgicai_vision.core import names
 from surgicai_vision.core.config import JSON, from_mapping
 from surgicai_vision.core.errors import BadFile, InputError, check_name, shown
 from surgicai_vision.core.files import configs_folder, read_yaml
-from surgicai_vision.core.plugins import POLICIES_GROUP, Registry, instance_of, resolve
+from surgicai_vision.core.plugins import POLICIES_GROUP, Registry, instance_of, resolve, uncallable
 from surgicai_vision.features.encoders import ANYWHERE, WeightsSource, load_encoder
 from surgicai_vision.training import released
 from surgicai_vision.training.checkpoint import (
@@ -48,8 +48,7 @@ def _fault(part: object) -> str:
     asked = {field.name for field in dataclasses.fields(resolve("policies.base:Recipe"))}
     if missing := sorted(asked - given):
         return f"has a recipe without {', '.join(missing)}; derive it from policies.base.Recipe"
-    make: object = plugin.make
-    return "" if callable(make) else f"has a make that is {shown(make)}; it must be a function"
+    return uncallable(plugin, "make")
 
 
 POLICIES: Final = Registry["Plugin"](

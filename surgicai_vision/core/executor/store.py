@@ -6,10 +6,8 @@ What is missing is done by an engine and committed whole.
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
-
-from filelock import Timeout
 
 from surgicai_vision.core.errors import InputError, SurgicaiError
 from surgicai_vision.core.executor.context import RunContext
@@ -86,13 +84,8 @@ def claim(store: Path) -> Iterator[None]:
         yield
         return
     path.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(locked(path / LOCK, wait=False))
-        except Timeout:
-            raise InputError(
-                f"Another run is working in {store}; wait for it or stop it first."
-            ) from None
+    refusal = InputError(f"Another run is working in {store}; wait for it or stop it first.")
+    with locked(path / LOCK, refusal=refusal):
         for left in path.glob(f"{TEMPORARY}*"):
             shutil.rmtree(left, ignore_errors=True)
         _claimed.add(path)
