@@ -2,12 +2,12 @@
 
     render_demos(demos, out, variants=Variants("train", count=5))
 
-A look is part of the drawn state and nothing but seen (docs/looks.md), so what was recorded once
-can be rendered in as many looks as wanted: the columns of all variants are the same. The look of a
-variant is drawn from the demonstration's file and the variant's number, whatever look it was
-recorded in. The dataset holds all variants of the first demonstration, then all of the second …;
-`demonstration_index` says which frames show the same one, and every split and count of
-demonstrations goes by it.
+A look affects only what is seen (docs/looks.md), so a demonstration that was recorded once can be
+rendered in any number of looks; all other columns are the same in every variant. The look of a
+variant is drawn from the demonstration's recorded states and the variant's number, whatever look it
+was recorded in. The dataset holds all variants of the first demonstration, then all of the second,
+and so on. `demonstration_index` says which frames show the same demonstration; every split and
+every count of demonstrations uses it.
 """
 
 from collections.abc import Mapping
